@@ -1,4 +1,4 @@
-"""BEV encoder with one learned query per cell that attends to the BEV and to the cameras."""
+"""BEV encoder with one learned query per cell, which attends to the BEV and to the cameras."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
@@ -17,31 +17,57 @@ from gsmap.structures.grid import BEVGrid
 
 
 class BEVSelfAttention(BEVDeformableAttention):
-    """BEVFormer's temporal self-attention for a model without history.
+    """Temporal self-attention of BEVFormer, for a model without history.
 
-    Both entries of the queue are then the current queries, so the values coincide and averaging the
-    two outputs equals one attention over the samples of both with half the weight. ``num_points``
-    are the samples per head and queue entry.
+    Without history both entries of the temporal queue are the current queries. Their values
+    coincide, so the average of the two outputs equals one attention over the samples of both
+    entries at half the weight.
+
+    Args:
+        embed_dims: Channels C.
+        num_heads: Number of heads.
+        num_points: Samples per head and entry of the queue.
+        dropout: Probability to drop a channel of the output in training.
     """
 
     def __init__(
         self, embed_dims: int = 256, num_heads: int = 8, num_points: int = 4, dropout: float = 0.1
     ) -> None:
-        super().__init__(embed_dims, num_heads, num_points, 2 * embed_dims, dropout, num_parts=2)
+        super().__init__(
+            embed_dims,
+            num_heads=num_heads,
+            num_points=num_points,
+            query_dims=2 * embed_dims,
+            dropout=dropout,
+            num_parts=2,
+        )
 
     def weights(self, query: Tensor) -> Tensor:
-        """Return a softmax per queue entry, averaged over the queue. (B, Q, heads, S)"""
+        """Attention weights: a softmax per entry of the queue, averaged over the queue.
+
+        Args:
+            query: Pairs of queries. (B, Q, 2 C)
+
+        Returns:
+            Weights that sum to 1 over S. (B, Q, heads, S)
+        """
         logits = self.attention_weights(query).float()
         logits = logits.unflatten(-1, (self.num_heads, self.num_parts, -1))
         return logits.softmax(-1).flatten(-2) / self.num_parts
 
 
 class BEVEncoderLayer(nn.Module):
-    """Self-attention, camera cross-attention and feed-forward, each followed by its LayerNorm.
+    """Self-attention, camera cross-attention and feed-forward network, each with its LayerNorm.
 
-    ``num_heads`` and ``num_points`` (samples per head and queue entry) are the self-attention's.
-    With ``released_pairs`` it pairs the query of sample floor(b / 2) with sample b, as upstream; a
-    sample's result then depends on its batch.
+    Args:
+        cross_attn: Config of the camera cross-attention.
+        embed_dims: Channels C.
+        num_heads: Heads of the self-attention.
+        num_points: Samples of the self-attention, per head and entry of its queue.
+        ffn_dims: Hidden channels of the feed-forward network.
+        dropout: Probability to drop a value in training.
+        released_pairs: Pair sample b with the query of sample floor(b / 2), as the released code of
+            BEVFormer does. The result of a sample then depends on its batch.
     """
 
     def __init__(
@@ -56,53 +82,70 @@ class BEVEncoderLayer(nn.Module):
     ) -> None:
         super().__init__()
         self.released_pairs = released_pairs
-        self.self_attn = BEVSelfAttention(embed_dims, num_heads, num_points, dropout)
+        self.self_attn = BEVSelfAttention(
+            embed_dims, num_heads=num_heads, num_points=num_points, dropout=dropout
+        )
         self.cross_attn = MODELS.build({"embed_dims": embed_dims, **cross_attn})
         self.dropout = nn.Dropout(dropout)
         self.ffn = feed_forward(embed_dims, ffn_dims, dropout)
         self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in range(3))
 
     def forward(
-        self, query: Tensor, query_pos: Tensor, grid: BEVGrid, feats: Any, seen: PillarProjection
+        self,
+        query: Tensor,
+        query_pos: Tensor,
+        grid: BEVGrid,
+        feats: Any,
+        projection: PillarProjection,
     ) -> Tensor:
-        """Update the queries of the grid's cells from image features that have their embeddings.
+        """Update the queries of all cells.
 
-        (B, Q, C), (1, Q, C), (B, V, C, h, w) or a list, and where the pillars fall -> (B, Q, C)
+        Args:
+            query: Queries of the cells, row by row. (B, Q, C)
+            query_pos: Positional encoding of the cells. (1, Q, C)
+            grid: The cells, H x W = Q.
+            feats: Image features with the embeddings of camera and level. (B, V, C, h, w), or a
+                list with one such tensor per level
+            projection: Image coordinates of the pillars, and the cells that each camera sees.
+
+        Returns:
+            The updated queries. (B, Q, C)
         """
         centres = self.centres(grid, query.device).view(1, -1, 2)
-        # of sample floor(b / 2): 0, 0, 1, 1, ...
-        partner = query.repeat_interleave(2, 0)[: len(query)] if self.released_pairs else query
+        partner = query
+        if self.released_pairs:
+            partner = query.repeat_interleave(2, 0)[: len(query)]  # of samples 0, 0, 1, 1, ...
         pair = torch.cat([partner, query + query_pos], -1)  # (B, Q, 2 C)
         bev = query.transpose(1, 2).unflatten(-1, (grid.height, grid.width))  # (B, C, H, W)
         query = self.norms[0](query + self.self_attn(pair, centres, bev))
-        query = self.norms[1](query + self.dropout(self.cross_attn(query, feats, seen)))
+        query = self.norms[1](query + self.dropout(self.cross_attn(query, feats, projection)))
         return self.norms[2](self.ffn(query))
 
     def centres(self, grid: BEVGrid, device: torch.device) -> Tensor:
-        """Return where each cell's query looks around itself, [0, 1] over the map. (H, W, 2)"""
+        """Reference point of each cell's self-attention, [0, 1] over the map. (H, W, 2)"""
         return grid.norm_from_metres(grid.pixel_centres(device))
 
 
 @MODELS.register_module()
 class BEVQueryEncoder(CameraEncoder):
-    """Lift camera features to BEV with a learned query per cell.
+    """BEV encoder with a learned query per cell: BEVFormer without history, or GKT.
 
-    BEVFormer without history, or GKT, according to the camera cross-attention.
+    The camera cross-attention decides which of the two it is.
 
     Args:
         cross_attn: Config of the camera cross-attention of every layer.
-        grid: The map's extent.
+        grid: Extent of the map.
         z_range: Lowest and highest z of the pillars in metres.
         bev_pixel_m: Side of a cell in metres, or its sizes along x and y.
         embed_dims: Channels C.
         num_layers: Number of layers.
         layer_cfg: Further arguments of :class:`BEVEncoderLayer`.
         num_cams: Number of cameras V.
-        with_can_bus: Whether the queries know the vehicle's motion.
+        with_can_bus: Add an embedding of the motion signals of the vehicle to the queries.
         num_levels: Levels of image features that are used, at most 4.
-        uniform_positions: Whether the positional encoding starts from [0, 1), as BEVFormer's code
-            means to; in MapTR and its successors it starts from N(0, 1), because nothing
-            initialises it after it is made.
+        uniform_positions: Initialise the positional encoding from U[0, 1), as intended by
+            BEVFormer. MapTR and its successors start from N(0, 1), because their code leaves the
+            default of ``nn.Embedding``.
     """
 
     layer_class: ClassVar[type[BEVEncoderLayer]] = BEVEncoderLayer
@@ -137,7 +180,8 @@ class BEVQueryEncoder(CameraEncoder):
         )
         self.level_embeds = nn.Parameter(torch.empty(4, embed_dims))  # only the first is used
         self.cams_embeds = nn.Parameter(torch.empty(num_cams, embed_dims))
-        self.calibration, self.can_bus_mlp = ("img_from_frame",), None
+        self.calibration = ("img_from_frame",)
+        self.can_bus_mlp = None
         if with_can_bus:
             self.calibration = ("img_from_frame", "can_bus")
             self.can_bus_mlp = nn.Sequential(
@@ -149,14 +193,16 @@ class BEVQueryEncoder(CameraEncoder):
             self.can_bus_mlp.add_module("norm", nn.LayerNorm(embed_dims))
         self.num_levels = num_levels
         layer = {"cross_attn": cross_attn, "embed_dims": embed_dims, **(layer_cfg or {})}
-        layers = [self.layer_class(**layer) for _ in range(num_layers)]
+        layers = []
+        for _ in range(num_layers):
+            layers.append(self.layer_class(**layer))
         self.num_heights: int = layers[0].cross_attn.num_heights
         self.layers = nn.ModuleList(layers)
         nn.init.normal_(self.level_embeds)
         nn.init.normal_(self.cams_embeds)
 
     def init_weights(self) -> None:
-        """Initialise the matrices of the layers (Xavier)."""
+        """Initialise the matrices of the layers from Xavier's uniform distribution."""
         super().init_weights()
         init_matrices(self.layers)
         if self.can_bus_mlp is not None:
@@ -165,10 +211,19 @@ class BEVQueryEncoder(CameraEncoder):
     def encode(
         self, feats: Any, calibration: Mapping[str, Tensor], img_shape: tuple[int, int]
     ) -> dict[str, Tensor]:
-        """Return ``bev_feats``, from ``img_from_frame`` (B, V, 4, 4) and ``can_bus`` (B, 18).
+        """Encode image features as BEV features.
 
-        The features are handed on as ``img_feats``.
-        ValueError if the number of cameras is not the configured one.
+        Args:
+            feats: Image features. (B, V, C, h, w), or a list with one such tensor per level
+            calibration: ``img_from_frame`` (B, V, 4, 4), and ``can_bus`` (B, 18) if the encoder
+                uses it.
+            img_shape: Rows and columns of the padded images.
+
+        Returns:
+            ``bev_feats`` (B, C, H, W), and the input as ``img_feats``.
+
+        Raises:
+            ValueError: If the number of cameras differs from ``num_cams``.
         """
         first = feats if isinstance(feats, Tensor) else feats[0]
         if first.shape[1] != len(self.cams_embeds):
@@ -180,20 +235,25 @@ class BEVQueryEncoder(CameraEncoder):
             tokens: Any = feats + codes[0]
         else:
             tokens = [level + code for level, code in zip(feats, codes, strict=False)]
-        bev_shape = self.grid.height, self.grid.width
+        bev_shape = (self.grid.height, self.grid.width)
         query = self.bev_embedding.weight.expand(len(first), -1, -1)  # (B, Q, C)
         if self.can_bus_mlp is not None:
             query = query + self.can_bus_mlp(calibration["can_bus"])[:, None]
-        query_pos = self.positional_encoding(first.new_zeros(1, *bev_shape))
+        query_pos = self.positional_encoding(first.new_zeros((1, *bev_shape)))
         query_pos = query_pos.flatten(2).transpose(1, 2)  # (1, Q, C)
-        seen = self.project(calibration["img_from_frame"], img_shape)
+        projection = self.project(calibration["img_from_frame"], img_shape)
         for layer in self.layers:
-            query = layer(query, query_pos, self.grid, tokens, seen)
+            query = layer(query, query_pos, grid=self.grid, feats=tokens, projection=projection)
         bev_feats = query.transpose(1, 2).unflatten(-1, bev_shape)
         return {"bev_feats": bev_feats, "img_feats": feats}
 
     def project(self, img_from_frame: Tensor, img_shape: tuple[int, int]) -> PillarProjection:
-        """Project every cell's pillar into every camera."""
+        """Project the pillar of every cell into every camera.
+
+        Args:
+            img_from_frame: Matrices from metres to pixels. (B, V, 4, 4)
+            img_shape: Rows and columns of the padded images.
+        """
         pillars = pillar_points(
             grid=self.grid,
             z_range=self.z_range,

@@ -14,20 +14,23 @@ from gsmap.structures.tensors import constant
 
 @MODELS.register_module()
 class SpatialCrossAttention(SamplingAttention):
-    """Attention from BEV cells to the cameras that see them, around their projected pillars.
+    """Deformable attention from BEV cells to the cameras, around the projected pillars.
 
     Sample s belongs to pillar height ``s % num_heights``. Sums over cameras are divided by the
-    number of cameras that see the cell.
+    number of cameras in which the cell is visible.
 
     Args:
         embed_dims: Channels C.
         num_heads: Number of heads.
-        num_points: Samples per head, S; ValueError if it is no multiple of ``num_heights``.
+        num_points: Samples per head, S.
         num_heights: Points per pillar, Z.
         num_levels: Levels of image features; each head has S samples in every level.
+
+    Raises:
+        ValueError: If ``num_points`` is not a multiple of ``num_heights``.
     """
 
-    fixed_sizes = False  # whether unseen pairs of cell and camera are computed too, with weight 0
+    fixed_sizes = False  # whether invisible pairs of cell and camera are computed, with weight 0
 
     def __init__(
         self,
@@ -47,10 +50,15 @@ class SpatialCrossAttention(SamplingAttention):
     def forward(
         self, query: Tensor, img_feats: Tensor | Sequence[Tensor], projection: PillarProjection
     ) -> Tensor:
-        """Collect camera features for every cell's query, without the residual.
+        """Attend from the cells to the cameras, without the residual.
 
-        Features are (B, V, C, h, w), one or a list of levels; the projected pillars have
-        ``num_heights`` points. (B, Q, C) -> (B, Q, C)
+        Args:
+            query: Queries of the cells. (B, Q, C)
+            img_feats: Image features. (B, V, C, h, w), or a list with one such tensor per level
+            projection: Image coordinates of pillars with ``num_heights`` points.
+
+        Returns:
+            Camera features of every cell. (B, Q, C)
         """
         levels = [img_feats] if isinstance(img_feats, Tensor) else list(img_feats)
         offsets = self.offsets_in_cells(query).chunk(self.num_parts, 3)  # (B, Q, heads, S, 2)
@@ -66,17 +74,18 @@ class SpatialCrossAttention(SamplingAttention):
                     value, (height, width), offset, weight, projection, repeats
                 )
                 continue
-            for sample, view in product(*(range(n) for n in feats.shape[:2])):
+            batch, num_views = feats.shape[:2]
+            for sample, view in product(range(batch), range(num_views)):
                 cell = projection.visible[sample, view].nonzero()[:, 0]  # (T,)
                 centres = projection.uv[sample, view, cell].repeat(1, repeats, 1)  # (T, S, 2)
                 locations = centres[:, None] + offset[sample, cell]  # (T, heads, S, 2)
-                seen = sample_map(
+                sampled = sample_map(
                     value[sample, view][None],
                     shape=(height, width),
                     locations=locations[None],
                     weights=weight[sample, cell][None],
                 )
-                summed[sample] = summed[sample].index_add(0, cell, seen[0])
+                summed[sample] = summed[sample].index_add(0, cell, sampled[0])
         count = projection.visible.sum(1).clamp(min=1)
         return self.output_proj(summed / count[..., None])
 
@@ -89,14 +98,14 @@ def _sample_all_pairs(
     projection: PillarProjection,
     repeats: int,
 ) -> Tensor:
-    """Sum what every cell samples in every camera, without a size that depends on values.
+    """Sum the samples of every cell over all cameras; no size depends on values.
 
     Args:
         value: Projected features of each camera. (B, V, h * w, heads, C)
         shape: Rows h and columns w of the features.
-        offsets: From the projected pillar, in [0, 1] over the map. (B, Q, heads, S, 2)
+        offsets: Offsets from the projected pillar, as fractions of the map. (B, Q, heads, S, 2)
         weights: Weight of each sample. (B, Q, heads, S)
-        projection: Where pillars fall, and which cells a camera sees.
+        projection: Image coordinates of the pillars, and the cells that each camera sees.
         repeats: Samples per pillar height.
 
     Returns:

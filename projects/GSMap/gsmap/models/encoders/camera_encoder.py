@@ -1,4 +1,4 @@
-"""What the cameras' BEV encoders share: how they read the samples' calibration."""
+"""Base class of the BEV encoders of cameras, and its stacking of the calibration."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -16,39 +16,71 @@ from gsmap.structures.tensors import uncompiled, uploaded
 def stack_calibration(
     img_metas: Sequence[dict[str, Any]], names: Sequence[str], device: torch.device
 ) -> dict[str, Tensor]:
-    """Stack what an encoder reads of the samples, see `calibration_arrays`. (B, ...) each"""
+    """Stack the calibration of the samples of a batch.
+
+    Args:
+        img_metas: Meta information of the samples, B of them.
+        names: Names of arrays of `calibration_arrays`.
+        device: Device of the result.
+
+    Returns:
+        A tensor for each name. (B, ...)
+    """
     arrays = [calibration_arrays(meta, names) for meta in img_metas]
-    stacks = [torch.from_numpy(np.stack([each[name] for each in arrays])) for name in names]
+    stacks = []
+    for name in names:
+        stack = np.stack([sample_arrays[name] for sample_arrays in arrays])
+        stacks.append(torch.from_numpy(stack))
     return dict(zip(names, uploaded(stacks, device), strict=True))
 
 
 class CameraEncoder(BaseModule):
-    """A BEV encoder of camera features."""
+    """Base class of BEV encoders of camera features.
 
-    calibration: tuple[str, ...]  # what it reads of a sample, names of `calibration_arrays`
-    num_levels: int | None = 1  # of the image features, the finest first; None takes all
+    Attributes:
+        calibration: Names of the arrays of `calibration_arrays` that the encoder reads.
+        num_levels: Number of levels of image features, from the finest on. None: all.
+    """
+
+    calibration: tuple[str, ...]
+    num_levels: int | None = 1
 
     def forward(
         self, mlvl_feats: Sequence[Tensor], img_metas: Sequence[dict[str, Any]]
     ) -> dict[str, Any]:
-        """Return ``bev_feats`` (B, C, H, W), row 0 at the smallest y, and what else `encode` does.
+        """Encode the images of a batch.
 
-        Of the image features, a list of (B, V, C, h, w), the first levels are used. Samples have
-        ``batch_input_shape`` and what the calibration is read from; ValueError if one lacks a field
-        or has another number of cameras.
+        Args:
+            mlvl_feats: Image features, one tensor per level, the finest first. (B, V, C, h, w) each
+            img_metas: Meta information of the samples: ``batch_input_shape``, and the fields from
+                which the calibration is read.
+
+        Returns:
+            ``bev_feats`` (B, C, H, W), row 0 at the smallest y, and further outputs of `encode`.
+
+        Raises:
+            ValueError: If a sample lacks a field or has another number of cameras.
         """
         calibration = stack_calibration(img_metas, self.calibration, mlvl_feats[0].device)
         return self.encode(self.levels(mlvl_feats), calibration, img_metas[0]["batch_input_shape"])
 
     def levels(self, mlvl_feats: Sequence[Tensor]) -> Any:
-        """Return what `encode` takes of all levels: the first, or a list of the first ones."""
-        return mlvl_feats[0] if self.num_levels == 1 else list(mlvl_feats[: self.num_levels])
+        """Select the levels that `encode` takes: the first one, or a list of the first ones."""
+        if self.num_levels == 1:
+            return mlvl_feats[0]
+        return list(mlvl_feats[: self.num_levels])
 
     def encode(
         self, feats: Any, calibration: Mapping[str, Tensor], img_shape: tuple[int, int]
     ) -> dict[str, Any]:
-        """Encode features (B, V, C, h, w), one or a list, with the calibration as tensors (B, ...).
+        """Encode image features as BEV features.
 
-        ``img_shape`` are rows and columns of the padded images.
+        Args:
+            feats: The selected levels. (B, V, C, h, w), or a list of such tensors
+            calibration: A tensor for each name in ``self.calibration``. (B, ...)
+            img_shape: Rows and columns of the padded images.
+
+        Returns:
+            ``bev_feats`` (B, C, H, W), and any further outputs by name.
         """
         raise NotImplementedError

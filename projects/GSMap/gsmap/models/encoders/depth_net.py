@@ -18,27 +18,31 @@ def _conv_bn_relu(
     conv = nn.Conv2d(
         in_channels, out_channels, kernel_size, padding=padding, dilation=dilation, bias=False
     )
-    parts = [("atrous_conv", conv), ("bn", nn.BatchNorm2d(out_channels)), ("relu", nn.ReLU())]
-    return nn.Sequential(OrderedDict(parts))
+    norm = nn.BatchNorm2d(out_channels)
+    return nn.Sequential(OrderedDict(atrous_conv=conv, bn=norm, relu=nn.ReLU()))
 
 
 def _camera_mlp(channels: int) -> nn.Sequential:
     """Build the embedding of a camera's parameter vector, under MapTRv2's parameter names."""
-    first, second = nn.Linear(CAMERA_VECTOR_SIZE, channels), nn.Linear(channels, channels)
+    first = nn.Linear(CAMERA_VECTOR_SIZE, channels)
+    second = nn.Linear(channels, channels)
     return nn.Sequential(OrderedDict(fc1=first, relu=nn.ReLU(), fc2=second))
 
 
 def camera_vector(cam2img: Tensor, img_aug_matrix: Tensor, ego_from_cam: Tensor) -> Tensor:
-    """Write a camera's parameters as the 22 numbers that MapTRv2's depth net reads. (..., 22)
+    """Parameters of a camera as the input vector of the depth net of MapTRv2.
 
-    These are fx, fy, cx, cy; a00, a01, tx, a10, a11, ty of the augmentation; the upper three rows
-    of the pose.
+    The 22 numbers are fx, fy, cx, cy; a00, a01, tx, a10, a11, ty of the augmentation; and the upper
+    three rows of the pose.
 
     Args:
         cam2img: Intrinsics of the original image, in pixels. (..., >= 3, >= 3)
         img_aug_matrix: Augmentation, which acts on (u * d, v * d, d, 1); its translation in pixels
             is in the third column. (..., 4, 4)
-        ego_from_cam: Pose of the camera in the vehicle, in metres. (..., 4, 4)
+        ego_from_cam: Pose of the camera in the frame of the vehicle, in metres. (..., 4, 4)
+
+    Returns:
+        The vector. (..., 22)
     """
     intrinsics = [cam2img[..., 0, 0], cam2img[..., 1, 1], cam2img[..., 0, 2], cam2img[..., 1, 2]]
     augmentation = img_aug_matrix[..., :2, :3].flatten(-2)
@@ -55,9 +59,19 @@ class SEGate(nn.Module):
         self.conv_expand = nn.Conv2d(channels, channels, 1)
 
     def forward(self, feats: Tensor, embedding: Tensor) -> Tensor:
-        """Gate ``feats`` (n, C, h, w) by ``embedding`` (n, C)."""
-        # linear layers stored as 1x1 convolutions, which are slow on a single pixel
-        reduce, expand = self.conv_reduce, self.conv_expand
+        """Scale features by their gate.
+
+        Args:
+            feats: Features. (n, C, h, w)
+            embedding: Embedding of the camera. (n, C)
+
+        Returns:
+            The scaled features. (n, C, h, w)
+        """
+        # The checkpoints store the two linear layers as 1x1 convolutions. As such they are slow on
+        # a single pixel.
+        reduce = self.conv_reduce
+        expand = self.conv_expand
         hidden = F.relu(F.linear(embedding, reduce.weight.flatten(1), reduce.bias))
         gate = F.linear(hidden, expand.weight.flatten(1), expand.bias).sigmoid()
         return feats * gate[..., None, None]
@@ -71,10 +85,10 @@ class ASPP(nn.Module):
 
     def __init__(self, channels: int, mid_channels: int) -> None:
         super().__init__()
-        self.aspp1 = _conv_bn_relu(channels, mid_channels, 1)
-        self.aspp2, self.aspp3, self.aspp4 = (
-            _conv_bn_relu(channels, mid_channels, 3, dilation) for dilation in (6, 12, 18)
-        )
+        self.aspp1 = _conv_bn_relu(channels, mid_channels, kernel_size=1)
+        self.aspp2 = _conv_bn_relu(channels, mid_channels, kernel_size=3, dilation=6)
+        self.aspp3 = _conv_bn_relu(channels, mid_channels, kernel_size=3, dilation=12)
+        self.aspp4 = _conv_bn_relu(channels, mid_channels, kernel_size=3, dilation=18)
         self.global_avg_pool = nn.Sequential(
             nn.AdaptiveAvgPool2d(1),
             nn.Conv2d(channels, mid_channels, 1, bias=False),
@@ -86,16 +100,23 @@ class ASPP(nn.Module):
         self.dropout = nn.Dropout(0.5)
 
     def forward(self, feats: Tensor) -> Tensor:
-        """Apply to ``feats``. (n, C, h, w) -> (n, C, h, w)"""
-        branches = [branch(feats) for branch in (self.aspp1, self.aspp2, self.aspp3, self.aspp4)]
+        """Pool the features at five scales. (n, C, h, w) -> (n, C, h, w)"""
+        branches = []
+        for branch in (self.aspp1, self.aspp2, self.aspp3, self.aspp4):
+            branches.append(branch(feats))
         branches.append(self.global_avg_pool(feats).expand_as(branches[0]))
-        return self.dropout(F.relu(self.bn1(self.conv1(torch.cat(branches, 1)))))
+        pyramid = self.conv1(torch.cat(branches, 1))
+        return self.dropout(F.relu(self.bn1(pyramid)))
 
 
 class CameraAwareDepthNet(nn.Module):
-    """Predict D depth logits and C context features, both gated by the camera's parameters.
+    """Depth logits and context features of image features, both gated by the camera's parameters.
 
-    ``aspp_channels`` are those of each branch of the depth head's pyramid.
+    Args:
+        in_channels: Channels of the image features.
+        context_channels: Channels C of the context.
+        depth_channels: Number D of depth bins.
+        aspp_channels: Channels of each branch of the pyramid of the depth head.
     """
 
     def __init__(
@@ -120,9 +141,14 @@ class CameraAwareDepthNet(nn.Module):
         )
 
     def forward(self, feats: Tensor, camera_vectors: Tensor) -> tuple[Tensor, Tensor]:
-        """Predict depth logits (n, D, h, w) and context (n, C, h, w) of features (n, C_in, h, w).
+        """Predict depth and context.
 
-        Each camera has its `camera_vector` (n, 22).
+        Args:
+            feats: Image features of n cameras. (n, in_channels, h, w)
+            camera_vectors: `camera_vector` of each camera. (n, 22)
+
+        Returns:
+            Depth logits (n, D, h, w) and context (n, C, h, w).
         """
         vectors = self.bn(camera_vectors)
         feats = self.reduce_conv(feats)
@@ -132,7 +158,13 @@ class CameraAwareDepthNet(nn.Module):
 
 
 class PlainDepthNet(nn.Module):
-    """A single 1x1 convolution to depth logits and context (MapTR's BEVPool encoder)."""
+    """A single 1x1 convolution to depth logits and context (BEVPool encoder of MapTR).
+
+    Args:
+        in_channels: Channels of the image features.
+        context_channels: Channels C of the context.
+        depth_channels: Number D of depth bins.
+    """
 
     def __init__(self, in_channels: int, context_channels: int, depth_channels: int) -> None:
         super().__init__()
@@ -140,6 +172,14 @@ class PlainDepthNet(nn.Module):
         self.conv = nn.Conv2d(in_channels, depth_channels + context_channels, 1)
 
     def forward(self, feats: Tensor, camera_vectors: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Predict depth logits (n, D, h, w) and context (n, C, h, w) from the features alone."""
+        """Predict depth and context.
+
+        Args:
+            feats: Image features of n cameras. (n, in_channels, h, w)
+            camera_vectors: Not used; the other depth net needs it.
+
+        Returns:
+            Depth logits (n, D, h, w) and context (n, C, h, w).
+        """
         depth_and_context = self.conv(feats)
         return depth_and_context.tensor_split([self.depth_channels], 1)

@@ -1,4 +1,4 @@
-"""Geometry-guided kernel attention (GKT) in plain torch: fixed kernels around projected cells."""
+"""Geometry-guided kernel attention (GKT): fixed kernels around projected cells."""
 
 import torch
 from mmdet3d.registry import MODELS
@@ -12,7 +12,14 @@ from gsmap.ops.kernel_sampling.reference import kernel_pixels
 
 
 def kernel_offsets(kernel_size: tuple[int, int]) -> Tensor:
-    """Return a kernel's offsets (dx, dy) in pixels, in the order of its weights, dx slow. (S, 2)"""
+    """Offsets of the pixels of a kernel from its centre.
+
+    Args:
+        kernel_size: Rows and columns of the kernel.
+
+    Returns:
+        Offsets (dx, dy) in pixels in the order of the attention weights, dy fastest. (S, 2)
+    """
     rows, cols = kernel_size
     dx = torch.arange(cols) - cols // 2
     dy = torch.arange(rows) - rows // 2
@@ -23,24 +30,28 @@ def kernel_offsets(kernel_size: tuple[int, int]) -> Tensor:
 class GeometryKernelAttention(nn.Module):
     """Attention from BEV cells to the pixels around their projections, one pillar height per head.
 
-    Only pairs of a cell and a camera that sees it are computed. Sums over cameras are divided by
-    the number of cameras that see the cell.
+    Only pairs of a cell and a camera in which it is visible are computed. Sums over cameras are
+    divided by the number of cameras in which the cell is visible.
 
     Args:
-        embed_dims: Channels C; ValueError if they are not divisible by ``num_heads``.
-        num_heads: Number of heads; head m looks at pillar height m.
-        kernel_size: Rows and columns of the kernel; ValueError if they are not odd and pixels are
-            not bilinear. An even kernel lies half a pixel to the left and up.
-        bilinear: Sample between pixels (MapQR), in place of rounding to one; zero outside the map.
-        released_cells: Let each camera serve the cells that it sees in the first sample of the
-            batch, as released; a sample's result then depends on its batch.
-        equal_weights: Start from equal weights over the kernel, as GKT's code means to; in MapTR
-            and its successors they start from Xavier's law, because the transformer around them
-            initialises all matrices later.
+        embed_dims: Channels C.
+        num_heads: Number of heads; head m attends to pillar height m.
+        kernel_size: Rows and columns of the kernel. An even kernel, which needs ``bilinear``, lies
+            half a pixel to the left and up.
+        bilinear: Sample between pixels (MapQR) instead of at the nearest one; zero outside the map.
+        released_cells: Use the visible cells of the first sample of the batch for all samples, as
+            in the released code. The result of a sample then depends on its batch.
+        equal_weights: Start from equal weights over the kernel, as GKT's code intends. In MapTR and
+            its successors they start from Xavier's distribution, because the transformer around
+            them initialises all matrices later.
+
+    Raises:
+        ValueError: If a kernel size is even without ``bilinear``, or ``embed_dims`` is not a
+            multiple of ``num_heads``.
     """
 
     offsets: Tensor
-    fixed_sizes = False  # whether unseen pairs of cell and camera are computed too, with weight 0
+    fixed_sizes = False  # whether invisible pairs of cell and camera are computed, with weight 0
 
     def __init__(
         self,
@@ -59,7 +70,8 @@ class GeometryKernelAttention(nn.Module):
                 f"embed_dims must be divisible by num_heads, got {embed_dims} and {num_heads}."
             )
         self.num_heads = self.num_heights = num_heads
-        self.bilinear, self.released_cells = bilinear, released_cells
+        self.bilinear = bilinear
+        self.released_cells = released_cells
         self.equal_weights = equal_weights
         self.register_buffer("offsets", kernel_offsets(kernel_size), persistent=False)
         self.attention_weights = nn.Linear(embed_dims, num_heads * len(self.offsets))
@@ -68,7 +80,10 @@ class GeometryKernelAttention(nn.Module):
         self.init_weights()
 
     def init_weights(self) -> None:
-        """Initialise all matrices (Xavier), those of the kernel's weights unless they are equal."""
+        """Initialise all matrices from Xavier's uniform distribution.
+
+        With ``equal_weights``, the attention weights start from zero logits.
+        """
         if self.equal_weights:
             constant_init(self.attention_weights, 0.0)
         else:
@@ -77,37 +92,53 @@ class GeometryKernelAttention(nn.Module):
         xavier_init(self.output_proj, distribution="uniform")
 
     def forward(self, query: Tensor, img_feats: Tensor, projection: PillarProjection) -> Tensor:
-        """Collect camera features (B, V, C, h, w) for every cell's query, without the residual.
+        """Attend from the cells to the cameras, without the residual.
 
-        The projected pillars have as many points as there are heads. (B, Q, C) -> (B, Q, C)
+        Args:
+            query: Queries of the cells. (B, Q, C)
+            img_feats: Image features. (B, V, C, h, w)
+            projection: Image coordinates of pillars with one point per head.
+
+        Returns:
+            Camera features of every cell. (B, Q, C)
         """
         height, width = img_feats.shape[-2:]
         value = self.value_proj(img_feats.flatten(3).transpose(2, 3))  # (B, V, h * w, C)
         logits = self.attention_weights(query).float().unflatten(-1, (self.num_heads, -1))
         weights = logits.softmax(-1)  # (B, Q, heads, S)
         visible = projection.visible
-        served = visible[:1].expand_as(visible) if self.released_cells else visible
+        pairs = visible[:1].expand_as(visible) if self.released_cells else visible
         shape = (height, width)
         if self.fixed_sizes or has_kernel(value):
             maps = value.unflatten(-1, (self.num_heads, -1))
             summed = sample_kernels(
-                maps, shape, projection.uv, served, weights, self.offsets, self.bilinear
+                maps, shape, projection.uv, pairs, weights, self.offsets, self.bilinear
             ).flatten(2)
         else:
-            summed = self._sum_pairs(value.float(), shape, projection.uv, served, weights)
+            summed = self._sum_pairs(
+                value.float(), shape=shape, uv=projection.uv, pairs=pairs, weights=weights
+            )
         count = visible.sum(1).clamp(min=1)  # (B, Q)
         return self.output_proj(summed / count[..., None])
 
     def _sum_pairs(
-        self, value: Tensor, shape: tuple[int, int], uv: Tensor, served: Tensor, weights: Tensor
+        self, value: Tensor, shape: tuple[int, int], uv: Tensor, pairs: Tensor, weights: Tensor
     ) -> Tensor:
-        """Do what `sample_kernels` does for the pairs of a cell and a camera that sees it alone.
+        """Sum kernels over cameras as `sample_kernels` does, computing the visible pairs only.
 
-        Maps (B, V, h * w, C), the rest as there. (B, Q, C)
+        Args:
+            value: Projected image features. (B, V, h * w, C)
+            shape: Rows h and columns w of the feature maps.
+            uv: Projected pillars, [0, 1] over the image. (B, V, Q, heads, 2)
+            pairs: Whether a cell attends to a camera. (B, V, Q)
+            weights: Attention weights over the kernel. (B, Q, heads, S)
+
+        Returns:
+            The sums. (B, Q, C)
         """
         batch, num_queries = weights.shape[:2]
         num_views, num_pixels = value.shape[1:3]
-        sample, view, cell = served.nonzero(as_tuple=True)  # T pairs
+        sample, view, cell = pairs.nonzero(as_tuple=True)  # T pairs
         pixels, pair_weights = kernel_pixels(
             uv[sample, view, cell], self.offsets, weights[sample, cell], shape, self.bilinear
         )  # (T, heads, S)

@@ -9,27 +9,37 @@ from gsmap.structures.tensors import uploaded
 
 @MODELS.register_module()
 class GridMask(nn.Module):
-    """Black out a regular grid of squares in all images of a batch (Chen et al., 2020).
+    """GridMask augmentation (arXiv 2001.04086): a regular grid of black squares in all images.
 
-    ``prob``, in [0, 1], is the probability of a batch to be masked, ``ratio``, in (0, 1), the side
-    of a kept square over the period of the grid; else ValueError.
+    Args:
+        prob: Probability to mask a batch, in [0, 1].
+        ratio: Width of a kept stripe over the period of the grid, in (0, 1).
+
+    Raises:
+        ValueError: If an argument is out of range.
     """
 
     def __init__(self, prob: float = 0.7, ratio: float = 0.5) -> None:
         super().__init__()
         if not 0 <= prob <= 1 or not 0 < ratio < 1:
             raise ValueError(f"prob must be in [0, 1] and ratio in (0, 1), got {prob} and {ratio}.")
-        self.prob, self.ratio = prob, ratio
+        self.prob = prob
+        self.ratio = ratio
 
     def forward(self, images: Tensor) -> Tensor:
-        """Mask the images, or return them as they are. (V, 3, H, W)"""
+        """Mask the images with probability ``prob``. (V, 3, H, W) -> (V, 3, H, W)"""
         if torch.rand(()) >= self.prob:
             return images
         (mask,) = uploaded([self.draw_mask(*images.shape[-2:])], images.device)
         return images * mask.to(images.dtype)
 
     def draw_mask(self, height: int, width: int) -> Tensor:
-        """Return one where the image is kept and zero in the squares of a random grid. (H, W)"""
+        """Random mask: 1 where the image is kept, 0 in the squares. (H, W)
+
+        Args:
+            height: Rows of the images.
+            width: Columns of the images.
+        """
         period = int(torch.randint(2, height, ()))
         side = min(max(round(period * self.ratio), 1), period - 1)
         row, col = torch.randint(period, (2,)).tolist()

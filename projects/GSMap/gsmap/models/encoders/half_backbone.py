@@ -14,12 +14,12 @@ from gsmap.structures.tensors import tensor_versions
 
 
 class HalfBackbone:
-    """Runs copies of an image backbone and its neck whose weights are float16, cast once.
+    """Runs copies of an image backbone and its neck with float16 weights, cast once.
 
-    Nearly all arithmetic of a frame is there. Autocast would cast every weight again at each frame.
-    Batch norms of ResNets are folded in float32, before the cast. On a GPU, convolutions of ResNet
-    blocks apply their bias, the residual and the ReLU themselves (cuDNN's fused operators). The
-    copies are made when they are first needed or a weight has changed.
+    These two do nearly all arithmetic of a frame. Autocast would cast every weight at each frame.
+    Batch norms of ResNets are folded in float32, before the cast. On a GPU, a convolution of a
+    ResNet block includes its bias, the residual and the ReLU (fused operators of cuDNN). The copies
+    are made on first use and again after a weight has changed.
     """
 
     def __init__(self) -> None:
@@ -32,7 +32,7 @@ class HalfBackbone:
     def __call__(
         self, backbone: nn.Module, neck: nn.Module | None, images: Tensor, channels_last: bool
     ) -> list[Tensor]:
-        """Feature maps of normalised images.
+        """Compute the feature maps of normalised images.
 
         Args:
             backbone: The image backbone, in evaluation mode.
@@ -47,13 +47,13 @@ class HalfBackbone:
         state = tensor_versions(backbone) + ([] if neck is None else tensor_versions(neck))
         if self.backbone is None or state != self.state:
             folds = can_be_folded(backbone)
-            copied = copy.deepcopy(backbone)
-            copied = fuse_conv_bn(copied) if folds else copied
-            self.backbone = copied.half().to(memory_format=memory_format)  # type: ignore[call-overload]
+            replica = copy.deepcopy(backbone)
+            replica = fuse_conv_bn(replica) if folds else replica
+            self.backbone = replica.half().to(memory_format=memory_format)  # type: ignore[call-overload]
             self.neck = copy.deepcopy(neck)
             if self.neck is not None:
                 self.neck.half().to(memory_format=memory_format)  # type: ignore[call-overload]
-            self.fuses = folds and _is_plain(copied)
+            self.fuses = folds and _is_plain(replica)
             self.state = state
         images = images.to(torch.float16, memory_format=memory_format)
         if self.fuses and images.is_cuda:
@@ -92,16 +92,26 @@ def fused_resnet(backbone: ResNet, images: Tensor) -> tuple[Tensor, ...]:
 
 
 def _convolve(conv: nn.Conv2d, x: Tensor, identity: Tensor | None = None) -> Tensor:
-    """Convolution, then bias, the residual if there is one, and ReLU, as one operator."""
-    geometry: Any = (conv.stride, conv.padding, conv.dilation, conv.groups)
+    """Convolution, bias, optional residual and ReLU as one operator."""
+    geometry: Any = {
+        "stride": conv.stride,
+        "padding": conv.padding,
+        "dilation": conv.dilation,
+        "groups": conv.groups,
+    }
     if identity is None:
-        return torch.cudnn_convolution_relu(x, conv.weight, conv.bias, *geometry)
-    return torch.cudnn_convolution_add_relu(x, conv.weight, identity, 1.0, conv.bias, *geometry)
+        return torch.cudnn_convolution_relu(x, weight=conv.weight, bias=conv.bias, **geometry)
+    return torch.cudnn_convolution_add_relu(
+        x, weight=conv.weight, z=identity, alpha=1.0, bias=conv.bias, **geometry
+    )
 
 
 def _is_plain(backbone: nn.Module) -> bool:
-    """Return whether a folded backbone is a ResNet of plain blocks, as `fused_resnet` takes it."""
+    """Whether a folded backbone is a ResNet of plain blocks, which `fused_resnet` requires."""
     if not isinstance(backbone, ResNet) or backbone.deep_stem or backbone.plugins is not None:
         return False
-    blocks = [block for name in backbone.res_layers for block in getattr(backbone, name)]
-    return all(type(block) in (BasicBlock, Bottleneck) for block in blocks)
+    for name in backbone.res_layers:
+        for block in getattr(backbone, name):
+            if type(block) not in (BasicBlock, Bottleneck):
+                return False
+    return True

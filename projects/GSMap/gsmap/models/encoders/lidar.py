@@ -1,4 +1,4 @@
-"""BEV features from LiDAR with mmdet3d's own modules, and their fusion with the cameras'."""
+"""BEV features from LiDAR with modules of mmdet3d, and their fusion with camera features."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,18 +17,19 @@ from gsmap.structures.grid import BEVGrid
 
 @MODELS.register_module()
 class LidarEncoder(BaseModule):
-    """Voxels to BEV features: PointPillars or SECOND, according to its parts.
+    """BEV features of voxels: PointPillars or SECOND, depending on the configs of its modules.
 
-    The data preprocessor voxelises (``voxel=True``), with the extent of the map as its range.
+    The data preprocessor makes the voxels (``voxel=True``). Its range must be the extent of the
+    map.
 
     Args:
-        grid: The map's extent.
-        voxel_encoder: Config of the encoder of each voxel's points.
-        middle_encoder: Config of what spreads the voxels over the plane.
+        grid: Extent of the map.
+        voxel_encoder: Config of the encoder of the points of a voxel.
+        middle_encoder: Config of the module that scatters voxels to the BEV plane.
         backbone: Config of the 2D backbone, or None.
         neck: Config of the neck, or None; its first output is used.
-        bev_pixel_m: Side of a cell of the output, to which the features are interpolated, in
-            metres, or its sizes along x and y.
+        bev_pixel_m: Side of a cell of the output in metres, or its sizes along x and y. The
+            features are interpolated to these cells.
     """
 
     def __init__(
@@ -50,11 +51,18 @@ class LidarEncoder(BaseModule):
         self.bev_size = (cells.height, cells.width)
 
     def forward(self, voxels: dict[str, Tensor], batch_size: int) -> Tensor:
-        """Encode the voxels of a batch to BEV features (B, C, H, W), row 0 at the smallest y.
+        """Encode the voxels of a batch.
 
-        They are ``voxels`` (M, points, channels), ``num_points`` (M,) and ``coors`` (M, 4): sample,
-        z, y, x. RuntimeError if a sparse encoder is to run on the CPU without spconv, or to train
-        there, which spconv cannot do.
+        Args:
+            voxels: ``voxels`` (M, points, channels), ``num_points`` (M,) and ``coors`` (M, 4), the
+                latter as sample, z, y, x.
+            batch_size: Number B of samples.
+
+        Returns:
+            BEV features, row 0 at the smallest y. (B, C, H, W)
+
+        Raises:
+            RuntimeError: If a sparse encoder runs on the CPU without spconv, or trains on the CPU.
         """
         coors = voxels["coors"]
         if isinstance(self.middle_encoder, SparseEncoder) and not coors.is_cuda:
@@ -80,7 +88,14 @@ class LidarEncoder(BaseModule):
 
 @MODELS.register_module()
 class ConvFuser(ConvModule):
-    """One convolution over the joined BEV features of cameras and LiDAR (mmcv's ``ConvModule``)."""
+    """One convolution over the concatenated BEV features of cameras and LiDAR.
+
+    Args:
+        camera_channels: Channels of the camera features.
+        lidar_channels: Channels of the LiDAR features.
+        out_channels: Channels of the output.
+        kwargs: Further arguments of ``mmcv.cnn.ConvModule``.
+    """
 
     def __init__(
         self, camera_channels: int, lidar_channels: int, out_channels: int, **kwargs: Any
@@ -89,5 +104,13 @@ class ConvFuser(ConvModule):
         super().__init__(camera_channels + lidar_channels, out_channels, **{**defaults, **kwargs})
 
     def forward(self, camera_feats: Tensor, lidar_feats: Tensor) -> Tensor:
-        """Fuse both, of one size. 2 x (B, C, H, W) -> (B, C, H, W)"""
+        """Fuse two BEV maps of equal size.
+
+        Args:
+            camera_feats: BEV features of the cameras. (B, camera_channels, H, W)
+            lidar_feats: BEV features of the LiDAR. (B, lidar_channels, H, W)
+
+        Returns:
+            The fused features. (B, out_channels, H, W)
+        """
         return super().forward(torch.cat([camera_feats, lidar_feats], 1))

@@ -22,21 +22,24 @@ CAMERA_MATRICES = ("cam2img", "img_aug_matrix", "ego_from_cam")
 class LSSEncoder(CameraEncoder):
     """Lift image features by predicted depth, sum them in BEV cells, refine by convolutions.
 
-    The cells are half as large as those of the output; the second convolution halves the
-    resolution.
+    The cells of the sum have half the side of the output's cells; the second convolution has
+    stride 2.
 
     Args:
-        grid: The map's extent; points outside are dropped.
-        z_range: Lowest and highest z in metres; it is one layer.
+        grid: Extent of the map; points outside are dropped.
+        z_range: Lowest and highest z of the points in metres.
         bev_pixel_m: Side of a cell of the output in metres, or its sizes along x and y.
         embed_dims: Channels C of image and BEV features.
-        depth_range: ``(low, high, step)`` of the depth bins in metres; ValueError if there is none.
-        camera_aware: Whether the depth net reads the cameras' parameters (MapTRv2) or is one
-            convolution (the BEVPool variant of MapTR).
-        aspp_channels: Channels of each branch of the camera-aware depth head's pyramid.
+        depth_range: ``(low, high, step)`` of the depth bins in metres.
+        camera_aware: Use the depth net with camera parameters (MapTRv2). Otherwise one convolution,
+            as in the BEVPool variant of MapTR.
+        aspp_channels: Channels of each branch of the pyramid of the camera-aware depth head.
+
+    Raises:
+        ValueError: If ``depth_range`` contains no bin.
     """
 
-    fixed_sizes = False  # whether points are scattered into cells, in place of sorted by cell
+    fixed_sizes = False  # whether points are scattered into cells instead of sorted by cell
 
     def __init__(
         self,
@@ -53,37 +56,54 @@ class LSSEncoder(CameraEncoder):
         self.grid = grid.rasterized(bev_pixel_m)
         self.cells = self.grid.resized(2 * self.grid.height, 2 * self.grid.width)
         self.z_range = (float(z_range[0]), float(z_range[1]))
-        low, high, step = (float(x) for x in depth_range)
-        self.depth_range = low, high, step
+        low, high, step = depth_range
+        self.depth_range = (float(low), float(high), float(step))
         self.num_bins = num_depth_bins(self.depth_range)
         self.camera_aware = camera_aware
         self.calibration = ("frame_from_img", *(CAMERA_MATRICES if camera_aware else ()))
-        sizes = (embed_dims, embed_dims, self.num_bins)
-        self.depth_net = (
-            CameraAwareDepthNet(*sizes, aspp_channels) if camera_aware else PlainDepthNet(*sizes)
-        )
-        blocks = []
+        channels = {
+            "in_channels": embed_dims,
+            "context_channels": embed_dims,
+            "depth_channels": self.num_bins,
+        }
+        self.depth_net: CameraAwareDepthNet | PlainDepthNet
+        if camera_aware:
+            self.depth_net = CameraAwareDepthNet(aspp_channels=aspp_channels, **channels)
+        else:
+            self.depth_net = PlainDepthNet(**channels)
+        blocks = nn.Sequential()
         for stride in (1, 2, 1):
-            conv = nn.Conv2d(embed_dims, embed_dims, 3, stride=stride, padding=1, bias=False)
-            blocks += [conv, nn.BatchNorm2d(embed_dims), nn.ReLU(inplace=True)]
-        self.downsample = nn.Sequential(*blocks)
+            blocks.append(
+                nn.Conv2d(embed_dims, embed_dims, 3, stride=stride, padding=1, bias=False)
+            )
+            blocks.append(nn.BatchNorm2d(embed_dims))
+            blocks.append(nn.ReLU(inplace=True))
+        self.downsample = blocks
 
     def init_weights(self) -> None:
-        """Initialise matrices and kernels as upstream's transformer does: Xavier, uniform."""
+        """Initialise matrices and kernels from Xavier's uniform distribution, as in MapTRv2."""
         super().init_weights()
         init_matrices(self)
 
     def encode(
         self, feats: Tensor, calibration: Mapping[str, Tensor], img_shape: tuple[int, int]
     ) -> dict[str, Any]:
-        """Encode features, with ``frame_from_img`` and, camera-aware, ``CAMERA_MATRICES``.
+        """Encode image features as BEV features.
 
-        Beside ``bev_feats`` (B, C, H, W) there are ``depth``, the probability of each depth bin (B,
-        V, D, h, w), its ``depth_range``, and ``img_feats``, the features used (B, V, C, h, w).
+        Args:
+            feats: Image features. (B, V, C, h, w)
+            calibration: ``frame_from_img`` (B, V, 4, 4), and ``CAMERA_MATRICES`` if the encoder is
+                camera-aware.
+            img_shape: Rows and columns of the padded images.
+
+        Returns:
+            ``bev_feats`` (B, C, H, W); ``depth``, the probability of each depth bin
+            (B, V, D, h, w), and its ``depth_range``; the input as ``img_feats``.
         """
         vectors = None
         if self.camera_aware:
-            vectors = camera_vector(*(calibration[name] for name in CAMERA_MATRICES)).flatten(0, 1)
+            matrices = {name: calibration[name] for name in CAMERA_MATRICES}
+            vectors = camera_vector(**matrices).flatten(0, 1)  # (B * V, 22)
         logits, context = self.depth_net(feats.flatten(0, 1), vectors)
         depth = logits.float().softmax(1).unflatten(0, feats.shape[:2])  # (B, V, D, h, w)
         context = context.float().unflatten(0, feats.shape[:2])  # (B, V, C, h, w)
@@ -94,10 +114,28 @@ class LSSEncoder(CameraEncoder):
             bev = bev_pool_conv3x3(
                 depth, context, indices, self.cells, kernel.float(), self.fixed_sizes
             )
-        lifted = {"depth": depth, "depth_range": self.depth_range, "img_feats": feats}
-        return {"bev_feats": self.downsample[1:](bev), **lifted}
+        return {
+            "bev_feats": self.downsample[1:](bev),
+            "depth": depth,
+            "depth_range": self.depth_range,
+            "img_feats": feats,
+        }
 
     def points(self, frame_from_img: Tensor, img_shape: tuple[int, int], feats: Tensor) -> Tensor:
-        """Return every feature pixel at every depth, in metres. (B, V, D, h, w, 3)"""
-        depths = torch.arange(*self.depth_range, device=feats.device)
-        return frustum_points(frame_from_img, img_shape, (feats.shape[-2], feats.shape[-1]), depths)
+        """Points of every feature pixel at every depth, in the annotation frame.
+
+        Args:
+            frame_from_img: Matrices from (u * d, v * d, d, 1) to metres. (B, V, 4, 4)
+            img_shape: Rows and columns of the padded images.
+            feats: Image features. (B, V, C, h, w)
+
+        Returns:
+            Points in metres. (B, V, D, h, w, 3)
+        """
+        low, high, step = self.depth_range
+        return frustum_points(
+            frame_from_img,
+            image_size=img_shape,
+            feature_size=(feats.shape[-2], feats.shape[-1]),
+            depths_m=torch.arange(low, high, step, device=feats.device),
+        )

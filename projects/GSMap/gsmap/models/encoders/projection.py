@@ -12,28 +12,34 @@ _MIN_DEPTH_M = 1e-5
 
 
 class PillarProjection(NamedTuple):
-    """Where the Z pillar points of all Q cells fall in every camera, and which cells it sees."""
+    """Projection of the Z pillar points of all Q cells into V cameras.
 
-    uv: Tensor  # [0, 1] over the (padded) image; meaningless behind the camera (B, V, Q, Z, 2)
-    visible: Tensor  # whether it sees any point of the cell's pillar (B, V, Q)
+    Attributes:
+        uv: Image coordinates, [0, 1] over the padded image; undefined behind a camera.
+            (B, V, Q, Z, 2)
+        visible: Whether any point of the cell's pillar lies in the image. (B, V, Q)
+    """
+
+    uv: Tensor
+    visible: Tensor
 
 
 def pillar_points(
     grid: BEVGrid, z_range: tuple[float, float], num_heights: int, device: torch.device
 ) -> Tensor:
-    """Return the middle of equal slices of a range of heights over every cell centre.
+    """Points of a vertical pillar over every cell: the centres of Z slices of equal height.
 
     Args:
         grid: The cells, H x W = Q.
-        z_range: Smallest and largest height in the annotation frame, in metres.
+        z_range: Lowest and highest z in the annotation frame, in metres.
         num_heights: Number Z of slices.
-        device: Where the points go.
+        device: Device of the points.
 
     Returns:
         Homogeneous points (x, y, z, 1) in metres, cells row by row. (Q, Z, 4)
     """
-    # Fractions first, then metres, in float32: kernel positions round, so the order of operations
-    # matters.
+    # Fractions first, then metres, in float32: the positions of kernels are rounded, so the order
+    # of operations changes results.
     cols = torch.linspace(0.5, grid.width - 0.5, grid.width, device=device) / grid.width
     rows = torch.linspace(0.5, grid.height - 0.5, grid.height, device=device) / grid.height
     heights = torch.linspace(0.5 / num_heights, 1 - 0.5 / num_heights, num_heights, device=device)
@@ -47,11 +53,11 @@ def pillar_points(
 def project_pillars(
     points: Tensor, img_from_frame: Tensor, img_shape: tuple[int, int]
 ) -> PillarProjection:
-    """Project points to pixels.
+    """Project pillar points into the cameras.
 
     Args:
         points: Homogeneous points in the annotation frame, in metres. (Q, Z, 4)
-        img_from_frame: Matrices to pixels. (B, V, 4, 4)
+        img_from_frame: Matrices from metres to (u * d, v * d, d, 1) in pixels. (B, V, 4, 4)
         img_shape: Rows and columns of the padded image.
     """
     with torch.autocast(points.device.type, enabled=False):
@@ -61,9 +67,12 @@ def project_pillars(
 
 
 def visible_points(projected: Tensor, img_shape: tuple[int, int]) -> PillarProjection:
-    """Divide pillar points (u * d, v * d, d, ...) by their depth, and say who sees a cell.
+    """Normalised image coordinates and visibility of projected pillar points.
 
-    (B, V, Q, Z, 3 or 4) in pixels and metres; ``img_shape`` as in `project_pillars`.
+    Args:
+        projected: Points (u * d, v * d, d, ...), with pixels u, v and the depth d in metres.
+            (B, V, Q, Z, 3 or 4)
+        img_shape: Rows and columns of the padded image.
     """
     depth = projected[..., 2]
     uv = projected[..., :2] / depth.clamp(min=_MIN_DEPTH_M)[..., None]
@@ -75,17 +84,18 @@ def visible_points(projected: Tensor, img_shape: tuple[int, int]) -> PillarProje
 def pixel_rays(
     frame_from_img: Tensor, image_size: tuple[int, int], feature_size: tuple[int, int]
 ) -> Tensor:
-    """Return what every feature pixel looks along, of depth 1.
+    """Viewing rays of the feature pixels, as vectors to depth 1.
 
     Args:
-        frame_from_img: As of `frustum_points`. (..., 3 or 4, 3 or 4)
-        image_size: Height and width of the (padded) image in pixels.
+        frame_from_img: Matrices as in `frustum_points`. (..., 3 or 4, 3 or 4)
+        image_size: Height and width of the padded image in pixels.
         feature_size: Height h and width w of the feature map.
 
     Returns:
-        Vectors in metres, in the frame of the map. (..., h, w, 3)
+        Vectors in metres, in the annotation frame. (..., h, w, 3)
     """
-    device, dtype = frame_from_img.device, frame_from_img.dtype
+    device = frame_from_img.device
+    dtype = frame_from_img.dtype
     u = torch.linspace(0, image_size[1] - 1, feature_size[1], device=device, dtype=dtype)
     v = torch.linspace(0, image_size[0] - 1, feature_size[0], device=device, dtype=dtype)
     u, v = torch.meshgrid(u, v, indexing="xy")  # (h, w)
@@ -99,19 +109,23 @@ def frustum_points(
     feature_size: tuple[int, int],
     depths_m: Tensor,
 ) -> Tensor:
-    """Place every feature pixel at every depth, in the frame of the map.
+    """Points of every feature pixel at every depth, in the annotation frame.
 
-    Feature pixels are spread evenly from the first to the last pixel of the image, ends included,
-    as in MapTRv2 (they are not the centres of the feature cells).
+    Feature pixels are spaced evenly from the first to the last pixel of the image, as in MapTRv2.
+    They are not the centres of the feature cells.
 
     Args:
         frame_from_img: Inverse of ``lidar2img`` after augmentation: maps (u * d, v * d, d, 1), with
             the pixel (u, v) and the depth d in metres, to (x, y, z, 1) in metres. (..., 4, 4)
-        image_size: Height and width of the (padded) image in pixels.
+        image_size: Height and width of the padded image in pixels.
         feature_size: Height h and width w of the feature map.
-        depths_m: Along the optical axis. (D,)
+        depths_m: Depths along the optical axis, in metres. (D,)
 
-    ValueError if ``frame_from_img`` does not hold 4 x 4 matrices. -> (..., D, h, w, 3) in metres
+    Returns:
+        Points in metres. (..., D, h, w, 3)
+
+    Raises:
+        ValueError: If ``frame_from_img`` does not contain 4 x 4 matrices.
     """
     if frame_from_img.shape[-2:] != (4, 4):
         raise ValueError(

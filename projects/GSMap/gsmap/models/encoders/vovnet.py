@@ -1,6 +1,6 @@
-"""VoVNetV2, an image backbone (arXiv 1911.06667): the V2-99 of GeMap's largest models.
+"""VoVNetV2, an image backbone (arXiv 1911.06667): the V2-99 of the largest GeMap models.
 
-Modules are named as in the original, slashes included, so that its checkpoints load as they are.
+Module names, including their slashes, equal those of the original, so its checkpoints load.
 """
 
 from collections import OrderedDict
@@ -12,7 +12,7 @@ from mmengine.model import BaseModule
 from torch import Tensor, nn
 
 STEM_CHANNELS = (64, 64, 128)
-STAGE_CHANNELS = ((128, 256), (160, 512), (192, 768), (224, 1024))  # of a layer, of the output
+STAGE_CHANNELS = ((128, 256), (160, 512), (192, 768), (224, 1024))  # hidden, output
 LAYERS_AND_BLOCKS = {  # layers per block, blocks of the four stages
     19: (3, (1, 1, 1, 1)),
     39: (5, (1, 1, 2, 2)),
@@ -24,7 +24,7 @@ LAYERS_AND_BLOCKS = {  # layers per block, blocks of the four stages
 def _convolution(
     name: str, in_channels: int, channels: int, size: int, stride: int = 1
 ) -> list[tuple[str, nn.Module]]:
-    """Return a convolution with norm and ReLU, by name."""
+    """Convolution, batch norm and ReLU with their names."""
     padding = size // 2
     return [
         (f"{name}/conv", nn.Conv2d(in_channels, channels, size, stride, padding, bias=False)),
@@ -34,9 +34,13 @@ def _convolution(
 
 
 class OneShotAggregation(nn.Module):
-    """A chain of 3x3 convolutions, all aggregated at its end by one 1x1, whose channels are gated.
+    """A chain of 3x3 convolutions, aggregated at its end by a 1x1 convolution with gated channels.
 
-    Its modules' names begin with its own; channels are those of input, convolutions and output.
+    Args:
+        name: Prefix of the names of the modules.
+        channels: Channels of the input, of the 3x3 convolutions and of the output.
+        num_layers: Number of 3x3 convolutions.
+        residual: Add the input to the output.
     """
 
     def __init__(
@@ -44,37 +48,51 @@ class OneShotAggregation(nn.Module):
     ) -> None:
         super().__init__()
         self.residual = residual
-        first, layer, last = channels
-        inputs = [first] + [layer] * (num_layers - 1)
-        self.layers = nn.ModuleList(
-            nn.Sequential(OrderedDict(_convolution(f"{name}_{i}", size, layer, 3)))
-            for i, size in enumerate(inputs)
+        in_channels, hidden_channels, out_channels = channels
+        self.layers = nn.ModuleList()
+        for index in range(num_layers):
+            conv = _convolution(
+                f"{name}_{index}",
+                in_channels=hidden_channels if index else in_channels,
+                channels=hidden_channels,
+                size=3,
+            )
+            self.layers.append(nn.Sequential(OrderedDict(conv)))
+        concat = _convolution(
+            f"{name}_concat",
+            in_channels=in_channels + num_layers * hidden_channels,
+            channels=out_channels,
+            size=1,
         )
-        total = first + num_layers * layer
-        self.concat = nn.Sequential(OrderedDict(_convolution(f"{name}_concat", total, last, 1)))
-        gate = OrderedDict(fc=nn.Conv2d(last, last, 1), gate=nn.Hardsigmoid())
+        self.concat = nn.Sequential(OrderedDict(concat))
+        gate = OrderedDict(fc=nn.Conv2d(out_channels, out_channels, 1), gate=nn.Hardsigmoid())
         self.ese = nn.Sequential(gate)  # effective squeeze and excitation
 
     def forward(self, feats: Tensor) -> Tensor:
-        """Return the block's features. (B, C, H, W)"""
+        """Run the block. (n, C_in, H, W) -> (n, C_out, H, W)"""
         outputs = [feats]
         for layer in self.layers:
             outputs.append(layer(outputs[-1]))
         aggregated = self.concat(torch.cat(outputs, 1))
         gated = aggregated * self.ese(aggregated.mean((2, 3), keepdim=True))
-        return gated + feats if self.residual else gated
+        if self.residual:
+            return gated + feats
+        return gated
 
 
 @MODELS.register_module()
 class VoVNet(BaseModule):
-    """VoVNetV2 with effective squeeze and excitation; ValueError for another depth or index.
+    """VoVNetV2 with effective squeeze and excitation.
 
     Args:
         depth: 19, 39, 57 or 99.
-        out_indices: Stages whose features are returned: 0 to 3, at 1/4, 1/8, 1/16 and 1/32 of the
-            image's size.
-        frozen_stages: Train none of the stem (0) and the first so many stages; -1 trains all.
-        norm_eval: Keep the statistics of batch norms.
+        out_indices: Stages of the output: 0 to 3, at 1/4, 1/8, 1/16 and 1/32 of the image size.
+        frozen_stages: The stem and this number of stages are not trained; -1 trains all.
+        norm_eval: Keep the running statistics of batch norms in training.
+        init_cfg: Initialisation of mmengine.
+
+    Raises:
+        ValueError: If an argument is out of range.
     """
 
     def __init__(
@@ -94,21 +112,32 @@ class VoVNet(BaseModule):
                 f"{tuple(out_indices)} and {frozen_stages}."
             )
         self.out_indices = tuple(out_indices)
-        self.frozen_stages, self.norm_eval = frozen_stages, norm_eval
-        first, second, channels = STEM_CHANNELS
-        stem = _convolution("stem_1", 3, first, 3, 2) + _convolution("stem_2", first, second, 3)
-        stem += _convolution("stem_3", second, channels, 3, 2)
+        self.frozen_stages = frozen_stages
+        self.norm_eval = norm_eval
+        first, second, third = STEM_CHANNELS
+        stem = [
+            *_convolution("stem_1", in_channels=3, channels=first, size=3, stride=2),
+            *_convolution("stem_2", in_channels=first, channels=second, size=3),
+            *_convolution("stem_3", in_channels=second, channels=third, size=3, stride=2),
+        ]
         self.stem = nn.Sequential(OrderedDict(stem))
         num_layers, num_blocks = LAYERS_AND_BLOCKS[depth]
-        stages = [nn.Sequential() for _ in STAGE_CHANNELS]
-        for index, (stage, (layer, last)) in enumerate(zip(stages, STAGE_CHANNELS, strict=True)):
+        in_channels = third
+        for index, (hidden_channels, out_channels) in enumerate(STAGE_CHANNELS):
+            stage = nn.Sequential()
             if index:
                 stage.add_module("Pooling", nn.MaxPool2d(3, 2, ceil_mode=True))
-            for block in range(num_blocks[index]):
-                name, sizes = f"OSA{index + 2}_{block + 1}", (channels, layer, last)
-                stage.add_module(name, OneShotAggregation(name, sizes, num_layers, block > 0))
-                channels = last
-        self.stage2, self.stage3, self.stage4, self.stage5 = stages
+            for block_index in range(num_blocks[index]):
+                name = f"OSA{index + 2}_{block_index + 1}"
+                block = OneShotAggregation(
+                    name,
+                    channels=(in_channels, hidden_channels, out_channels),
+                    num_layers=num_layers,
+                    residual=block_index > 0,
+                )
+                stage.add_module(name, block)
+                in_channels = out_channels
+            self.add_module(f"stage{index + 2}", stage)
 
     @property
     def stages(self) -> tuple[nn.Sequential, ...]:
@@ -116,8 +145,9 @@ class VoVNet(BaseModule):
         return self.stage2, self.stage3, self.stage4, self.stage5
 
     def forward(self, images: Tensor) -> tuple[Tensor, ...]:
-        """Return the chosen stages' features. (n, 3, H, W) -> tuple of (n, C, h, w)"""
-        feats, outputs = self.stem(images), []
+        """Feature maps of the stages in ``out_indices``. (n, 3, H, W) -> tuple of (n, C, h, w)"""
+        feats = self.stem(images)
+        outputs = []
         for index, stage in enumerate(self.stages):
             feats = stage(feats)
             if index in self.out_indices:
@@ -125,7 +155,7 @@ class VoVNet(BaseModule):
         return tuple(outputs)
 
     def train(self, mode: bool = True) -> "VoVNet":
-        """Switch to training, but for what is frozen."""
+        """Set the training mode; frozen modules stay in evaluation mode."""
         super().train(mode)
         for part in (self.stem, *self.stages)[: self.frozen_stages + 1]:
             part.eval().requires_grad_(False)
