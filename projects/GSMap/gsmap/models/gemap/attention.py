@@ -1,4 +1,4 @@
-"""GeMap's self-attention, among the points of other instances and within each instance."""
+"""Geometry-decoupled self-attention of GeMap: between instances, then within each of them."""
 
 import torch
 from mmdet3d.registry import MODELS
@@ -8,7 +8,7 @@ from gsmap.models.base.layers import mlp
 
 
 class _AttentionBlock(nn.Module):
-    """Attention and feed-forward, each normalised *before* its residual is added."""
+    """Self-attention and feed-forward network, each normalised *before* its residual is added."""
 
     def __init__(self, embed_dims: int, num_heads: int, ffn_dims: int, dropout: float) -> None:
         super().__init__()
@@ -18,7 +18,7 @@ class _AttentionBlock(nn.Module):
         self.norm2 = nn.LayerNorm(embed_dims)
 
     def forward(self, query: Tensor, attn_mask: Tensor | None = None) -> Tensor:
-        """Let queries attend to each other but where the mask (Q, Q) is True. (B, Q, C)"""
+        """Apply both. The mask (Q, Q) is True where attention is blocked. (B, Q, C)"""
         attended = self.attention(query, query, query, attn_mask=attn_mask, need_weights=False)[0]
         query = self.norm1(attended) + query
         return self.norm2(self.ffn(query)) + query
@@ -26,11 +26,17 @@ class _AttentionBlock(nn.Module):
 
 @MODELS.register_module()
 class GeometryDecoupledAttention(nn.Module):
-    """To all points of other instances, then within each (GeMap, arXiv 2312.03341).
+    """Self-attention to the points of other instances, then within each instance (GeMap).
 
-    Differs from the released code in its cost alone: there, the second step is an attention among
-    all N * P points with a mask, here one among P points per instance. ``ffn_dims`` are the hidden
-    channels of both feed-forward networks.
+    The result equals the released code's, which computes the second step as a masked attention
+    among all N * P points. Here it is an attention among P points per instance.
+
+    Args:
+        embed_dims: Channels C.
+        num_heads: Number of heads.
+        num_points: Points P per instance.
+        ffn_dims: Hidden channels of both feed-forward networks.
+        dropout: Probability to drop an attention weight in training.
     """
 
     def __init__(
@@ -43,15 +49,25 @@ class GeometryDecoupledAttention(nn.Module):
     ) -> None:
         super().__init__()
         self.num_points = num_points
-        self.inter = _AttentionBlock(embed_dims, num_heads, ffn_dims, dropout)
-        self.intra = _AttentionBlock(embed_dims, num_heads, ffn_dims, dropout)
+        sizes = {"num_heads": num_heads, "ffn_dims": ffn_dims, "dropout": dropout}
+        self.inter = _AttentionBlock(embed_dims, **sizes)
+        self.intra = _AttentionBlock(embed_dims, **sizes)
 
     def forward(
         self, query: Tensor, query_pos: Tensor | None = None, attn_mask: Tensor | None = None
     ) -> Tensor:
-        """Let points attend to other instances, then within theirs; there is no position.
+        """Update the point queries.
 
-        ValueError if the queries are not two or more instances of P points.
+        Args:
+            query: Point queries, instance after instance. (B, N * P, C)
+            query_pos: Not used: GeMap has no positional encoding here.
+            attn_mask: True where an instance may not attend to another one. (N, N)
+
+        Returns:
+            The updated queries. (B, N * P, C)
+
+        Raises:
+            ValueError: If there are fewer than two instances, or not P queries for each.
         """
         batch, count = query.shape[:2]
         if count % self.num_points or count < 2 * self.num_points:

@@ -1,4 +1,4 @@
-"""GeMap's head: instances and points attend apart, shapes and relations are supervised."""
+"""Head of GeMap: decoupled self-attention, and a loss of shapes and relations."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -13,16 +13,20 @@ from gsmap.models.gemap.losses import EuclideanLoss
 
 @MODELS.register_module()
 class GeMapHead(MapHead):
-    """The map head with GeMap's parts as defaults, on whatever else it is made of.
+    """Map head with the modules of GeMap as defaults.
 
-    On a MapTR config this is GeMap with its simple objective, on MapTRv2 with its full one.
-    Besides `MapHead`'s arguments:
+    On a MapTR config this is GeMap with its simple objective, on a MapTRv2 config with its full
+    objective.
 
     Args:
+        decoder: Config of the decoder; its self-attention is replaced if ``decoupled``.
+        losses: Configs of the losses; `EuclideanLoss` is added.
+        query_groups: Groups of queries; the first one remains unless ``one_to_many``.
         loss_euclidean: Settings of `EuclideanLoss`, or None to train without it.
-        decoupled: Let the layers' self-attention be GeMap's; else it is the config's.
+        decoupled: Use GeMap's self-attention in the layers instead of the configured one.
         one_to_many: Keep the further query groups, which GeMap does not have. The Euclidean loss of
-            many matches takes much memory: name the losses of such a group.
+            many matches takes much memory, so list the losses of such a group.
+        kwargs: Further arguments of `MapHead`.
     """
 
     def __init__(

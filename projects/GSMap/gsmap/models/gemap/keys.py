@@ -1,4 +1,4 @@
-"""The table between the state keys of GeMap's release and ours."""
+"""State keys of the GeMap release and their names here."""
 
 import torch
 
@@ -14,8 +14,8 @@ from gsmap.models.maptr.keys import (
 )
 from gsmap.models.maptrv2.keys import LIFTED_MARKER, LIFTED_RULES, LIFTED_UNUSED
 
-# The names are those of upstream since 2023-12-12. Before, upstream called the attention among
-# instances "intra" and the one within each "inter", and no key tells the two apart.
+# Names of the release since 2023-12-12. Before that date, "intra" was the attention between
+# instances and "inter" the one within each instance; no key distinguishes the two versions.
 _GEOMETRY_RULES = rules_of(
     DECODER_LAYER + "attentions.0.", LAYER + "self_attn.", "inter_=inter. intra_=intra."
 )
@@ -24,8 +24,8 @@ GEMAP = KeyMap(
     (*_GEOMETRY_RULES, *MAPTR.rules),
     {
         **CODE_WEIGHTS,
-        # On Argoverse 2, the simple objective is the full one's head with its parts switched off.
-        HEAD + "tau": None,  # a number that no computation reads
+        # On Argoverse 2, the simple objective uses the head of the full one with weights of zero.
+        HEAD + "tau": None,  # not used in any computation
         HEAD + "loss_seg.loss_fn.pos_weight": None,
         HEAD + "loss_pv_seg.loss_fn.pos_weight": None,
     },

@@ -1,8 +1,8 @@
-"""GeMap's Euclidean loss (arXiv 2312.03341): shapes of map elements and the relations between them.
+"""Euclidean loss of GeMap (arXiv 2312.03341): shapes of map elements and relations between them.
 
-Angles count by their cosine and sine, so that no angle wraps around. The released code is the
-specification: it compares coordinates normalised to [0, 1], so x and y weigh differently; every
-element has an edge from its last point to its first, open lines too.
+Angles enter by cosine and sine, which do not wrap around. Two details follow the released code:
+coordinates are normalised to [0, 1], so x and y weigh differently; and every element, including
+open lines, has an edge from its last point to its first.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,14 @@ NORM_EPS = 1e-6  # added to the product of two lengths: an edge may be a single 
 
 
 def shape_features(points: Tensor) -> Tensor:
-    """Return each edge's length, cosine and sine to the edge before. (..., P, 2) -> (3, ..., P)"""
+    """Length of each edge, cosine and sine of its angle to the edge before.
+
+    Args:
+        points: Normalised points. (..., P, 2)
+
+    Returns:
+        Length, cosine, sine. (3, ..., P)
+    """
     edges = _edges(points.movedim(-1, 0))
     lengths = edges.norm(dim=0)
     before = edges.roll(1, -1)
@@ -27,37 +34,60 @@ def shape_features(points: Tensor) -> Tensor:
 
 
 def relation_features(points: Tensor, pairs: Tensor) -> Tensor:
-    """Return distances between all points of pairs (2, R), and cosine and sine between all edges.
+    """Distances between the points, and angles between the edges, of pairs of elements.
 
-    One per point (or edge) of the first and of the second. (..., M, P, 2) -> (3, ..., R, P, P)
+    Args:
+        points: Normalised points of M elements. (..., M, P, 2)
+        pairs: Indices of the first and the second element of R pairs. (2, R)
+
+    Returns:
+        Distance of two points, cosine and sine of the angle between two edges; the last two axes
+        are the points (or edges) of the first and of the second element. (3, ..., R, P, P)
     """
     points = points.movedim(-1, 0)  # sums over a last axis of two would be slow
     edges = _edges(points)
     lengths = edges.norm(dim=0)
-    one, other = (..., pairs[0], slice(None), None), (..., pairs[1], None, slice(None))
-    distances = (points[one] - points[other]).norm(dim=0)
-    turns = _turns(edges[one], edges[other], lengths[one] * lengths[other])
+    first = (..., pairs[0], slice(None), None)
+    second = (..., pairs[1], None, slice(None))
+    distances = (points[first] - points[second]).norm(dim=0)
+    turns = _turns(edges[first], edges[second], products=lengths[first] * lengths[second])
     return torch.stack([distances, *turns])
 
 
 def euclidean_shape_loss(pred: Tensor, target: Tensor) -> Tensor:
-    """Return the mean L1 distance of shapes: of lengths, of cosines and of sines, added up.
+    """Mean L1 distance between the shape features of matched elements.
 
-    Normalised points in the same order, of M matches, 2 x (..., M, P, 2) -> (...); zero without
-    matches. ValueError if the shapes disagree.
+    Args:
+        pred: Normalised points of M predictions. (..., M, P, 2)
+        target: Normalised points of their ground truths, in matching order. (..., M, P, 2)
+
+    Returns:
+        The sum of the distances of lengths, cosines and sines; zero without matches. (...)
+
+    Raises:
+        ValueError: If the shapes disagree.
     """
     check_same_shape(pred=pred, target=target)
-    off = (shape_features(pred) - shape_features(target)).abs().sum(0)  # (..., M, P)
-    return off.sum((-2, -1)) / max(pred.shape[-3] * pred.shape[-2], 1)
+    distances = (shape_features(pred) - shape_features(target)).abs().sum(0)  # (..., M, P)
+    return distances.sum((-2, -1)) / max(pred.shape[-3] * pred.shape[-2], 1)
 
 
 def euclidean_relation_loss(pred: Tensor, target: Tensor, counts: Sequence[int]) -> Tensor:
-    """Return the L1 distance of the relations between the elements of each sample.
+    """L1 distance between the relation features of the elements of each sample.
 
-    A sample with n matches adds the sum over its pairs of elements, each taken once, divided by
-    (n * P)^2: by all pairs of points, also those of an element with itself. Normalised points,
-    sample after sample and in the same order, 2 x (..., M, P, 2) -> (...), and the matches of each
-    sample; zero where none has two. ValueError if shapes disagree or counts do not add up.
+    A sample with n matches adds the sum over its pairs of different elements, each taken once,
+    divided by the number (n * P)^2 of pairs of points, which includes pairs within an element.
+
+    Args:
+        pred: Normalised points of M predictions, sample after sample. (..., M, P, 2)
+        target: Normalised points of their ground truths, in matching order. (..., M, P, 2)
+        counts: Number of matches of each sample, M in total.
+
+    Returns:
+        The distance; zero if no sample has two matches. (...)
+
+    Raises:
+        ValueError: If the shapes disagree, or the counts do not add up to M.
     """
     check_same_shape(pred=pred, target=target)
     if sum(counts) != pred.shape[-3]:
@@ -70,19 +100,21 @@ def euclidean_relation_loss(pred: Tensor, target: Tensor, counts: Sequence[int])
         shares += [1 / max(count, 1) ** 2] * pairs[-1].shape[1]
         first += count
     on_host = [torch.cat(pairs, 1), torch.tensor(shares, dtype=pred.dtype)]
-    both, share = uploaded(on_host, pred.device)
-    off = (relation_features(pred, both) - relation_features(target, both)).abs()
-    return off.sum(0).mean((-2, -1)) @ share
+    pair_indices, pair_weights = uploaded(on_host, pred.device)
+    pred_relations = relation_features(pred, pair_indices)
+    target_relations = relation_features(target, pair_indices)
+    distances = (pred_relations - target_relations).abs()  # (3, ..., R, P, P)
+    return distances.sum(0).mean((-2, -1)) @ pair_weights
 
 
 @MODELS.register_module()
 class EuclideanLoss(MapLoss):
-    """GeMap's Euclidean loss of matched elements, of their shapes and of their relations.
+    """Euclidean loss of GeMap between matched elements.
 
     Args:
-        loss_weight: Weight of the whole (lambda of the supplement's Table A1).
-        shape_weight: Weight of the shapes within it.
-        relation_weight: Weight of the relations within it.
+        loss_weight: Weight of the loss (lambda in Table A1 of the supplement).
+        shape_weight: Weight of the shapes within the loss.
+        relation_weight: Weight of the relations within the loss.
         flags: As in `MapLoss`.
     """
 
@@ -96,14 +128,13 @@ class EuclideanLoss(MapLoss):
         **flags: bool,
     ) -> None:
         super().__init__(loss_weight, **flags)
-        self.shape_weight, self.relation_weight = shape_weight, relation_weight
+        self.shape_weight = shape_weight
+        self.relation_weight = relation_weight
 
     def by_layer(self, pairs: MatchedPairs) -> Tensor:
-        """Return the weighted loss of parts that are means, in the plane: heights are left out."""
-        pred, target = (
-            pairs.by_layer(pairs.pred_pts[..., :2]),
-            pairs.by_layer(pairs.gt_pts[..., :2]),
-        )
+        """Weighted loss of each decoder layer. Heights are ignored."""
+        pred = pairs.by_layer(pairs.pred_pts[..., :2])
+        target = pairs.by_layer(pairs.gt_pts[..., :2])
         shape = euclidean_shape_loss(pred, target)
         counts = pairs.counts[: len(pairs.counts) // pairs.num_layers]
         relation = euclidean_relation_loss(pred, target, counts)
@@ -111,12 +142,12 @@ class EuclideanLoss(MapLoss):
 
 
 def _edges(points: Tensor) -> Tensor:
-    """Return the edge that ends in each point; the first one closes the ring. (2, ..., P)"""
+    """Edges that end in each point; the first one closes the ring. (2, ..., P)"""
     return points - points.roll(1, -1)
 
 
 def _turns(first: Tensor, second: Tensor, products: Tensor) -> tuple[Tensor, Tensor]:
-    """Return cosine and sine from edges (2, ...) to others, given their lengths' products."""
+    """Cosine and sine of the angle between edges (2, ...), from the products of their lengths."""
     dot = first[0] * second[0] + first[1] * second[1]
     cross = first[0] * second[1] - first[1] * second[0]
     scale = 1 / (products + NORM_EPS)

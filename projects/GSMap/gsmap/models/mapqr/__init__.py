@@ -1,1 +1,1 @@
-"""MapQR: instance queries that scatter to their points and gather what these see."""
+"""MapQR (arXiv 2402.17430): instance queries with scatter-and-gather attention."""

@@ -1,4 +1,4 @@
-"""MapQR's decoder: an instance query is scattered to its points, which look, and gathered again."""
+"""Decoder of MapQR: instance queries with scatter-and-gather cross-attention."""
 
 import math
 from typing import Any
@@ -13,9 +13,17 @@ from gsmap.models.base.layers import mlp
 
 
 def sine_code(points: Tensor, channels: int) -> Tensor:
-    """Return a code of points (x, y) in [0, 1]: half of the channels of y, then half of x.
+    """Sinusoidal positional encoding of points.
 
-    Each half holds sine and cosine in turn, of 2 pi v / 10000^(2 i / half). (..., 2) -> (..., C)
+    The first half of the channels encodes y, the second x. Each half alternates sine and cosine of
+    2 pi v / 10000^(2 i / half).
+
+    Args:
+        points: Points (x, y) in [0, 1]. (..., 2)
+        channels: Channels C, a multiple of 4.
+
+    Returns:
+        The encoding. (..., C)
     """
     half = channels // 2
     steps = 10000.0 ** (torch.arange(0, half, 2, device=points.device) / half)
@@ -24,26 +32,36 @@ def sine_code(points: Tensor, channels: int) -> Tensor:
 
 
 class Gather(nn.Sequential):
-    """The network that joins what the points of an instance saw (MapQR)."""
+    """Gathering of MapQR: an MLP from the features of the points of an instance to one query.
+
+    Args:
+        embed_dims: Channels C.
+        points: Points P per instance.
+    """
 
     def __init__(self, embed_dims: int, points: int) -> None:
-        joined = points * embed_dims
-        super().__init__(*mlp(joined, joined // 2, embed_dims, embed_dims))
+        inputs = points * embed_dims
+        super().__init__(*mlp(inputs, inputs // 2, embed_dims, embed_dims))
         self.points = points
 
-    def forward(self, seen: Tensor) -> Tensor:
-        """Join the points of each instance. (B, N * P, C) -> (B, N, C)"""
-        return super().forward(seen.unflatten(1, (-1, self.points)).flatten(2))
+    def forward(self, point_feats: Tensor) -> Tensor:
+        """Gather the features of each instance. (B, N * P, C) -> (B, N, C)"""
+        instance_feats = point_feats.unflatten(1, (-1, self.points)).flatten(2)
+        return super().forward(instance_feats)
 
 
 @MODELS.register_module()
 class ScatterGatherAttention(BEVDeformableAttention):
-    """Deformable attention of instance queries by way of their points (MapQR).
+    """Scatter-and-gather attention of MapQR.
+
+    Each instance query is copied to its points, these attend to the BEV features, and the results
+    are gathered to one vector per instance.
 
     Args:
-        points_per_instance: Points per instance P.
-        kwargs: Arguments of :class:`SamplingAttention`; ``num_points`` are the samples per head and
-            point.
+        points_per_instance: Points P per instance.
+        embed_dims: Channels C.
+        kwargs: Further arguments of :class:`SamplingAttention`; ``num_points`` is the number of
+            samples per head and point.
     """
 
     def __init__(self, points_per_instance: int = 20, embed_dims: int = 256, **kwargs: Any) -> None:
@@ -59,29 +77,42 @@ class ScatterGatherAttention(BEVDeformableAttention):
         frames: Tensor | None = None,
         position: Tensor | float = 0.0,
     ) -> Tensor:
-        """Return what each instance's points see of the map (B, C, H, W). (B, N, C) -> (B, N, C)
+        """Attend from the points of the instances to the BEV features, without the residual.
 
-        References and frames are as in `place_samples`, of the points, as is the position that is
-        added to their copies of the query. (B, N * P, ...)
+        Args:
+            query: Instance queries. (B, N, C)
+            reference: References of the points, as in `place_samples`. (B, N * P, D)
+            feats: BEV features. (B, C, H, W)
+            frames: Frames of the points, as in `place_samples`.
+            position: Positional encoding of the points. (B, N * P, C)
+
+        Returns:
+            A vector per instance. (B, N, C)
         """
-        scattered = query.repeat_interleave(self.points_per_instance, 1)
-        return super().forward(scattered + position, reference, feats, frames)
+        point_query = query.repeat_interleave(self.points_per_instance, 1)
+        return super().forward(
+            point_query + position, reference=reference, feats=feats, frames=frames
+        )
 
 
 @MODELS.register_module()
 class MapQRDecoderLayer(MapDecoderLayer):
-    """Self-attention of the instances, scatter-and-gather attention, feed-forward (MapQR).
+    """Decoder layer of MapQR: self-attention of instances, scatter-and-gather attention, FFN.
 
-    Only the points have a position: a code of their reference.
+    Instance queries have no positional encoding. Points have one, the sinusoidal encoding of their
+    reference.
 
     Args:
-        embed_dims: Channels C; ValueError if 4 does not divide them.
-        num_points: Points per instance P.
-        mask_groups: Keep the query groups apart in the self-attention. MapQR's published figures
-            were made without.
+        embed_dims: Channels C, a multiple of 4.
+        num_points: Points P per instance.
+        mask_groups: Block self-attention between query groups. The published figures of MapQR are
+            without this mask.
         self_attn: Config of the self-attention of instances (`PointSelfAttention`).
         cross_attn: Config of the cross-attention (`ScatterGatherAttention`).
         kwargs: Further arguments of `MapDecoderLayer`.
+
+    Raises:
+        ValueError: If ``embed_dims`` is not a multiple of 4.
     """
 
     def __init__(
@@ -107,26 +138,34 @@ class MapQRDecoderLayer(MapDecoderLayer):
         nn.init.zeros_(self.position_proj.bias)
 
     def forward(self, query: Tensor, _: Tensor, *inputs: Any) -> Tensor:  # type: ignore[override]
-        """Update the instance queries. (B, N, C) -> (B, N, C)
+        """Update the instance queries.
 
-        As in `MapDecoderLayer`, but that references are of the points (B, N * P, D) and that the
-        learned position, which the first reference comes from, is not used.
+        Args:
+            query: Instance queries. (B, N, C)
+            inputs: References of the points (B, N * P, D), BEV features (B, C, H, W), and
+                optionally the self-attention mask (N, N), as in `MapDecoderLayer`.
+
+        Returns:
+            The updated queries. (B, N, C)
         """
         reference, bev_feats, *masks = inputs
         mask = masks[0] if self.mask_groups else None
         query = self.norms[0](self.self_attn(query, torch.zeros_like(query), mask))
         code = sine_code(reference[..., :2], query.shape[-1])
-        position, frames = self.position_proj(code), None
+        position = self.position_proj(code)
+        frames = None
         if self.guidance is not None:
             position = self.guidance.position(position, reference)
             frames = self.guidance.frames(reference, bev_feats)
-        seen = self.cross_attn(query, reference, bev_feats, frames, position)
-        return self.norms[2](self.ffn(self.norms[1](query + seen)))
+        bev_context = self.cross_attn(
+            query, reference, feats=bev_feats, frames=frames, position=position
+        )
+        return self.norms[2](self.ffn(self.norms[1](query + bev_context)))
 
 
 @MODELS.register_module()
 class MapQRDecoder(MapDecoder):
-    """A stack of layers with instance queries, each of which moves all points of its instance.
+    """Decoder with instance queries, each of which refines all points of its instance.
 
     Args:
         layer: Config of the layer (`MapQRDecoderLayer`).
@@ -141,10 +180,19 @@ class MapQRDecoder(MapDecoder):
 
     @classmethod
     def reference_settings(cls, num_points: int) -> dict[str, Any]:
-        """Return that all points of an instance start from one query and move by one state."""
+        """Settings of the point reference: one state per instance refines all its points.
+
+        Args:
+            num_points: Points P per instance.
+        """
         return {"points_per_state": num_points}
 
     def read(self, state: Tensor, references: Tensor) -> Decoded:
-        """Return a layer's output: the points share the state of their instance. (B, N, C)"""
+        """Output of a layer: the points share the state of their instance.
+
+        Args:
+            state: States of the instances. (B, N, C)
+            references: References of the points. (B, N * P, D)
+        """
         points = state[:, :, None].expand(-1, -1, self.num_points, -1)
         return Decoded(points, self.by_instance(references), state)

@@ -1,4 +1,4 @@
-"""MapQR's BEV encoder: geometry kernels at pillar heights that every layer refines (GKT-h)."""
+"""BEV encoder of MapQR (GKT-h): geometry kernels at pillar heights that every layer refines."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -15,17 +15,17 @@ from gsmap.structures.tensors import at_least_float32
 
 
 class MovingPillars:
-    """The pillars of a batch, whose heights the encoder's layers move, one after another.
+    """Pillars of a batch with variable heights, which the layers of the encoder refine in turn.
 
     Args:
-        feet: Cell centres at z = 0, homogeneous, in metres. (Q, 4)
-        start: First heights, [0, 1] over the range. (Z,)
+        feet: Homogeneous cell centres at z = 0, in metres. (Q, 4)
+        start: Initial heights, [0, 1] over the range. (Z,)
         z_range: Lowest and highest z in metres.
-        img_from_frame: Matrices to pixels. (B, V, 4, 4)
+        img_from_frame: Matrices from metres to pixels. (B, V, 4, 4)
         img_shape: Rows and columns of the padded images.
 
     Attributes:
-        heights: Present heights, [0, 1] over the range, not clipped. (B, Q, Z), at first (Z,)
+        heights: Current heights, [0, 1] over the range, not clipped. (B, Q, Z), initially (Z,)
     """
 
     def __init__(
@@ -37,14 +37,21 @@ class MovingPillars:
         img_shape: tuple[int, int],
     ) -> None:
         self.start = self.heights = start
-        self.low_m, self.extent_m = z_range[0], z_range[1] - z_range[0]
-        matrices, self.img_shape = img_from_frame.float(), img_shape
+        self.low_m = z_range[0]
+        self.extent_m = z_range[1] - z_range[0]
+        self.img_shape = img_shape
+        matrices = img_from_frame.float()
         with torch.autocast(feet.device.type, enabled=False):
             self.feet = feet @ matrices.transpose(-1, -2)  # (B, V, Q, 4)
-        self.upwards = matrices[:, :, None, None, :, 2]  # a metre of height (B, V, 1, 1, 4)
+        self.upwards = matrices[:, :, None, None, :, 2]  # per metre of height (B, V, 1, 1, 4)
 
     def move(self, offsets_m: Tensor, accumulate: bool) -> PillarProjection:
-        """Move the heights by offsets in metres (B, Q, Z), and project the pillars."""
+        """Add offsets to the heights and project the pillars.
+
+        Args:
+            offsets_m: Offsets in metres. (B, Q, Z)
+            accumulate: Add them to the current heights, otherwise to the initial ones.
+        """
         before = self.heights if accumulate else self.start
         self.heights = before + at_least_float32(offsets_m) / self.extent_m
         z = (self.low_m + self.heights * self.extent_m)[:, None, ..., None]  # (B, 1, Q, Z, 1)
@@ -54,18 +61,19 @@ class MovingPillars:
 
 @MODELS.register_module()
 class HeightKernelAttention(GeometryKernelAttention):
-    """Geometry kernel attention that first moves the height of each pillar point (MapQR).
+    """Geometry kernel attention with predicted offsets of the pillar heights (MapQR).
 
-    It samples bilinearly. All points of a cell that a camera sees are used, visible or not.
+    Kernels are sampled bilinearly. If any point of a cell is visible in a camera, all its points
+    are used.
 
     Args:
         embed_dims: Channels C.
-        num_heads: Number of heads; head m looks at pillar height m.
+        num_heads: Number of heads; head m attends to pillar height m.
         kernel_size: Rows and columns of the kernel.
-        accumulate_heights: Start from the heights of the layer before, as released, or from the
-            evenly spaced ones.
+        accumulate_heights: Start from the heights of the previous layer, as in the released code.
+            Otherwise start from the evenly spaced heights.
         released_cells: As in `GeometryKernelAttention`.
-        equal_weights: As there; MapQR's do start equal.
+        equal_weights: As in `GeometryKernelAttention`; True in the released code.
     """
 
     def __init__(
@@ -79,8 +87,8 @@ class HeightKernelAttention(GeometryKernelAttention):
     ) -> None:
         super().__init__(
             embed_dims,
-            num_heads,
-            kernel_size,
+            num_heads=num_heads,
+            kernel_size=kernel_size,
             bilinear=True,
             released_cells=released_cells,
             equal_weights=equal_weights,
@@ -92,23 +100,32 @@ class HeightKernelAttention(GeometryKernelAttention):
     def forward(  # type: ignore[override]
         self, query: Tensor, img_feats: Tensor, pillars: MovingPillars
     ) -> Tensor:
-        """Move the pillars, then attend as the base class does. (B, Q, C) -> (B, Q, C)"""
-        seen = pillars.move(self.height_offsets(query), self.accumulate_heights)
-        return super().forward(query, img_feats, seen)
+        """Refine the pillar heights, then attend to the projected pillars.
+
+        Args:
+            query: Queries of the cells. (B, Q, C)
+            img_feats: Image features. (B, V, C, h, w)
+            pillars: Pillars of the batch; their heights are changed in place.
+
+        Returns:
+            Camera features of every cell. (B, Q, C)
+        """
+        projection = pillars.move(self.height_offsets(query), self.accumulate_heights)
+        return super().forward(query, img_feats, projection)
 
 
 @MODELS.register_module()
 class HeightQueryEncoder(BEVQueryEncoder):
-    """`BEVQueryEncoder` with pillars whose heights its layers move, `HeightKernelAttention`.
+    """BEV encoder of MapQR: `BEVQueryEncoder` with `HeightKernelAttention`.
 
-    The first heights are spread evenly over ``z_range``, ends included.
+    The initial heights are spaced evenly over ``z_range``, ends included.
 
     Args:
         cross_attn: Config of the camera cross-attention of every layer (`HeightKernelAttention`).
         kwargs: Further arguments of `BEVQueryEncoder`.
 
     Raises:
-        TypeError: If the cross-attention does not move heights.
+        TypeError: If the cross-attention is not a `HeightKernelAttention`.
     """
 
     def __init__(self, cross_attn: dict[str, Any] | None = None, **kwargs: Any) -> None:
@@ -123,8 +140,18 @@ class HeightQueryEncoder(BEVQueryEncoder):
     def project(  # type: ignore[override]
         self, img_from_frame: Tensor, img_shape: tuple[int, int]
     ) -> MovingPillars:
-        """Return the pillars of a batch, before the first layer moves them."""
+        """Pillars of a batch at their initial heights.
+
+        Args:
+            img_from_frame: Matrices from metres to pixels. (B, V, 4, 4)
+            img_shape: Rows and columns of the padded images.
+        """
         device = img_from_frame.device
-        feet = pillar_points(self.grid, (0.0, 0.0), 1, device)[:, 0]  # (Q, 4)
-        start = torch.linspace(0, 1, self.num_heights, device=device)
-        return MovingPillars(feet, start, self.z_range, img_from_frame, img_shape)
+        feet = pillar_points(self.grid, z_range=(0.0, 0.0), num_heights=1, device=device)[:, 0]
+        return MovingPillars(
+            feet,  # (Q, 4)
+            start=torch.linspace(0, 1, self.num_heights, device=device),
+            z_range=self.z_range,
+            img_from_frame=img_from_frame,
+            img_shape=img_shape,
+        )

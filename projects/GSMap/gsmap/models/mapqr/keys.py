@@ -1,4 +1,4 @@
-"""The table between the state keys of MapQR's release and ours."""
+"""State keys of the MapQR release and their names here."""
 
 from gsmap.checkpoints.key_rules import KeyMap
 from gsmap.models.maptr.keys import (
