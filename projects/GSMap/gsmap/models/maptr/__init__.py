@@ -1,1 +1,1 @@
-"""MapTR (arXiv 2208.14437): points in order, each with a query of its own."""
+"""MapTR (arXiv 2208.14437): ordered points, each with a query."""

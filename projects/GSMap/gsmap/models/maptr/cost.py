@@ -1,4 +1,4 @@
-"""MapTR's matching cost of points."""
+"""Matching cost of points in MapTR."""
 
 from typing import Any
 
@@ -12,9 +12,17 @@ from gsmap.models.base.parts import WEIGHT, weights_of
 
 
 def order_distances(pts: Tensor, pts_shifts: Tensor) -> Tensor:
-    """Return the summed L1 distance of every prediction to every order of every ground truth.
+    """L1 distance of every prediction to every equivalent point order of every ground truth.
 
-    ValueError if the numbers of points differ. (N, P, 2), (K, S, P, 2) -> (N, K, S)
+    Args:
+        pts: Normalised points of the predictions. (N, P, 2)
+        pts_shifts: Normalised points of the ground truths, in S equivalent orders. (K, S, P, 2)
+
+    Returns:
+        Distances, summed over points and coordinates. (N, K, S)
+
+    Raises:
+        ValueError: If the numbers of points differ.
     """
     if pts.shape[-2:] != pts_shifts.shape[-2:]:
         raise ValueError(
@@ -41,6 +49,15 @@ class OrderedPointsCost(PointsCost):
     def __call__(
         self, pred_instances: SampleView, gt_instances: SampleView, img_meta: Any = None
     ) -> Tensor:
-        """Compare normalised ``pts`` (N, P, 2) with ``pts_shifts`` (K, S, P, 2). (N, K)"""
+        """Weighted distances between predictions and ground truths.
+
+        Args:
+            pred_instances: Predictions with normalised ``pts`` (N, P, 2).
+            gt_instances: Ground truths with ``pts_shifts`` (K, S, P, 2) and ``labels`` (K,).
+            img_meta: Not used.
+
+        Returns:
+            The costs. (N, K)
+        """
         distances = order_distances(pred_instances.pts, gt_instances.pts_shifts).amin(-1)
         return distances * weights_of(self.weight, gt_instances.labels)

@@ -1,4 +1,4 @@
-"""The table between the state keys of MapTR's release and ours, with rules that others share."""
+"""State keys of the MapTR release and their names here, with rules that other methods use."""
 
 import torch
 

@@ -1,4 +1,4 @@
-"""MapTR's losses: of points and of the edges between them."""
+"""Losses of MapTR: distances of points and directions of edges."""
 
 from mmdet3d.registry import MODELS
 from torch import Tensor
@@ -26,7 +26,7 @@ class PointsLoss(MapLoss):
         super().__init__(loss_weight, **flags)
 
     def values(self, pairs: MatchedPairs) -> Tensor:
-        """Return the distance of each coordinate. (M, P, 2 or 3)"""
+        """Absolute difference of each coordinate of M matched pairs. (M, P, 2 or 3)"""
         check_same_shape(pred=pairs.pred_pts, target=pairs.gt_pts)
         return (pairs.pred_pts - pairs.gt_pts).abs()
 
@@ -35,8 +35,8 @@ class PointsLoss(MapLoss):
 class DirectionLoss(MapLoss):
     """One minus the cosine between the edges of matched pairs (MapTR Eq. 7).
 
-    Points are in metres, so that x and y weigh the same. Closed shapes need no extra edge: their
-    last point is their first.
+    Points are in metres, so x and y have equal weights. Closed shapes need no extra edge: their
+    last point equals their first.
 
     Args:
         loss_weight: Weight of the loss.
@@ -49,12 +49,22 @@ class DirectionLoss(MapLoss):
         super().__init__(loss_weight, **flags)
 
     def values(self, pairs: MatchedPairs) -> Tensor:
-        """Return the value of each edge. (M, P - 1)"""
+        """One minus the cosine for each edge of M matched pairs. (M, P - 1)"""
         check_same_shape(pred=pairs.pred_pts_m, target=pairs.gt_pts_m)
         return turns(pairs.pred_pts_m.diff(dim=1), pairs.gt_pts_m.diff(dim=1))
 
 
 def turns(first: Tensor, second: Tensor) -> Tensor:
-    """Return one minus the cosine between edges. 2 x (M, E, 2 or 3) -> (M, E)"""
-    lengths = ((first.square().sum(-1) + _EPS) * (second.square().sum(-1) + _EPS)).sqrt()
+    """One minus the cosine of the angle between edges.
+
+    Args:
+        first: Edge vectors. (M, E, 2 or 3)
+        second: Edge vectors. (M, E, 2 or 3)
+
+    Returns:
+        Values in [0, 2]. (M, E)
+    """
+    first_squared = first.square().sum(-1) + _EPS
+    second_squared = second.square().sum(-1) + _EPS
+    lengths = (first_squared * second_squared).sqrt()
     return 1 - (first * second).sum(-1) / lengths

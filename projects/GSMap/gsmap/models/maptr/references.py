@@ -1,4 +1,4 @@
-"""References: what decoder layers refine, from its first value to points in metres."""
+"""Point references: initial values, refinement by decoder layers, and points in metres."""
 
 from collections.abc import Sequence
 
@@ -12,18 +12,29 @@ from gsmap.models.base.references import RefinedReference
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32, check_same_shape, in_float32
 
-_EPS = 1e-5  # a point closer to the border moves as one at this distance
+_EPS = 1e-5  # points closer to the border are moved to this distance before the logit
 
 
 def refine_reference(reference: Tensor, offsets: Tensor, coords: int = 2) -> Tensor:
-    """Move a reference by predicted offsets.
+    """Add predicted offsets to a reference.
 
-    The point in (0, 1), the first ``coords`` entries, moves before its sigmoid; further entries
-    (GSMap Eq. 1: sigma, theta before their activation) add up. The result is at least float32.
-    ValueError if the shapes disagree. (..., D), (..., D) -> (..., D)
+    The first ``coords`` entries are a point in (0, 1); its offset is added to its logit. Offsets of
+    further entries (GSMap Eq. 1: sigma and theta before their activation) are added directly.
+
+    Args:
+        reference: References. (..., D)
+        offsets: Predicted offsets. (..., D)
+        coords: Number of coordinates of the point.
+
+    Returns:
+        The refined references, at least float32. (..., D)
+
+    Raises:
+        ValueError: If the shapes disagree.
     """
     check_same_shape(reference=reference, offsets=offsets)
-    reference, offsets = at_least_float32(reference), at_least_float32(offsets)
+    reference = at_least_float32(reference)
+    offsets = at_least_float32(offsets)
     inner = reference[..., :coords].clamp(_EPS, 1 - _EPS)
     points = (inner.logit() + offsets[..., :coords]).sigmoid()
     if reference.shape[-1] == coords:
@@ -36,16 +47,16 @@ class PointReference(nn.Module, RefinedReference):
     """A point per query, [0, 1] over the map, refined by each decoder layer (MapTR).
 
     Args:
-        grid: The map's extent.
+        grid: Extent of the map.
         embed_dims: Channels C of the point states.
-        num_layers: Decoder layers.
+        num_layers: Number of decoder layers.
         coords: 2, or 3 for points with height.
         z_range: Lowest and highest z in metres, for points with height.
-        points_per_state: Points that start from one query and move by one state. More than one have
-            larger networks, as in MapQR.
+        points_per_state: Number of points n that one query initialises and one state refines. With
+            more than one, the networks are larger, as in MapQR.
 
     Raises:
-        ValueError: If ``coords`` is not 2 or 3, a height lacks its range, or that is empty.
+        ValueError: If ``coords`` is not 2 or 3, or 3 without a valid ``z_range``.
     """
 
     def __init__(
@@ -64,7 +75,8 @@ class PointReference(nn.Module, RefinedReference):
             )
         if z_range is not None and not z_range[0] < z_range[1]:
             raise ValueError(f"z_range must be (low, high) with low < high, got {z_range}.")
-        self.grid, self.coords = grid, coords
+        self.grid = grid
+        self.coords = coords
         self.z_range = None if z_range is None else (float(z_range[0]), float(z_range[1]))
         self.points_per_state = points_per_state
         entries = points_per_state * coords
@@ -76,31 +88,48 @@ class PointReference(nn.Module, RefinedReference):
         self.branches = nn.ModuleList(mlp(embed_dims, *hidden, entries) for _ in range(num_layers))
 
     def by_point(self, entries: Tensor) -> Tensor:
-        """Sort entries of states by point, at least float32. (..., Q, n * D) -> (..., Q * n, D)"""
+        """Split entries of states into points. (..., Q, n * D) -> (..., Q * n, D), >= float32"""
         by_state = at_least_float32(entries).unflatten(-1, (self.points_per_state, -1))
         return by_state.flatten(-3, -2)
 
     def init_weights(self) -> None:
-        """Spread the first points over the map."""
+        """Initialise the network of the initial points from Xavier's uniform distribution."""
         if self.points_per_state == 1:
             xavier_init(self.initial, distribution="uniform", bias=0.0)
         else:
             init_matrices(self.initial)
 
     def start(self, query_pos: Tensor) -> Tensor:
-        """Return the reference that the first layer starts from. (..., Q, C) -> (..., Q * n, D)"""
+        """Initial reference, from the positional queries. (..., Q, C) -> (..., Q * n, D)"""
         return self.by_point(in_float32(self.initial, query_pos)).sigmoid()
 
     def offsets(self, layer: int, point_states: Tensor) -> Tensor:
-        """Return a layer's change of the reference. (..., Q, C) -> (..., Q * n, D)"""
+        """Offsets predicted by a layer.
+
+        Args:
+            layer: Index of the layer.
+            point_states: States of the points. (..., Q, C)
+
+        Returns:
+            Offsets for `refine_reference`. (..., Q * n, D)
+        """
         return self.by_point(in_float32(self.branches[layer], point_states))
 
     def refine(self, layer: int, point_states: Tensor, reference: Tensor) -> Tensor:
-        """Return the reference after a layer. (..., Q, C), (..., Q * n, D) -> (..., Q * n, D)"""
+        """Refine the reference after a layer.
+
+        Args:
+            layer: Index of the layer.
+            point_states: States of the points. (..., Q, C)
+            reference: Reference of the previous layer. (..., Q * n, D)
+
+        Returns:
+            The refined reference. (..., Q * n, D)
+        """
         return refine_reference(reference, self.offsets(layer, point_states), self.coords)
 
     def metres(self, points: Tensor) -> Tensor:
-        """Bring normalised points to metres. (..., coords) -> (..., coords)"""
+        """Convert normalised points to metres. (..., coords) -> (..., coords)"""
         points = self.grid.metres_from_norm(points)
         if self.z_range is None:
             return points
@@ -108,10 +137,18 @@ class PointReference(nn.Module, RefinedReference):
         return torch.cat([points[..., :2], low + (high - low) * points[..., 2:]], -1)
 
     def norm(self, points_m: Tensor) -> Tensor:
-        """Bring points in metres to [0, 1]; the inverse of :meth:`metres`.
+        """Normalise points in metres to [0, 1]; the inverse of :meth:`metres`.
 
-        A height outside ``z_range`` becomes the nearest one in it, as in MapTRv2. ValueError if the
-        points have no height and the reference has.
+        A height outside ``z_range`` is clamped to it, as in MapTRv2.
+
+        Args:
+            points_m: Points in metres. (..., >= coords)
+
+        Returns:
+            Normalised points. (..., coords)
+
+        Raises:
+            ValueError: If the points have no height but the reference has.
         """
         if points_m.shape[-1] < self.coords:
             raise ValueError(
@@ -126,31 +163,49 @@ class PointReference(nn.Module, RefinedReference):
         return torch.cat([points[..., :2], height], -1)
 
     def moved(self, references: Tensor, motion: Tensor) -> Tensor:
-        """Return references of an earlier frame as they lie now. (B, ..., D) -> (B, ..., D)
+        """Transform references of an earlier frame to the current frame.
 
-        The motion (B, 4, 4) takes metres then to metres now.
+        Args:
+            references: References of the earlier frame. (B, ..., D)
+            motion: Transform from the earlier to the current frame, in metres. (B, 4, 4)
+
+        Returns:
+            References of the current frame. (B, ..., D)
         """
         points = self.moved_points(references[..., : self.coords], motion)
         return torch.cat([points, references[..., self.coords :]], -1)
 
     def moved_points(self, points: Tensor, motion: Tensor) -> Tensor:
-        """Return normalised points (B, ..., coords) after a motion (B, 4, 4), put onto the map.
+        """Transform normalised points and clamp them to the map.
 
-        It is computed in the motion's precision.
+        The computation has the precision of ``motion``.
+
+        Args:
+            points: Normalised points. (B, ..., coords)
+            motion: Transform in metres. (B, 4, 4)
+
+        Returns:
+            Normalised points. (B, ..., coords)
         """
-        metres = self.metres(points.to(motion))
-        turn = motion[:, : self.coords, : self.coords].transpose(1, 2)  # without z: on the ground
-        moved = metres.flatten(1, -2) @ turn + motion[:, None, : self.coords, 3]
-        return self.norm(moved).clamp(0.0, 1.0).view_as(points).to(points)
+        points_m = self.metres(points.to(motion))
+        # With two coordinates only the motion in the plane applies.
+        rotation = motion[:, : self.coords, : self.coords].transpose(1, 2)
+        translation = motion[:, None, : self.coords, 3]
+        transformed_m = points_m.flatten(1, -2) @ rotation + translation
+        return self.norm(transformed_m).clamp(0.0, 1.0).view_as(points).to(points)
 
     def decode(self, references: Tensor) -> dict[str, Tensor]:
-        """Return what references (N, P, D) say in metres: ``pts`` (N, P, coords)."""
+        """Decode references (N, P, D) to ``pts`` (N, P, coords) in metres."""
         return {"pts": self.metres(references[..., : self.coords])}
 
     def render(self, references: Tensor, grid: BEVGrid) -> Tensor:
-        """Return rendered masks of what has an extent. (..., P, D) -> (..., H, W)
+        """Not available: points have no extent to render.
+
+        Args:
+            references: References. (..., P, D)
+            grid: The raster.
 
         Raises:
-            TypeError: If it is points.
+            TypeError: Always.
         """
         raise TypeError(f"{type(self).__name__} has no masks: set reference to GaussianReference.")
