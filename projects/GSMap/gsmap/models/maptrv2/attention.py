@@ -1,4 +1,4 @@
-"""MapTRv2's self-attention."""
+"""Decoupled self-attention of MapTRv2."""
 
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
@@ -6,27 +6,49 @@ from torch import Tensor, nn
 
 @MODELS.register_module()
 class DecoupledSelfAttention(nn.Module):
-    """Two small attentions: among instances, then among the points of each (MapTRv2)."""
+    """Decoupled self-attention: between instances, then between the points of each (MapTRv2).
+
+    Args:
+        embed_dims: Channels C.
+        num_heads: Number of heads.
+        num_points: Points P per instance.
+        dropout: Probability to drop an attention weight or an output channel in training.
+    """
 
     def __init__(
         self, embed_dims: int = 256, num_heads: int = 8, num_points: int = 20, dropout: float = 0.1
     ) -> None:
         super().__init__()
         self.num_points = num_points
-        self.instance_attn = nn.MultiheadAttention(embed_dims, num_heads, dropout, batch_first=True)
+        settings = {"num_heads": num_heads, "dropout": dropout, "batch_first": True}
+        self.instance_attn = nn.MultiheadAttention(embed_dims, **settings)
         self.norm = nn.LayerNorm(embed_dims)
-        self.point_attn = nn.MultiheadAttention(embed_dims, num_heads, dropout, batch_first=True)
+        self.point_attn = nn.MultiheadAttention(embed_dims, **settings)
         self.dropout = nn.Dropout(dropout)
 
     def forward(self, query: Tensor, query_pos: Tensor, attn_mask: Tensor | None = None) -> Tensor:
-        """Let point p of all instances attend to each other, then the points of each instance."""
+        """Update the point queries.
+
+        Point p of an instance attends to point p of the other instances; then the points of each
+        instance attend to each other.
+
+        Args:
+            query: Point queries, instance after instance. (B, N * P, C)
+            query_pos: Their positional encoding. (B, N * P, C)
+            attn_mask: True where an instance may not attend to another one. (N, N)
+
+        Returns:
+            The queries plus both attentions. (B, N * P, C)
+        """
         batch = len(query)
-        per_instance = [x.unflatten(1, (-1, self.num_points)) for x in (query, query_pos)]
-        query, query_pos = (x.transpose(1, 2).flatten(0, 1) for x in per_instance)  # (B * P, N, C)
-        query = self.norm(self._attend(self.instance_attn, query, query_pos, attn_mask))
+        query = query.unflatten(1, (-1, self.num_points))  # (B, N, P, C)
+        query_pos = query_pos.unflatten(1, (-1, self.num_points))
+        query = query.transpose(1, 2).flatten(0, 1)  # (B * P, N, C)
+        instance_pos = query_pos.transpose(1, 2).flatten(0, 1)
+        query = self.norm(self._attend(self.instance_attn, query, pos=instance_pos, mask=attn_mask))
         query = query.unflatten(0, (batch, -1)).transpose(1, 2).flatten(0, 1)  # (B * N, P, C)
-        query_pos = per_instance[1].flatten(0, 1)
-        query = self._attend(self.point_attn, query, query_pos, None)
+        point_pos = query_pos.flatten(0, 1)
+        query = self._attend(self.point_attn, query, pos=point_pos, mask=None)
         return query.unflatten(0, (batch, -1)).flatten(1, 2)
 
     def _attend(

@@ -1,4 +1,4 @@
-"""The auxiliary head of depth. It only helps training."""
+"""Auxiliary head of depth supervision, used in training only."""
 
 from typing import Any
 
@@ -12,20 +12,31 @@ from gsmap.utils.targets import NeedsTargets
 
 @MODELS.register_module()
 class DepthSupervision(nn.Module, NeedsTargets):
-    """The depth of an encoder that lifts features, from ``gt_depth`` (V, H, W) of a LiDAR.
+    """Supervises the depth of a lifting encoder by ``gt_depth`` (V, H, W) of a LiDAR.
 
-    What other auxiliary heads take, ``kwargs``, is not used.
+    Args:
+        loss_weight: Weight of the loss.
+        name: Name of the loss.
+        kwargs: Arguments of other auxiliary heads; not used.
     """
 
     transforms = ("MakeDepthMap",)
 
     def __init__(self, loss_weight: float = 3.0, name: str = "depth", **kwargs: Any) -> None:
         super().__init__()
-        self.loss_weight, self.name = loss_weight, name
+        self.loss_weight = loss_weight
+        self.name = name
 
     def loss(self, bev_outputs: dict[str, Any], batch_data_samples: Samples) -> Tensor:
-        """Return the loss on ``depth`` (B, V, D, h, w), probabilities of ``depth_range``'s bins."""
-        probs, depth_range = bev_outputs["depth"], bev_outputs["depth_range"]
+        """Weighted depth loss.
+
+        Args:
+            bev_outputs: Outputs of the encoder: ``depth``, the probabilities of the bins
+                (B, V, D, h, w), and ``depth_range``, the bins.
+            batch_data_samples: Samples with ``gt_depth`` in metres. (V, H, W) each
+        """
+        probs = bev_outputs["depth"]
         target = stack_targets(self, batch_data_samples, "gt_depth", probs.device)
-        bins = depth_bins(target, target.shape[-1] // probs.shape[-1], depth_range)
+        stride = target.shape[-1] // probs.shape[-1]
+        bins = depth_bins(target, stride=stride, depth_range=bev_outputs["depth_range"])
         return self.loss_weight * depth_loss(probs, bins)

@@ -7,21 +7,21 @@ from gsmap.structures.tensors import num_depth_bins
 
 
 def depth_bins(depth_m: Tensor, stride: int, depth_range: tuple[float, float, float]) -> Tensor:
-    """Return the depth bin of each block of pixels, -1 for none, int64.
+    """Depth bin of each block of pixels.
 
-    A block takes its nearest return. If that lies in front of the first bin or beyond the last, the
-    block has no target, even if a further return would have.
+    The nearest return of a block counts. If it lies before the first bin or behind the last one,
+    the block has no target, even if another return lies in a bin.
 
     Args:
         depth_m: Depth along the optical axis in metres, 0 without a return. (..., H, W)
         stride: Side of a block in pixels.
-        depth_range: Where bin 0 starts, where the last ends, and the step, in metres.
+        depth_range: Start of the first bin, end of the last one, and the step, in metres.
 
     Returns:
-        Indices of bins. (..., H / stride, W / stride)
+        Indices of bins, int64; -1 without a target. (..., H / stride, W / stride)
 
     Raises:
-        ValueError: If the size is no multiple of ``stride``.
+        ValueError: If the size is not a multiple of ``stride``.
     """
     height, width = depth_m.shape[-2:]
     if height % stride or width % stride:
@@ -37,10 +37,17 @@ def depth_bins(depth_m: Tensor, stride: int, depth_range: tuple[float, float, fl
 
 
 def depth_loss(probs: Tensor, bins: Tensor) -> Tensor:
-    """Return the mean of -log p at the target bin, over the pixels that have one (0 if none has).
+    """Cross-entropy of the depth bins: the mean of -log p at the target bin.
 
-    Only the target bin enters; the other bins are held down by the softmax. ValueError if the
-    shapes disagree. Probabilities (..., D, h, w), bins, -1 for none (..., h, w) -> ()
+    Args:
+        probs: Probabilities of the bins. (..., D, h, w)
+        bins: Indices of the target bins, -1 without a target. (..., h, w)
+
+    Returns:
+        The mean over pixels with a target; 0 if there is none. ()
+
+    Raises:
+        ValueError: If the shapes disagree.
     """
     if probs.shape[:-3] + probs.shape[-2:] != bins.shape:
         raise ValueError(
@@ -48,6 +55,8 @@ def depth_loss(probs: Tensor, bins: Tensor) -> Tensor:
             f"for {tuple(probs.shape)}."
         )
     valid = bins >= 0
-    chosen = probs.float().gather(-3, bins.clamp(min=0).unsqueeze(-3)).squeeze(-3)  # (..., h, w)
-    chosen = torch.where(valid, chosen, 1).clamp(min=torch.finfo(chosen.dtype).tiny)
-    return -chosen.log().sum() / valid.sum().clamp(min=1)
+    indices = bins.clamp(min=0).unsqueeze(-3)
+    target_probs = probs.float().gather(-3, indices).squeeze(-3)  # (..., h, w)
+    least = torch.finfo(target_probs.dtype).tiny
+    target_probs = torch.where(valid, target_probs, 1).clamp(min=least)
+    return -target_probs.log().sum() / valid.sum().clamp(min=1)

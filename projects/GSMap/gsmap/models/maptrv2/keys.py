@@ -1,4 +1,4 @@
-"""The table between the state keys of MapTRv2's release and ours."""
+"""State keys of the MapTRv2 release and their names here."""
 
 import torch
 from torch import Tensor
@@ -7,7 +7,7 @@ from gsmap.checkpoints.key_rules import KeyMap, rules_of, zeros
 from gsmap.models.maptr.keys import CODE_WEIGHTS, COMMON_RULES, DECODER_LAYER, ENCODER, HEAD, LAYER
 
 MASK_RULES = rules_of(HEAD, "map_head.aux_heads.", "seg_head.=seg. pv_seg_head.=pv_seg.")
-# the weight of the foreground in a mask loss, which the config says
+# Weight of the foreground in a mask loss; here a setting of the config.
 MASK_WEIGHTS = {
     HEAD + "loss_seg.loss_fn.pos_weight": torch.tensor((4.0,)),
     HEAD + "loss_pv_seg.loss_fn.pos_weight": torch.tensor((1.0,)),
@@ -20,7 +20,7 @@ LIFTED_RULES = (
 )
 LIFTED_UNUSED: dict[str, Tensor | None] = {
     **CODE_WEIGHTS,
-    # parts of the encoder with learned BEV queries, which depth lifting does not run
+    # Modules of the encoder with learned BEV queries, not used by depth lifting.
     **zeros(
         HEAD,
         {
@@ -36,7 +36,7 @@ LIFTED_UNUSED: dict[str, Tensor | None] = {
             "transformer.can_bus_mlp.norm.bias": (256,),
         },
     ),
-    # the grid of voxels, which the config says: size, first centre and number (x, y, z)
+    # Grid of voxels, here a setting of the config: size, first centre and number (x, y, z).
     ENCODER + "dx": torch.tensor((0.15, 0.15, 20.0)),
     ENCODER + "bx": torch.tensor((-14.925, -29.925, 0.0)),
     ENCODER + "nx": torch.tensor((200.0, 400.0, 1.0)),

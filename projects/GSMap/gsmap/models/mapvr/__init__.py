@@ -1,1 +1,1 @@
-"""MapVR (arXiv 2306.10502): points supervised through their soft rasters."""
+"""MapVR (arXiv 2306.10502): points supervised by their soft rasters."""

@@ -1,4 +1,4 @@
-"""MapVR's matching cost."""
+"""Matching cost of MapVR."""
 
 from typing import Any
 
@@ -15,7 +15,9 @@ from gsmap.ops.soft_iou import pairwise_dice_loss
 
 @TASK_UTILS.register_module()
 class RenderedDiceCost(MapCost):
-    """Dice loss of softly rendered points, each pair rendered as the ground truth's class (MapVR).
+    """Dice loss between soft rasters of predictions and ground truths (MapVR).
+
+    The class of the ground truth decides whether a pair is rendered as lines or as polygons.
 
     Args:
         weight: Weight of the cost.
@@ -30,14 +32,24 @@ class RenderedDiceCost(MapCost):
         self.renderer = ElementRenderer(size, **rendering)
 
     def check(self, head: BuiltHead) -> None:
-        """Raise ValueError if a polygon's class does not exist."""
+        """Raise ValueError if a class of ``polygon_classes`` does not exist."""
         self.renderer.check(self, head)
 
     def __call__(
         self, pred_instances: SampleView, gt_instances: SampleView, img_meta: Any = None
     ) -> Tensor:
-        """Compare ``pts`` (N, P, 2) with ``first_pts`` (K, P, 2) of ``labels`` (K,). (N, K)"""
-        preds, is_polygon = pred_instances.pts, self.renderer.is_polygon(gt_instances.labels)
+        """Weighted dice losses between predictions and ground truths.
+
+        Args:
+            pred_instances: Predictions with normalised ``pts`` (N, P, 2).
+            gt_instances: Ground truths with ``first_pts`` (K, P, 2) and ``labels`` (K,).
+            img_meta: Not used.
+
+        Returns:
+            The costs. (N, K)
+        """
+        preds = pred_instances.pts
+        is_polygon = self.renderer.is_polygon(gt_instances.labels)
         targets = self.renderer.render(gt_instances.first_pts, is_polygon)
         lines = torch.zeros(len(preds), dtype=torch.bool, device=preds.device)
         as_lines = pairwise_dice_loss(self.renderer.render(preds, lines), targets)

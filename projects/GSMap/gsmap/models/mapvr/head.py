@@ -1,4 +1,4 @@
-"""MapVR's head: points supervised through their soft rasters."""
+"""Head of MapVR: points supervised by their soft rasters."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -18,26 +18,34 @@ from gsmap.structures.grid import BEVGrid
 
 @MODELS.register_module()
 class MapVRHead(MapHead):
-    """The map head with MapVR's parts as defaults, on whatever decoder and references there are.
+    """Map head with the losses and matching costs of MapVR as defaults.
 
-    Matched points are rendered softly, as lines or as polygons by their class, and compared by the
-    dice loss, in matching on coarser rasters. Points weigh less than in MapTR, and predictions
-    shall be straight in place of the ground truth's directions. Besides `MapHead`'s arguments:
+    Matched points are rendered softly, as lines or as filled polygons depending on their class, and
+    compared by the dice loss. Matching uses coarser rasters. Points have a lower weight than in
+    MapTR, and `SelfDirectionLoss` replaces the direction loss.
 
     Args:
-        losses: As in `MapHead`; `PointsLoss` gets another weight, `DirectionLoss` is replaced.
-        match_costs: As in `MapHead`; `OrderedPointsCost` gets another weight.
+        grid: Extent of the map.
+        classes: Names of the classes.
+        decoder: Config of the decoder; the dropout of its layers is set to ``dropout``.
+        losses: As in `MapHead`; the weight of `PointsLoss` is set to ``points_weight``, and
+            `DirectionLoss` is removed.
+        match_costs: As in `MapHead`; the weight of `OrderedPointsCost` is set to ``points_weight``.
         loss_dice: Settings of the dice loss, or None to train without it.
         dice_cost: Settings of its matching cost, or None to match without it.
         loss_direction: Settings of `SelfDirectionLoss`, or None to train without it.
-        points_weight: Weight of the points in losses and in matching, None to leave theirs;
-            ValueError if a weight is given and there are no points.
-        polygons: Names of the classes that are rendered as filled polygons, ValueError for what is
-            no class; None: those that are areas (`AREA_CLASSES`).
+        points_weight: Weight of the points in losses and in matching. None: keep the configs'.
+        polygons: Names of the classes that are rendered as filled polygons. None: those of
+            `AREA_CLASSES`.
         rendering: Further settings of `ElementRenderer`, for loss and cost.
-        masks: Sizes of pixels as in `ElementMasks`: 256 x 128 and, for matching, 128 x 64 on a map
-            of 60 x 30 m.
-        dropout: Dropout in the decoder's layers.
+        masks: Pixel sizes as in `ElementMasks`. Defaults: 256 x 128 pixels, and 128 x 64 for
+            matching, on a map of 60 x 30 m.
+        dropout: Dropout in the layers of the decoder.
+        kwargs: Further arguments of `MapHead`.
+
+    Raises:
+        ValueError: If ``polygons`` has an unknown class, or ``points_weight`` is given without a
+            loss and a cost of points.
     """
 
     def __init__(
@@ -65,10 +73,11 @@ class MapVRHead(MapHead):
         sizes = {"pixel_m": 60 / 256, "cost_pixel_m": 60 / 128}
         drawing = ElementMasks(grid, **{**sizes, **(masks or {})})
         shared = {"polygon_classes": indices, **(rendering or {})}
-        size, cost_size = ((g.height, g.width) for g in (drawing.grid, drawing.cost_grid))
-        kept = [loss for loss in losses if class_of(loss) is not DirectionLoss]
+        size = (drawing.grid.height, drawing.grid.width)
+        cost_size = (drawing.cost_grid.height, drawing.cost_grid.width)
+        other_losses = [loss for loss in losses if class_of(loss) is not DirectionLoss]
         losses = [
-            *with_points_weight(kept, PointsLoss, points_weight, "loss_weight"),
+            *with_points_weight(other_losses, PointsLoss, points_weight, "loss_weight"),
             *brought(SelfDirectionLoss, loss_direction),
             *brought(RenderedDiceLoss, loss_dice, size=size, **shared),
         ]

@@ -1,4 +1,4 @@
-"""MapVR's losses: the dice loss of softly rendered elements, and straight predictions."""
+"""Losses of MapVR: dice of softly rendered elements, and directions of consecutive edges."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -18,13 +18,14 @@ from gsmap.structures.tensors import constant
 
 @dataclass(frozen=True)
 class ElementRenderer:
-    """Renders map elements as MapVR does: lines or filled polygons, by their class.
+    """Soft renderer of map elements as in MapVR: lines or filled polygons, depending on the class.
 
     Args:
         size: Rows H and columns W of the masks.
-        line_softness: Softness of lines (tau), in pixels, squared if ``distance`` is.
-        polygon_softness: Softness of polygons.
-        polygon_classes: Classes that are rendered as filled polygons; none: all are lines.
+        line_softness: Softness of lines (tau), in pixels, or squared pixels if ``distance`` is
+            ``"squared"``.
+        polygon_softness: Softness of polygons, in the unit of ``line_softness``.
+        polygon_classes: Indices of the classes that are rendered as filled polygons.
         distance: ``"squared"`` or ``"plain"`` (see `gsmap.ops.polyline_raster.soft_rasters`).
 
     Raises:
@@ -44,21 +45,35 @@ class ElementRenderer:
             raise ValueError(f"polygon_classes must be >= 0, got {self.polygon_classes}.")
         if self.distance not in DISTANCES:
             raise ValueError(f"distance must be one of {DISTANCES}, got {self.distance!r}.")
-        softness = self.line_softness, self.polygon_softness
-        if min(softness) <= 0:
-            raise ValueError(f"softness must be > 0, got {softness[0]} and {softness[1]}.")
+        if self.line_softness <= 0 or self.polygon_softness <= 0:
+            raise ValueError(
+                f"softness must be > 0, got {self.line_softness} and {self.polygon_softness}."
+            )
 
     def check(self, part: object, head: BuiltHead) -> None:
-        """Raise ValueError if a polygon's class, in the settings of a part, does not exist."""
+        """Raise ValueError if a class of ``polygon_classes`` does not exist.
+
+        Args:
+            part: Loss or cost that uses the renderer; the message contains its name.
+            head: Head with the classes.
+        """
         name = f"{type(part).__name__}.polygon_classes"
         check_classes(name, self.polygon_classes, head.classes)
 
     def is_polygon(self, labels: Tensor) -> Tensor:
-        """Return which elements are rendered as polygons. (n,) -> (n,)"""
+        """Whether elements of the given labels are rendered as polygons. (n,) -> (n,)"""
         return torch.isin(labels, constant(labels, self.polygon_classes))
 
     def render(self, points: Tensor, is_polygon: Tensor) -> Tensor:
-        """Return masks of elements whose vertices are normalised. (n, P, 2), (n,) -> (n, H, W)"""
+        """Render elements to soft masks.
+
+        Args:
+            points: Normalised vertices. (n, P, 2)
+            is_polygon: Whether to fill an element. (n,)
+
+        Returns:
+            Masks in [0, 1]. (n, H, W)
+        """
         height, width = self.size
         pixels = torch.stack([points[..., 0] * width, points[..., 1] * height], -1)
         return soft_rasters(
@@ -76,7 +91,8 @@ class ElementRenderer:
 class RenderedDiceLoss(MapLoss):
     """Dice loss between softly rendered predictions and ground truths (MapVR, section 4.3).
 
-    A pair is rendered as its ground truth's class, from its points in the annotated order.
+    The class of the ground truth decides whether a pair is rendered as lines or as polygons. The
+    points are in the annotated order.
 
     Args:
         loss_weight: Weight of the loss.
@@ -100,22 +116,23 @@ class RenderedDiceLoss(MapLoss):
         self.renderer = ElementRenderer(size, **rendering)
 
     def check(self, head: BuiltHead) -> None:
-        """Raise ValueError if a polygon's class does not exist."""
+        """Raise ValueError if a class of ``polygon_classes`` does not exist."""
         self.renderer.check(self, head)
 
     def values(self, pairs: MatchedPairs) -> Tensor:
-        """Compare the rasters of pairs. (M,)"""
+        """Dice loss of each of M matched pairs. (M,)"""
         is_polygon = self.renderer.is_polygon(pairs.gt_labels)
         preds = self.renderer.render(pairs.pred_pts, is_polygon)
-        return dice_loss(preds, self.renderer.render(pairs.gt_first_pts, is_polygon))
+        targets = self.renderer.render(pairs.gt_first_pts, is_polygon)
+        return dice_loss(preds, targets)
 
 
 @MODELS.register_module()
 class SelfDirectionLoss(MapLoss):
     """One minus the cosine between consecutive edges of a prediction (MapVR Eq. 4).
 
-    It keeps predictions from folding back where nothing but their rendering is supervised. Both
-    edges of a pair get a gradient; a ring's last edge and its first are no pair.
+    It penalises folded predictions, which a loss of rasters alone permits. Both edges of a pair
+    receive a gradient. The last and the first edge of a ring do not form a pair.
 
     Args:
         loss_weight: Weight of the loss.
@@ -128,7 +145,7 @@ class SelfDirectionLoss(MapLoss):
         super().__init__(loss_weight, **flags)
 
     def values(self, pairs: MatchedPairs) -> Tensor:
-        """Return the value of each turn, of points in metres. (M, P - 2)"""
+        """One minus the cosine at each inner vertex of M matched pairs. (M, P - 2)"""
         # Differs from MapVR Eq. (4), which sums the cosines: their sign would reward folding.
         edges = pairs.pred_pts_m.diff(dim=1)
         return turns(edges[:, :-1], edges[:, 1:])
