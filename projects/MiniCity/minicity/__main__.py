@@ -1,4 +1,4 @@
-"""The generated data set by itself: ``python -m minicity generate`` and ``draw``."""
+"""Commands of the generated data set: ``python -m minicity generate`` and ``draw``."""
 
 import argparse
 import shlex
@@ -9,7 +9,11 @@ from minicity import cli, devkit_plots
 
 
 def main() -> str:
-    """Run the command that is asked for and return what it has to say."""
+    """Run the command of the command line.
+
+    Returns:
+        Summary of the command's result for the user.
+    """
     parser = CommandParser(prog="python -m minicity", description=__doc__)
     commands = parser.add_subparsers(required=True)
     for name, module in (("generate", cli), ("draw", devkit_plots)):

@@ -1,4 +1,4 @@
-"""A pinhole camera in the world."""
+"""Pinhole camera in the world frame."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,13 +12,16 @@ NEAR_M = 0.25
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera. Integer pixel coordinates lie at pixel centres; x right, y down, z forward.
+    """Pinhole camera. Integer pixel coordinates lie at pixel centres; x right, y down, z forward.
 
     Attributes:
-        intrinsics: Focal lengths and principal point, pixels. (3, 3)
-        width: Image width.
-        height: Image height.
-        cam_from_world: Rigid transform. (4, 4)
+        intrinsics: Focal lengths and principal point, in pixels. (3, 3)
+        width: Image width in pixels, >= 1.
+        height: Image height in pixels, >= 1.
+        cam_from_world: Rigid transform from the world to the camera frame, in metres. (4, 4)
+
+    Raises:
+        ValueError: If a matrix has a wrong shape or an infinite entry, or the image is empty.
     """
 
     intrinsics: Array
@@ -27,7 +30,7 @@ class Camera:
     cam_from_world: Array
 
     def __post_init__(self) -> None:
-        """Refuse matrices that cannot belong to a camera."""
+        """Check the shapes and values of both matrices and the image size."""
         if np.shape(self.intrinsics) != (3, 3) or np.shape(self.cam_from_world) != (4, 4):
             raise ValueError(
                 "intrinsics must be (3, 3) and cam_from_world (4, 4), got "
@@ -40,30 +43,45 @@ class Camera:
 
     @cached_property
     def center(self) -> Array:
-        """Position in the world. (3,)"""
+        """Position of the camera in the world, in metres. (3,)"""
         return -self.cam_from_world[:3, :3].T @ self.cam_from_world[:3, 3]
 
     @cached_property
     def world_from_pixel(self) -> Array:
-        """Maps (u, v, 1) to a viewing direction in the world. (3, 3)"""
+        """Matrix that maps (u, v, 1) to a viewing direction in the world. (3, 3)"""
         return self.cam_from_world[:3, :3].T @ np.linalg.inv(self.intrinsics)
 
     def to_camera(self, points: Array) -> Array:
-        """World points in the camera's frame. (..., 3) -> (..., 3)"""
+        """Transform points from the world to the camera frame, in metres. (..., 3) -> (..., 3)"""
         return points @ self.cam_from_world[:3, :3].T + self.cam_from_world[:3, 3]
 
     def to_pixels(self, points_cam: Array) -> Array:
-        """Points of the camera's frame, z > 0, in pixels. (..., 3) -> (..., 2)"""
+        """Project points to the image.
+
+        Args:
+            points_cam: Points in the camera frame with z > 0, in metres. (..., 3)
+
+        Returns:
+            Image coordinates (u, v) in pixels. (..., 2)
+        """
         image = points_cam @ self.intrinsics.T
         return image[..., :2] / image[..., 2:]
 
 
 def clip_near(polygon: Array, near_m: float = NEAR_M) -> Array:
-    """The part of a convex polygon with z >= ``near_m``, perhaps nothing. (n, 3) -> (m, 3)"""
-    kept = []
+    """Clip a convex polygon to the half-space in front of a camera.
+
+    Args:
+        polygon: Corners in the camera frame, in metres. (n, 3)
+        near_m: Least depth of the result, in metres.
+
+    Returns:
+        Corners of the part with z >= ``near_m``; m is 0 where nothing is left. (m, 3)
+    """
+    corners = []
     for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
         if a[2] >= near_m:
-            kept.append(a)
+            corners.append(a)
         if (a[2] >= near_m) != (b[2] >= near_m):
-            kept.append(a + (near_m - a[2]) / (b[2] - a[2]) * (b - a))
-    return np.array(kept).reshape(-1, 3)
+            corners.append(a + (near_m - a[2]) / (b[2] - a[2]) * (b - a))
+    return np.array(corners).reshape(-1, 3)

@@ -1,13 +1,24 @@
 """Generate the MiniCity data set."""
 
 import argparse
+from typing import Any
 
 from minicity.config import PRESETS, VERSION, MiniCityConfig
 from minicity.generate import generate
 
 
 def image_size(text: str) -> tuple[int, int]:
-    """Width and height from ``800x450``."""
+    """Parse an image size such as ``800x450``.
+
+    Args:
+        text: Width and height in pixels, separated by ``x``.
+
+    Returns:
+        Width and height in pixels.
+
+    Raises:
+        argparse.ArgumentTypeError: If the text is no image size.
+    """
     width, _, height = text.partition("x")
     if not (width.isdigit() and height.isdigit()):
         raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT such as 800x450, got {text!r}")
@@ -15,7 +26,7 @@ def image_size(text: str) -> tuple[int, int]:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Describe the command's arguments."""
+    """Add the options of ``python -m minicity generate`` to a parser."""
     parser.add_argument("--root", required=True, help="output folder, in nuScenes layout")
     parser.add_argument(
         "--preset",
@@ -44,33 +55,45 @@ SIZE_OPTIONS = (
 
 
 def chosen_config(arguments: argparse.Namespace) -> MiniCityConfig:
-    """Data set of the command's arguments.
+    """Configuration of the data set that the command line describes.
+
+    Args:
+        arguments: Parsed options of ``add_arguments``.
 
     Raises:
         ValueError: If neither a preset nor ``--scenes`` is given, if a preset is given together
             with an option of size, or if a value is out of range.
     """
-    given = {
-        name: getattr(arguments, name)
-        for name in SIZE_OPTIONS
-        if getattr(arguments, name) is not None
-    }
+    values: dict[str, Any] = {}
+    for name in SIZE_OPTIONS:
+        value = getattr(arguments, name)
+        if value is not None:
+            values[name] = value
     if arguments.preset is not None:
-        if given:
-            options = ", ".join(f"--{name.replace('_', '-')}" for name in given)
+        if values:
+            options = ", ".join(f"--{name.replace('_', '-')}" for name in values)
             raise ValueError(f"--preset sets the size and the seed: leave out {options}.")
         return PRESETS[arguments.preset]
-    if "scenes" not in given:
+    if "scenes" not in values:
         raise ValueError("give --scenes NUMBER, or --preset NAME for a published data set.")
-    if "image_size" in given:
-        given["image_width"], given["image_height"] = given.pop("image_size")
-    return MiniCityConfig(**given)
+    if "image_size" in values:
+        width, height = values.pop("image_size")
+        values["image_width"] = width
+        values["image_height"] = height
+    return MiniCityConfig(**values)
 
 
 def run(arguments: argparse.Namespace) -> str:
-    """Generate the data set and say where it lies, and by which ``command`` it was made."""
+    """Generate the data set of the command line.
+
+    Args:
+        arguments: Parsed options of ``add_arguments``, and the command line as ``command``.
+
+    Returns:
+        Summary for the user: the folder, and the command that generated it.
+    """
     config = chosen_config(arguments)
-    made = generate(
+    is_new = generate(
         root=arguments.root,
         scenes=config.scenes,
         seed=config.seed,
@@ -80,7 +103,7 @@ def run(arguments: argparse.Namespace) -> str:
         val_scenes=config.val_scenes,
         workers=arguments.workers,
     )
-    if not made:
+    if not is_new:
         return f"MiniCity at {arguments.root} is complete already (same arguments): skipped."
-    made_by = arguments.command
-    return f"MiniCity written to {arguments.root} (version {VERSION}); made by: {made_by}"
+    command = arguments.command
+    return f"MiniCity written to {arguments.root} (version {VERSION}); made by: {command}"

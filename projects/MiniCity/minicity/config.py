@@ -1,4 +1,4 @@
-"""What a MiniCity data set is made of: its size, its seed and its fixed choices."""
+"""Configuration of a MiniCity data set, and the random numbers that follow from it."""
 
 import hashlib
 from dataclasses import asdict, dataclass
@@ -15,16 +15,19 @@ MAX_VAL_SCENES = 150
 
 @dataclass(frozen=True)
 class MiniCityConfig:
-    """Everything that decides the bytes of a MiniCity data set.
+    """Configuration of a MiniCity data set; equal configurations give equal bytes.
 
     Attributes:
         scenes: Number of scenes, training and validation together, >= 2.
         seed: Seed of every random choice, >= 0.
-        image_width: Width of the camera images in pixels.
-        image_height: Height of the camera images in pixels.
-        samples_per_scene: Key frames per scene, half a second apart.
-        sweeps_per_sample: LiDAR sweeps between two key frames.
+        image_width: Width of the camera images in pixels, in [64, 3200].
+        image_height: Height of the camera images in pixels, in [36, 1800].
+        samples_per_scene: Key frames per scene, half a second apart, in [1, 40].
+        sweeps_per_sample: LiDAR sweeps between two key frames, in [0, 9].
         val_scenes: Validation scenes among ``scenes``; None takes a fifth, at least one.
+
+    Raises:
+        ValueError: If a value is out of range.
     """
 
     scenes: int
@@ -36,7 +39,7 @@ class MiniCityConfig:
     val_scenes: int | None = None
 
     def __post_init__(self) -> None:
-        """Check every value, naming the one that is wrong."""
+        """Check the range of every value."""
         if self.scenes < 2:
             raise ValueError(
                 f"scenes must be at least 2 (one to train, one to test), got {self.scenes}."
@@ -72,7 +75,7 @@ class MiniCityConfig:
         return self.scenes - self.num_val
 
     def as_dict(self) -> dict:
-        """All values as JSON-ready fields, with the version of the generator's output."""
+        """All values as JSON-ready fields, with the format version of the generator."""
         return {"format": FORMAT, **asdict(self), "val_scenes": self.num_val}
 
 
@@ -98,14 +101,16 @@ chosen by it. Its single training scene is there for the format alone.
 
 
 def _digest(parts: tuple) -> bytes:
-    return hashlib.blake2b("|".join(map(str, parts)).encode(), digest_size=16).digest()
+    text = "|".join(map(str, parts))
+    return hashlib.blake2b(text.encode(), digest_size=16).digest()
 
 
 def make_rng(*parts: object) -> np.random.Generator:
-    """A random generator that depends on ``parts`` alone, not on the process or its past."""
-    return np.random.default_rng(np.frombuffer(_digest(parts), dtype=np.uint32).tolist())
+    """Make a random generator whose state depends on ``parts`` alone, in every process."""
+    words = np.frombuffer(_digest(parts), dtype=np.uint32)
+    return np.random.default_rng(words.tolist())
 
 
 def make_token(*parts: object) -> str:
-    """A 32-digit token as in nuScenes, which depends on ``parts`` alone."""
+    """Make a token of 32 hexadecimal digits, as in nuScenes, that depends on ``parts`` alone."""
     return _digest(("token", *parts)).hex()

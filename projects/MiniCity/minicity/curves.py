@@ -1,4 +1,4 @@
-"""Plane curves that roads are made of."""
+"""Geometry of polylines in the plane."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,23 +8,35 @@ Array = NDArray[np.float64]
 
 def arc_lengths(points: Array) -> Array:
     """Distance along a polyline at each of its points, in metres. (n, 2) -> (n,)"""
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def resample(points: Array, spacing_m: float) -> Array:
-    """Equally spaced points along a polyline, about ``spacing_m`` apart. (n, 2) -> (m, 2)"""
+    """Resample a polyline at equal distances.
+
+    Args:
+        points: Vertices in metres. (n, 2)
+        spacing_m: Approximate distance between two points of the result, in metres.
+
+    Returns:
+        At least two points, the ends of the polyline included. (m, 2)
+    """
     lengths = arc_lengths(points)
     count = max(2, round(lengths[-1] / spacing_m) + 1)
-    return interpolate(points, lengths, np.linspace(0.0, lengths[-1], count))
+    return interpolate(points, lengths, at=np.linspace(0.0, lengths[-1], num=count))
 
 
 def interpolate(values: Array, lengths: Array, at: Array) -> Array:
-    """Interpolate between rows of values. (k, D)
+    """Interpolate linearly between rows of values.
 
     Args:
-        values: A row at each arc length. (n, D)
-        lengths: Ascending arc lengths. (n,)
-        at: Arc lengths of the result. (k,)
+        values: One row per arc length. (n, D)
+        lengths: Ascending arc lengths in metres. (n,)
+        at: Arc lengths of the result in metres, clipped to the range of ``lengths``. (k,)
+
+    Returns:
+        Interpolated rows. (k, D)
     """
     left = np.clip(np.searchsorted(lengths, at, side="right") - 1, 0, len(lengths) - 2)
     span = np.maximum(lengths[left + 1] - lengths[left], 1e-12)
@@ -33,16 +45,19 @@ def interpolate(values: Array, lengths: Array, at: Array) -> Array:
 
 
 def subline(points: Array, start_m: float, end_m: float) -> Array:
-    """Return the part of a polyline between two arc lengths. (m, 2)
+    """Part of a polyline between two arc lengths.
 
     Args:
-        points: The polyline, in metres. (n, 2)
-        start_m: Arc length of the first point.
-        end_m: Arc length of the last point.
+        points: Vertices in metres. (n, 2)
+        start_m: Arc length of the first point of the result, in metres.
+        end_m: Arc length of the last point of the result, in metres.
+
+    Returns:
+        Vertices of the part. (m, 2)
     """
     lengths = arc_lengths(points)
     inner = lengths[(lengths > start_m + 1e-6) & (lengths < end_m - 1e-6)]
-    return interpolate(points, lengths, np.concatenate([[start_m], inner, [end_m]]))
+    return interpolate(points, lengths, at=np.concatenate([[start_m], inner, [end_m]]))
 
 
 def tangents(points: Array) -> Array:
@@ -52,33 +67,33 @@ def tangents(points: Array) -> Array:
 
 
 def left_normals(points: Array) -> Array:
-    """Unit vectors to the left of travel at each point of a polyline. (n, 2) -> (n, 2)"""
+    """Unit normal to the left of travel at each point of a polyline. (n, 2) -> (n, 2)"""
     direction = tangents(points)
     return np.stack([-direction[:, 1], direction[:, 0]], axis=1)
 
 
 def offset(points: Array, distance_m: float) -> Array:
-    """A polyline moved to its left by ``distance_m``. (n, 2) -> (n, 2)"""
+    """Shift a polyline to its left by a distance in metres. (n, 2) -> (n, 2)"""
     return points + distance_m * left_normals(points)
 
 
 def hermite(
     start: Array, start_dir: Array, end: Array, end_dir: Array, count: int, pull: float = 1.0
 ) -> Array:
-    """A cubic curve with given ends and end directions.
+    """Cubic Hermite curve between two points with given end directions.
 
     Args:
-        start: First point. (2,)
+        start: First point in metres. (2,)
         start_dir: Unit direction of travel at the start. (2,)
-        end: Last point. (2,)
+        end: Last point in metres. (2,)
         end_dir: Unit direction of travel at the end. (2,)
-        count: Number of points.
+        count: Number of points, >= 2.
         pull: Length of the end tangents relative to the distance between the ends.
 
     Returns:
-        The curve. (count, 2)
+        Points at equal steps of the curve's parameter. (count, 2)
     """
-    t = np.linspace(0.0, 1.0, count)[:, None]
+    t = np.linspace(0.0, 1.0, num=count)[:, None]
     reach = pull * float(np.linalg.norm(end - start))
     return (
         (2 * t**3 - 3 * t**2 + 1) * start
@@ -89,27 +104,39 @@ def hermite(
 
 
 def strip(points: Array, half_width_m: float) -> Array:
-    """The outline of a band around a polyline. (n, 2) -> (2n, 2)"""
-    normals = left_normals(points)
-    return np.concatenate(
-        [points + half_width_m * normals, (points - half_width_m * normals)[::-1]]
-    )
+    """Outline of a band around a polyline.
+
+    Args:
+        points: Centre line in metres. (n, 2)
+        half_width_m: Distance of the outline from the centre line, in metres.
+
+    Returns:
+        The left side in the direction of travel, then the right side against it. (2n, 2)
+    """
+    shift = half_width_m * left_normals(points)
+    left_side = points + shift
+    right_side = points - shift
+    return np.concatenate([left_side, right_side[::-1]])
 
 
 def rectangle(center: Array, yaw_rad: float, length_m: float, width_m: float) -> Array:
-    """Return the corners of a rectangle, anticlockwise. (4, 2)
+    """Corners of a rectangle, anticlockwise.
 
     Args:
-        center: Its middle (x, y) in metres. (2,)
-        yaw_rad: Direction of its length, anticlockwise from +x.
-        length_m: Extent along that direction.
-        width_m: Extent across it.
+        center: Centre (x, y) in metres. (2,)
+        yaw_rad: Direction of the length in radians, anticlockwise from +x.
+        length_m: Extent along that direction, in metres.
+        width_m: Extent across that direction, in metres.
+
+    Returns:
+        Front left, back left, back right and front right corner, in metres. (4, 2)
     """
-    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    c = np.cos(yaw_rad)
+    s = np.sin(yaw_rad)
     corners = 0.5 * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * [length_m, width_m]
     return corners @ np.array([[c, s], [-s, c]]) + center
 
 
 def unit(yaw_rad: float) -> Array:
-    """The unit vector at an angle from +x. (2,)"""
+    """Unit vector at an angle in radians, anticlockwise from +x. (2,)"""
     return np.array([np.cos(yaw_rad), np.sin(yaw_rad)])

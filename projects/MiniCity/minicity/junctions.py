@@ -1,4 +1,4 @@
-"""Junctions: their outline between the mouths of their roads, and the paths that cross them."""
+"""Junctions: outlines between the mouths of their roads, and driving paths across them."""
 
 from dataclasses import dataclass
 
@@ -8,17 +8,18 @@ from minicity.curves import Array, hermite
 from minicity.roads import Lane, Road
 
 CONNECTOR_M = 3.2
+STRAIGHT_RAD = 0.6  # a smaller turning angle counts as straight on
 
 
 @dataclass(frozen=True)
 class Junction:
-    """Where three or four roads meet.
+    """Junction of three or four roads.
 
     Attributes:
-        node: Its node.
-        outline: Kerb outline and road mouths, anticlockwise. (n, 2)
-        corners: The kerb lines between neighbouring roads. Each (m, 2)
-        arms: (road index, at its start) anticlockwise.
+        node: Index of the node.
+        outline: Kerb outline and road mouths in metres, anticlockwise. (n, 2)
+        corners: Kerb lines between neighbouring roads, in metres. Each (m, 2)
+        arms: (road index, whether the road starts here), anticlockwise.
     """
 
     node: int
@@ -29,12 +30,12 @@ class Junction:
 
 @dataclass(frozen=True)
 class Connector:
-    """The path from a lane into a lane of another road.
+    """Path across a junction from a lane into a lane of another road.
 
     Attributes:
-        source: Lane that is left.
-        target: Lane that is entered.
-        center: Path across the junction. (n, 2)
+        source: Lane that leads to the junction.
+        target: Lane that leaves the junction.
+        center: Path between both lanes, in metres. (n, 2)
     """
 
     source: Lane
@@ -43,13 +44,22 @@ class Connector:
 
 
 def mouth(road: Road, at_start: bool) -> Array:
-    """A road's mouth from its right to its left kerb, seen from the junction. (n, 2)"""
-    offsets = road.section.all_offsets
-    points = np.stack([road.line(o)[0 if at_start else -1] for o in offsets])
+    """Mouth of a road from its right to its left kerb as a driver in the junction faces it.
+
+    Args:
+        road: The road.
+        at_start: Whether the junction lies at the start of the road.
+
+    Returns:
+        Edges of lanes, median and kerbs at the end of the road, in metres. (n, 2)
+    """
+    end = 0 if at_start else -1
+    points = np.stack([road.line(offset_m)[end] for offset_m in road.section.all_offsets])
     return points if at_start else points[::-1]
 
 
 def _outward(road: Road, at_start: bool) -> Array:
+    """Unit direction in which a road leaves a junction. (2,)"""
     step = road.center[1] - road.center[0] if at_start else road.center[-2] - road.center[-1]
     return step / np.linalg.norm(step)
 
@@ -59,58 +69,97 @@ def make_junction(node: int, arms: list[tuple[int, bool]], roads: list[Road]) ->
 
     Args:
         node: Index of the node.
-        arms: Index of each road, and whether its start is here; anticlockwise.
-        roads: All roads.
+        arms: Index of each road, and whether it starts here; anticlockwise.
+        roads: All roads of the town.
+
+    Returns:
+        The junction.
     """
     mouths = [mouth(roads[r], at_start) for r, at_start in arms]
     outward = [_outward(roads[r], at_start) for r, at_start in arms]
     corners = []
+    ring = []
     for i in range(len(arms)):
         j = (i + 1) % len(arms)
         turn = float(np.arccos(np.clip(-outward[i] @ outward[j], -1, 1)))
-        pull = 1.0 + 0.25 * turn
-        corners.append(hermite(mouths[i][-1], -outward[i], mouths[j][0], outward[j], 12, pull))
-    ring = [part for m, corner in zip(mouths, corners, strict=True) for part in (m, corner[1:-1])]
-    return Junction(node, np.concatenate(ring), corners, arms)
+        corner = hermite(
+            start=mouths[i][-1],
+            start_dir=-outward[i],
+            end=mouths[j][0],
+            end_dir=outward[j],
+            count=12,
+            pull=1.0 + 0.25 * turn,
+        )
+        corners.append(corner)
+        ring += [mouths[i], corner[1:-1]]
+    return Junction(node, np.concatenate(ring), corners=corners, arms=arms)
 
 
-def _turn(source: Lane, target: Lane) -> float:
-    """Signed turning angle from the end of one lane to the start of another; left is positive."""
-    a, b = source.center[-1] - source.center[-2], target.center[1] - target.center[0]
+def _turning_angle(source: Lane, target: Lane) -> float:
+    """Angle in radians from the end of one lane to the start of another, positive to the left."""
+    a = source.center[-1] - source.center[-2]
+    b = target.center[1] - target.center[0]
     return float(np.arctan2(a[0] * b[1] - a[1] * b[0], a @ b))
 
 
-def _choose_target(source: Lane, lanes_in: int, targets: list[Lane], turn: float) -> Lane | None:
-    """The lane that a driver would enter, or None where the turn is made from another lane."""
-    if turn > 0.6:
+def _choose_target(source: Lane, lanes_in: int, targets: list[Lane]) -> Lane | None:
+    """Choose the lane into which a driver turns.
+
+    Args:
+        source: Lane that leads to the junction.
+        lanes_in: Number of lanes beside ``source`` in its direction, itself included.
+        targets: Lanes that leave the junction on one road, from the innermost.
+
+    Returns:
+        The lane, or None where this turn is made from another lane.
+    """
+    angle = _turning_angle(source, targets[0])
+    if angle > STRAIGHT_RAD:
         return targets[0] if source.index == 0 else None
-    if turn < -0.6:
+    if angle < -STRAIGHT_RAD:
         return targets[-1] if source.index == lanes_in - 1 else None
     return targets[min(source.index, len(targets) - 1)]
 
 
 def make_connectors(junction: Junction, lanes_by_road: dict[int, list[Lane]]) -> list[Connector]:
-    """All permitted paths across a junction."""
+    """Make all permitted paths across a junction.
+
+    Args:
+        junction: The junction.
+        lanes_by_road: Lanes of every road of the town, by road index.
+
+    Returns:
+        One path per permitted turn of each lane.
+    """
     incoming: dict[int, list[Lane]] = {}
     outgoing: dict[int, list[Lane]] = {}
     for r, at_start in junction.arms:
         for lane in lanes_by_road[r]:
-            enters = lane.forward != at_start
-            (incoming if enters else outgoing).setdefault(r, []).append(lane)
-    found = []
+            is_incoming = lane.forward != at_start
+            lanes = incoming if is_incoming else outgoing
+            lanes.setdefault(r, []).append(lane)
+    connectors = []
     for r_in, sources in incoming.items():
         for r_out, targets in outgoing.items():
             if r_in == r_out:
                 continue
             for source in sources:
-                target = _choose_target(source, len(sources), targets, _turn(source, targets[0]))
+                target = _choose_target(source, lanes_in=len(sources), targets=targets)
                 if target is not None:
-                    found.append(Connector(source, target, _path(source, target)))
-    return found
+                    path = _connector_path(source, target)
+                    connectors.append(Connector(source, target, center=path))
+    return connectors
 
 
-def _path(source: Lane, target: Lane) -> Array:
-    a, b = source.center[-1] - source.center[-2], target.center[1] - target.center[0]
+def _connector_path(source: Lane, target: Lane) -> Array:
+    """Smooth curve from the end of one lane to the start of another, in metres. (16, 2)"""
+    a = source.center[-1] - source.center[-2]
+    b = target.center[1] - target.center[0]
     return hermite(
-        source.center[-1], a / np.linalg.norm(a), target.center[0], b / np.linalg.norm(b), 16, 1.1
+        start=source.center[-1],
+        start_dir=a / np.linalg.norm(a),
+        end=target.center[0],
+        end_dir=b / np.linalg.norm(b),
+        count=16,
+        pull=1.1,
     )

@@ -1,4 +1,4 @@
-"""The street network of a town: jittered grid nodes joined by curved roads."""
+"""Street network of a town: jittered grid nodes joined by curved roads."""
 
 from dataclasses import dataclass
 
@@ -13,17 +13,18 @@ MARGIN_M = 130.0
 STATION_M = 3.0
 MIN_ROAD_M = 40.0
 CORNER_M = (4.0, 8.0)
+BEND_CUT_M = 40.0  # length of a street that the curve of a bend replaces, on each side
 STEPS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
 
 
 @dataclass
 class Node:
-    """A crossing point of the grid.
+    """Node of the grid, at which streets meet or bend.
 
     Attributes:
         position: Centre in metres. (2,)
-        turn_rad: Angle by which its four arms are turned from the axes.
-        neighbours: Node index per arm, at 0, 90, 180, 270 degrees plus the turn, or None.
+        turn_rad: Rotation of the four arms from the axes, in radians.
+        neighbours: Node index per arm, at 0, 90, 180, 270 degrees plus the rotation, or None.
     """
 
     position: Array
@@ -32,7 +33,7 @@ class Node:
 
     @property
     def degree(self) -> int:
-        """Number of roads that meet here."""
+        """Number of streets at the node."""
         return sum(n is not None for n in self.neighbours)
 
     def arm_dir(self, arm: int) -> Array:
@@ -41,30 +42,39 @@ class Node:
 
 
 def make_nodes(side: int, seed: int, name: str) -> list[Node]:
-    """Make grid nodes, moved and turned at random, with some of the streets left out.
+    """Make grid nodes with random offsets and rotations, and remove some of their streets.
 
     Args:
         side: Nodes along each side of the grid.
-        seed: Seed of all towns.
+        seed: Seed of the data set.
         name: Name of the town.
+
+    Returns:
+        ``side * side`` nodes, row by row.
     """
     rng = make_rng(seed, name, "nodes")
     nodes = []
     for i in range(side * side):
         cell = np.array([i % side, i // side])
-        position = MARGIN_M + PITCH_M * cell + rng.uniform(-17, 17, 2)
+        position = MARGIN_M + PITCH_M * cell + rng.uniform(low=-17, high=17, size=2)
         neighbours: list[int | None] = []
         for step in STEPS:
             other = cell + step
             inside = bool(np.all(other >= 0) and np.all(other < side))
             neighbours.append(int(other[0] + side * other[1]) if inside else None)
-        nodes.append(Node(position, float(rng.uniform(-0.3, 0.3)), neighbours))
-    streets = [
-        (i, arm)
-        for i in range(len(nodes))
-        for arm in (0, 1)
-        if nodes[i].neighbours[arm] is not None
-    ]
+        turn_rad = float(rng.uniform(low=-0.3, high=0.3))
+        nodes.append(Node(position, turn_rad, neighbours))
+    _remove_streets(nodes, rng)
+    return nodes
+
+
+def _remove_streets(nodes: list[Node], rng: np.random.Generator) -> None:
+    """Remove random streets in place; each node keeps at least two."""
+    streets = []
+    for i, node in enumerate(nodes):
+        for arm in (0, 1):
+            if node.neighbours[arm] is not None:
+                streets.append((i, arm))
     for k in rng.permutation(len(streets)):
         i, arm = streets[k]
         other = nodes[i].neighbours[arm]
@@ -72,49 +82,65 @@ def make_nodes(side: int, seed: int, name: str) -> list[Node]:
         if min(nodes[i].degree, nodes[other].degree) > 2 and rng.random() < 0.2:
             nodes[i].neighbours[arm] = None
             nodes[other].neighbours[(arm + 2) % 4] = None
-    return nodes
 
 
 def random_section(rng: np.random.Generator) -> CrossSection:
-    """Draw lanes, widths and median of a road."""
+    """Draw the lanes, the widths and the median of a road."""
     one_way = rng.random() < 0.12
     forward = int(rng.choice([1, 2, 3], p=[0.35, 0.45, 0.2]))
-    backward = (
-        0 if one_way else int(np.clip(forward + rng.choice([-1, 0, 1], p=[0.15, 0.7, 0.15]), 1, 3))
-    )
-    median = 0.0 if one_way or rng.random() > 0.33 else float(rng.choice([1.6, 2.4, 3.5]))
-    shoulders = [float(rng.choice([0.3, 0.6, 2.3], p=[0.4, 0.25, 0.35])) for _ in range(2)]
+    backward = 0
+    if not one_way:
+        difference = rng.choice([-1, 0, 1], p=[0.15, 0.7, 0.15])
+        backward = int(np.clip(forward + difference, 1, 3))
+    median_m = 0.0
+    if not (one_way or rng.random() > 0.33):
+        median_m = float(rng.choice([1.6, 2.4, 3.5]))
+    shoulder_widths = [0.3, 0.6, 2.3]
+    shoulder_shares = [0.4, 0.25, 0.35]
+    right_shoulder_m = float(rng.choice(shoulder_widths, p=shoulder_shares))
+    left_shoulder_m = float(rng.choice(shoulder_widths, p=shoulder_shares))
     return CrossSection(
-        forward, backward, round(float(rng.uniform(3.0, 3.7)), 2), median, *shoulders
+        forward=forward,
+        backward=backward,
+        lane_m=round(float(rng.uniform(low=3.0, high=3.7)), 2),
+        median_m=median_m,
+        right_shoulder_m=right_shoulder_m,
+        left_shoulder_m=left_shoulder_m,
     )
 
 
 def random_style(rng: np.random.Generator) -> RoadStyle:
-    """Draw paint and surface of a road."""
+    """Draw the paint and the surface of a road."""
+    dividers = ["double_yellow", "yellow", "dashed_white", "white"]
     dashes = [(3.0, 3.0), (2.0, 4.0), (4.0, 4.0), (3.0, 2.0)]
+    divider = str(rng.choice(dividers, p=[0.4, 0.2, 0.2, 0.2]))
+    dash_m = dashes[int(rng.integers(len(dashes)))]
+    line_m = float(rng.uniform(low=0.14, high=0.22))
+    edge_line = bool(rng.random() < 0.35)
+    crossing = str(rng.choice(["zebra", "ladder"], p=[0.7, 0.3]))
+    light_wear = rng.uniform(low=0.0, high=0.2)
+    heavy_wear = rng.uniform(low=0.2, high=0.55)
     return RoadStyle(
-        divider=str(
-            rng.choice(["double_yellow", "yellow", "dashed_white", "white"], p=[0.4, 0.2, 0.2, 0.2])
-        ),
-        dash_m=dashes[int(rng.integers(len(dashes)))],
-        line_m=float(rng.uniform(0.14, 0.22)),
-        edge_line=bool(rng.random() < 0.35),
-        crossing=str(rng.choice(["zebra", "ladder"], p=[0.7, 0.3])),
-        wear=float(rng.choice([rng.uniform(0.0, 0.2), rng.uniform(0.2, 0.55)], p=[0.75, 0.25])),
-        asphalt=float(rng.uniform(62, 105)),
-        walkway_m=float(rng.uniform(1.8, 4.0)),
+        divider=divider,
+        dash_m=dash_m,
+        line_m=line_m,
+        edge_line=edge_line,
+        crossing=crossing,
+        wear=float(rng.choice([light_wear, heavy_wear], p=[0.75, 0.25])),
+        asphalt=float(rng.uniform(low=62, high=105)),
+        walkway_m=float(rng.uniform(low=1.8, high=4.0)),
     )
 
 
 @dataclass
 class Chain:
-    """A street from one junction or dead end to the next, through nodes where it merely bends.
+    """Street from one junction or dead end to the next, through nodes at which it merely bends.
 
     Attributes:
-        nodes: Node indices along it.
+        nodes: Node indices along the street.
         arms: (arm at which it leaves the first node, arm at which it enters the last node).
-        center: Centre line from node to node. (n, 2)
-        section: Lanes across it.
+        center: Centre line from node to node, in metres. (n, 2)
+        section: Lanes across the street.
         style: Paint and surface.
     """
 
@@ -125,87 +151,108 @@ class Chain:
     style: RoadStyle
 
 
-def _leg(nodes: list[Node], a: int, arm: int) -> Array:
-    """The curve from node ``a`` along ``arm`` to the next node."""
-    b = nodes[a].neighbours[arm]
-    assert b is not None
-    arrive = -nodes[b].arm_dir((arm + 2) % 4)
-    return hermite(nodes[a].position, nodes[a].arm_dir(arm), nodes[b].position, arrive, 60)
+def _curve_to_neighbour(nodes: list[Node], index: int, arm: int) -> Array:
+    """Curve from a node along one of its arms to the next node, in metres. (60, 2)"""
+    node = nodes[index]
+    other_index = node.neighbours[arm]
+    assert other_index is not None
+    other = nodes[other_index]
+    return hermite(
+        start=node.position,
+        start_dir=node.arm_dir(arm),
+        end=other.position,
+        end_dir=-other.arm_dir((arm + 2) % 4),
+        count=60,
+    )
 
 
-def _join(first: Array, second: Array) -> Array:
-    """Two legs that meet at a bend, the corner replaced by a wide curve."""
-    cut = 40.0
-    first_length, second_length = arc_lengths(first)[-1], arc_lengths(second)[-1]
-    head, tail = subline(first, 0.0, first_length - cut), subline(second, cut, second_length)
-    start_dir, end_dir = head[-1] - head[-2], tail[1] - tail[0]
+def _join_at_bend(first: Array, second: Array) -> Array:
+    """Join two curves (n, 2) and (m, 2) that meet at a node by a wide bend. (k, 2)"""
+    first_length = arc_lengths(first)[-1]
+    second_length = arc_lengths(second)[-1]
+    head = subline(first, start_m=0.0, end_m=first_length - BEND_CUT_M)
+    tail = subline(second, start_m=BEND_CUT_M, end_m=second_length)
+    start_dir = head[-1] - head[-2]
+    end_dir = tail[1] - tail[0]
     bend = hermite(
-        head[-1],
-        start_dir / np.linalg.norm(start_dir),
-        tail[0],
-        end_dir / np.linalg.norm(end_dir),
-        30,
-        1.15,
+        start=head[-1],
+        start_dir=start_dir / np.linalg.norm(start_dir),
+        end=tail[0],
+        end_dir=end_dir / np.linalg.norm(end_dir),
+        count=30,
+        pull=1.15,
     )
     return np.concatenate([head[:-1], bend, tail[1:]])
 
 
 def make_chains(nodes: list[Node], seed: int, name: str) -> list[Chain]:
-    """Make all streets; a node of degree two is a bend of its street, any other an end.
+    """Make all streets. A street bends at a node of degree two and ends at every other node.
 
     Args:
         nodes: Nodes of the town.
-        seed: Seed of all towns.
+        seed: Seed of the data set.
         name: Name of the town.
+
+    Returns:
+        Every street once.
     """
     chains = []
-    used: set[tuple[int, int]] = set()
+    used_arms: set[tuple[int, int]] = set()
     for i, node in enumerate(nodes):
         if node.degree == 2:
             continue
         for arm in range(4):
-            if node.neighbours[arm] is None or (i, arm) in used:
+            if node.neighbours[arm] is None or (i, arm) in used_arms:
                 continue
-            chain = _follow(nodes, i, arm, make_rng(seed, name, "street", i, arm))
-            used |= {(i, arm), (chain.nodes[-1], chain.arms[1])}
+            rng = make_rng(seed, name, "street", i, arm)
+            chain = _follow_street(nodes, start=i, arm=arm, rng=rng)
+            used_arms.add((i, arm))
+            used_arms.add((chain.nodes[-1], chain.arms[1]))
             chains.append(chain)
     return chains
 
 
-def _follow(nodes: list[Node], start: int, arm: int, rng: np.random.Generator) -> Chain:
-    visited, first_arm = [start], arm
-    center = _leg(nodes, start, arm)
+def _follow_street(nodes: list[Node], start: int, arm: int, rng: np.random.Generator) -> Chain:
+    """Follow a street from an arm of its first node to the node at which it ends."""
+    first_arm = arm
+    center = _curve_to_neighbour(nodes, start, arm)
     current = nodes[start].neighbours[arm]
     assert current is not None
-    visited.append(current)
+    visited = [start, current]
     while nodes[current].degree == 2:
         back = (arm + 2) % 4
         arm = next(a for a in range(4) if a != back and nodes[current].neighbours[a] is not None)
-        center = _join(center, _leg(nodes, current, arm))
+        center = _join_at_bend(center, _curve_to_neighbour(nodes, current, arm))
         following = nodes[current].neighbours[arm]
         assert following is not None
         current = following
         visited.append(current)
     return Chain(
-        visited, (first_arm, (arm + 2) % 4), center, random_section(rng), random_style(rng)
+        nodes=visited,
+        arms=(first_arm, (arm + 2) % 4),
+        center=center,
+        section=random_section(rng),
+        style=random_style(rng),
     )
 
 
 def _half_widths(chain: Chain, at_start: bool) -> tuple[float, float]:
-    """Metres from the centre line to the (left, right) kerb, seen looking out of the junction."""
-    left, right = chain.section.left_m, -chain.section.right_m
+    """Distance of the (left, right) kerb from the centre line in metres, facing the street."""
+    left = chain.section.left_m
+    right = -chain.section.right_m
     return (left, right) if at_start else (right, left)
 
 
 def mouth_distances(arms: list[tuple[float, float, float]], corner_m: float) -> list[float]:
-    """How far from a junction's centre each of its roads has to end.
+    """Distance from the centre of a junction at which each of its roads ends.
 
-    Two neighbouring kerbs meet at ``(w2 + w1 cos(phi)) / sin(phi)`` along the first road, ``phi``
-    being the angle between the roads and ``w`` the half widths; the corner's radius is added.
+    Two neighbouring kerbs meet at ``(w2 + w1 cos(phi)) / sin(phi)`` along the first road, with
+    ``phi`` the angle between the roads and ``w`` the half widths; the corner's radius is added.
 
     Args:
-        arms: (angle in radians, left half width, right half width) of the roads, anticlockwise.
-        corner_m: Space left for the rounded corner.
+        arms: (angle in radians, left half width, right half width in metres) of each road, in
+            anticlockwise order.
+        corner_m: Space for the rounded corner, in metres.
 
     Returns:
         Metres along each road.
@@ -217,7 +264,8 @@ def mouth_distances(arms: list[tuple[float, float, float]], corner_m: float) -> 
         angle = (arms[j][0] - arms[i][0]) % (2 * np.pi)
         if angle > 0.9 * np.pi or count == 1:
             continue
-        w1, w2 = arms[i][1], arms[j][2]
+        w1 = arms[i][1]
+        w2 = arms[j][2]
         for k, near, far in ((i, w1, w2), (j, w2, w1)):
             meet = (far + near * np.cos(angle)) / np.sin(angle)
             distances[k] = max(distances[k], meet + corner_m)
@@ -226,17 +274,18 @@ def mouth_distances(arms: list[tuple[float, float, float]], corner_m: float) -> 
 
 def make_roads(
     nodes: list[Node], chains: list[Chain], seed: int, name: str
-) -> tuple[list[Road], list]:
-    """Cut the streets back to their junctions.
+) -> tuple[list[Road], list[list[tuple[int, bool, float]]]]:
+    """Cut the streets back to the mouths of their junctions.
 
     Args:
         nodes: Nodes of the town.
         chains: Streets between nodes.
-        seed: Seed of all towns.
+        seed: Seed of the data set.
         name: Name of the town.
 
     Returns:
-        The roads and, per node, (road index, at its start, angle) anticlockwise by angle.
+        The roads; and per node, (road index, whether the road starts there, angle in radians) of
+        each road, anticlockwise by angle.
     """
     meetings: list[list[tuple[int, bool, float]]] = [[] for _ in nodes]
     for c, chain in enumerate(chains):
@@ -249,13 +298,25 @@ def make_roads(
         meeting.sort(key=lambda m: m[2])
         if nodes[n].degree < 3:
             continue
-        arms = [(angle, *_half_widths(chains[c], at_start)) for c, at_start, angle in meeting]
-        corner = float(make_rng(seed, name, "corner", n).uniform(*CORNER_M))
+        arms = []
+        for c, at_start, angle in meeting:
+            left, right = _half_widths(chains[c], at_start)
+            arms.append((angle, left, right))
+        corner_rng = make_rng(seed, name, "corner", n)
+        corner = float(corner_rng.uniform(low=CORNER_M[0], high=CORNER_M[1]))
         for (c, at_start, _), distance in zip(meeting, mouth_distances(arms, corner), strict=True):
             cuts[c, 0 if at_start else 1] = distance
     roads = []
     for c, chain in enumerate(chains):
         length = arc_lengths(chain.center)[-1]
-        center = resample(subline(chain.center, cuts[c, 0], length - cuts[c, 1]), STATION_M)
-        roads.append(Road(c, chain.nodes[0], chain.nodes[-1], center, chain.section, chain.style))
+        part = subline(chain.center, start_m=cuts[c, 0], end_m=length - cuts[c, 1])
+        road = Road(
+            index=c,
+            start_node=chain.nodes[0],
+            end_node=chain.nodes[-1],
+            center=resample(part, STATION_M),
+            section=chain.section,
+            style=chain.style,
+        )
+        roads.append(road)
     return roads, meetings

@@ -1,4 +1,4 @@
-"""One road between two junctions: its cross-section, lanes, lines and painted style."""
+"""Road between two junctions: cross-section, lanes, lines and paint."""
 
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -14,15 +14,17 @@ STOP_LINE_M = 0.45
 
 @dataclass(frozen=True)
 class CrossSection:
-    """Lanes across a road; offsets are metres left of the centre line, forward lanes lie right.
+    """Lanes across a road.
+
+    Offsets are in metres, positive to the left of the centre line. Forward lanes lie on its right.
 
     Attributes:
-        forward: Lanes along the centre line.
-        backward: Lanes against it; 0 makes a one-way road.
-        lane_m: Width of a lane.
-        median_m: Width of the raised strip between the directions; 0 for none.
-        right_shoulder_m: Width between the outermost forward lane and the kerb.
-        left_shoulder_m: The same on the other side.
+        forward: Number of lanes along the centre line.
+        backward: Number of lanes against the centre line; 0 for a one-way road.
+        lane_m: Width of a lane in metres.
+        median_m: Width of the raised strip between the directions in metres; 0 for none.
+        right_shoulder_m: Width between the outermost forward lane and the right kerb, in metres.
+        left_shoulder_m: Width between the outermost backward lane and the left kerb, in metres.
     """
 
     forward: int
@@ -34,12 +36,12 @@ class CrossSection:
 
     @property
     def forward_edges(self) -> list[float]:
-        """Offsets of the forward lanes' edges, from the centre to the right kerb side."""
+        """Offsets of the edges of the forward lanes, from the centre to the right kerb."""
         return [-self.median_m / 2 - i * self.lane_m for i in range(self.forward + 1)]
 
     @property
     def backward_edges(self) -> list[float]:
-        """Offsets of the backward lanes' edges, from the centre to the left kerb side."""
+        """Offsets of the edges of the backward lanes, from the centre to the left kerb."""
         return [self.median_m / 2 + i * self.lane_m for i in range(self.backward + 1)]
 
     @property
@@ -61,17 +63,17 @@ class CrossSection:
 
 @dataclass(frozen=True)
 class RoadStyle:
-    """How a road is painted and surfaced.
+    """Paint and surface of a road.
 
     Attributes:
         divider: Centre paint: ``double_yellow``, ``yellow``, ``dashed_white`` or ``white``.
-        dash_m: Painted and bare length of a dashed line.
-        line_m: Width of a painted line.
+        dash_m: Painted and bare length of a dashed line, in metres.
+        line_m: Width of a painted line in metres.
         edge_line: Whether a solid line runs along the kerb side of the lanes.
         crossing: Crossing paint: ``zebra`` or ``ladder``.
-        wear: Share of paint that has worn off, in [0, 1).
-        asphalt: Grey level of the asphalt.
-        walkway_m: Width of the pavements.
+        wear: Share of the paint that is worn off, in [0, 1).
+        asphalt: Grey level of the asphalt, in [0, 255].
+        walkway_m: Width of the pavements in metres.
     """
 
     divider: str
@@ -86,15 +88,15 @@ class RoadStyle:
 
 @dataclass(frozen=True)
 class Lane:
-    """A lane: its identity and its centre line in the direction of travel.
+    """Lane of a road.
 
     Attributes:
-        road: Index of its road.
-        forward: Whether it runs along the road's centre line.
-        index: 0 for the innermost lane.
-        center: Centre line. (n, 2)
-        start_node: Junction that it leaves.
-        end_node: Junction that it enters.
+        road: Index of the road.
+        forward: Whether the lane runs along the road's centre line.
+        index: Position among the lanes of its direction, 0 for the innermost lane.
+        center: Centre line in the direction of travel, in metres. (n, 2)
+        start_node: Node at which the lane starts.
+        end_node: Node at which the lane ends.
     """
 
     road: int
@@ -106,26 +108,28 @@ class Lane:
 
     @property
     def key(self) -> tuple[int, bool, int]:
-        """Identity of the lane within its town."""
+        """Identity of the lane within its town: road, direction and index."""
         return (self.road, self.forward, self.index)
 
 
 @dataclass
 class Road:
-    """A road between two nodes, cut back to the mouths of its junctions.
+    """Road between two nodes, cut back to the mouths of its junctions.
+
+    Arc lengths are in metres along the centre line.
 
     Attributes:
         index: Number of the road in its town.
         start_node: Node at the first point.
         end_node: Node at the last point.
-        center: Centre line from mouth to mouth. (n, 2)
+        center: Centre line from mouth to mouth, in metres. (n, 2)
         section: Lanes across the road.
         style: Paint and surface.
         crossings: Arc lengths (start, end) of pedestrian crossings.
         clear_start_m: Arc length at which divider paint begins.
         clear_end_m: Arc length at which divider paint ends.
-        stop_forward: Arc lengths of the stop line for forward lanes, or None.
-        stop_backward: Arc lengths of the stop line for backward lanes, or None.
+        stop_forward: Arc lengths (start, end) of the stop line for forward lanes, or None.
+        stop_backward: Arc lengths (start, end) of the stop line for backward lanes, or None.
     """
 
     index: int
@@ -141,51 +145,80 @@ class Road:
     stop_backward: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        """Prepare the tables that lines at an offset are read from."""
+        """Compute the arc lengths and normals of the centre line."""
         self._lengths = arc_lengths(self.center)
         self._normals = left_normals(self.center)
         self.clear_end_m = self.clear_end_m or self.length_m
 
     @property
     def length_m(self) -> float:
-        """Length of the centre line."""
+        """Length of the centre line in metres."""
         return float(self._lengths[-1])
 
     def line(self, offset_m: float, start_m: float = 0.0, end_m: float | None = None) -> Array:
-        """The line at an offset between two arc lengths of the centre line. (n, 2)"""
+        """Line parallel to the centre line.
+
+        Args:
+            offset_m: Offset in metres, positive to the left.
+            start_m: Arc length of the first point, in metres.
+            end_m: Arc length of the last point, in metres; None for the end of the road.
+
+        Returns:
+            Points in metres. (n, 2)
+        """
         end_m = self.length_m if end_m is None else end_m
         inner = self._lengths[(self._lengths > start_m + 0.05) & (self._lengths < end_m - 0.05)]
         at = np.concatenate([[start_m], inner, [end_m]])
-        points = interpolate(self.center, self._lengths, at)
-        return points + offset_m * interpolate(self._normals, self._lengths, at)
+        points = interpolate(self.center, self._lengths, at=at)
+        return points + offset_m * interpolate(self._normals, self._lengths, at=at)
 
     def band(
         self, right_m: float, left_m: float, start_m: float = 0.0, end_m: float | None = None
     ) -> Array:
-        """The outline, anticlockwise, between two offsets and two arc lengths. (n, 2)"""
-        right = self.line(right_m, start_m, end_m)
-        return np.concatenate([right, self.line(left_m, start_m, end_m)[::-1]])
+        """Outline of the area between two offsets and two arc lengths, anticlockwise.
+
+        Args:
+            right_m: Offset of the right side in metres.
+            left_m: Offset of the left side in metres.
+            start_m: Arc length at which the area begins, in metres.
+            end_m: Arc length at which the area ends, in metres; None for the end of the road.
+
+        Returns:
+            The right side, then the left side against the centre line, in metres. (n, 2)
+        """
+        right = self.line(right_m, start_m, end_m=end_m)
+        left = self.line(left_m, start_m, end_m=end_m)
+        return np.concatenate([right, left[::-1]])
 
     def band_with_mouths(self, right_m: float, left_m: float) -> Array:
-        """The whole band, its ends with every vertex that the junctions' mouths have. (n, 2)"""
-        between = [o for o in self.section.all_offsets if right_m < o < left_m]
-        end = np.array([self.line(o)[-1] for o in between]).reshape(-1, 2)
-        start = np.array([self.line(o)[0] for o in reversed(between)]).reshape(-1, 2)
+        """Outline of the whole road between two offsets in metres, anticlockwise. (n, 2)
+
+        Its ends have every vertex of the junctions' mouths, so that the outlines join.
+        """
+        start_points = []
+        end_points = []
+        for offset_m in self.section.all_offsets:
+            if right_m < offset_m < left_m:
+                line = self.line(offset_m)
+                start_points.append(line[0])
+                end_points.append(line[-1])
+        start = np.array(start_points[::-1]).reshape(-1, 2)
+        end = np.array(end_points).reshape(-1, 2)
         return np.concatenate([self.line(right_m), end, self.line(left_m)[::-1], start])
 
     def direction(self, at_m: float) -> float:
-        """Heading of the centre line at an arc length, in radians."""
-        step = interpolate(tangents(self.center), self._lengths, np.array([at_m]))[0]
+        """Heading of the centre line at an arc length, in radians anticlockwise from +x."""
+        step = interpolate(tangents(self.center), self._lengths, at=np.array([at_m]))[0]
         return float(np.arctan2(step[1], step[0]))
 
     def point(self, at_m: float, offset_m: float) -> Array:
-        """The point at an arc length and an offset. (2,)"""
+        """Point at an arc length and an offset, in metres. (2,)"""
         at = np.array([at_m])
-        normal = interpolate(self._normals, self._lengths, at)[0]
-        return interpolate(self.center, self._lengths, at)[0] + offset_m * normal
+        normal = interpolate(self._normals, self._lengths, at=at)[0]
+        return interpolate(self.center, self._lengths, at=at)[0] + offset_m * normal
 
     def carriageways(self) -> list[tuple[float, float]]:
-        """Offsets (right, left) of each kerb-to-kerb surface: two where a median parts them."""
+        """Offsets (right, left) of each kerb-to-kerb surface: two for a road with a median."""
         section = self.section
         if section.median_m > 0:
             return [
@@ -195,22 +228,39 @@ class Road:
         return [(section.right_m, section.left_m)]
 
     def lanes(self) -> list[Lane]:
-        """All lanes of the road."""
-        found = []
-        for forward, edges in (
-            (True, self.section.forward_edges),
-            (False, self.section.backward_edges),
-        ):
-            for i, (inner, outer) in enumerate(pairwise(edges)):
-                center = self.line(0.5 * (inner + outer))
-                nodes = (self.start_node, self.end_node)
-                if not forward:
-                    center, nodes = center[::-1], nodes[::-1]
-                found.append(Lane(self.index, forward, i, center, *nodes))
-        return found
+        """Lanes of the road: forward ones, then backward ones, each from the innermost."""
+        lanes = []
+        for i, (inner, outer) in enumerate(pairwise(self.section.forward_edges)):
+            lane = Lane(
+                road=self.index,
+                forward=True,
+                index=i,
+                center=self.line(0.5 * (inner + outer)),
+                start_node=self.start_node,
+                end_node=self.end_node,
+            )
+            lanes.append(lane)
+        for i, (inner, outer) in enumerate(pairwise(self.section.backward_edges)):
+            lane = Lane(
+                road=self.index,
+                forward=False,
+                index=i,
+                center=self.line(0.5 * (inner + outer))[::-1],
+                start_node=self.end_node,
+                end_node=self.start_node,
+            )
+            lanes.append(lane)
+        return lanes
 
     def add_crossing(self, start_m: float, depth_m: float, at_start: bool, stop: bool) -> None:
-        """Put a crossing near one end, perhaps with a stop line before it, and clear the paint."""
+        """Add a crossing near one end of the road and end the divider paint before it.
+
+        Args:
+            start_m: Distance from the end of the road to the crossing, in metres.
+            depth_m: Extent of the crossing along the road, in metres.
+            at_start: Whether the crossing lies at the start of the centre line.
+            stop: Whether to add a stop line before the crossing.
+        """
         far = start_m + depth_m
         clear = far + (STOP_GAP_M + STOP_LINE_M if stop else 0.3)
         if at_start:

@@ -1,4 +1,4 @@
-"""What the renderer is told about the ground: surfaces, kerbs, paint and height."""
+"""Description of the ground for the renderer: surfaces, kerbs, paint and height."""
 
 from dataclasses import dataclass, field
 
@@ -20,12 +20,12 @@ PAINTS = {"white": (232, 234, 234), "yellow": (60, 176, 222)}
 
 @dataclass(frozen=True)
 class Surface:
-    """A part of the ground.
+    """Part of the ground of one material.
 
     Attributes:
-        polygon: Its outline in the world, metres; holes are left out.
-        material: A key of ``MATERIALS``.
-        tone: Brightness relative to the material's own.
+        polygon: Outline and holes in the world, in metres.
+        material: Key of ``MATERIALS``.
+        tone: Brightness relative to the colour in ``MATERIALS``.
     """
 
     polygon: Polygon
@@ -38,9 +38,9 @@ class Marking:
     """Paint on the ground.
 
     Attributes:
-        outlines: Painted areas in the world, metres. Each (n, 2)
-        paint: A key of ``PAINTS``.
-        wear: Share of the paint that has worn off, in [0, 1).
+        outlines: Outlines of the painted areas in the world, in metres. Each (n, 2)
+        paint: Key of ``PAINTS``.
+        wear: Share of the paint that is worn off, in [0, 1).
     """
 
     outlines: list[Array]
@@ -50,12 +50,15 @@ class Marking:
 
 @dataclass(frozen=True)
 class HeightGrid:
-    """Ground height on a regular grid; outside it the nearest cell counts.
+    """Ground height on a regular grid; a point outside takes the height of the nearest cell.
 
     Attributes:
-        origin: World x, y of cell (0, 0)'s centre. (2,)
-        cell_m: Edge of a cell.
-        height_m: Height of each cell, rows along y, columns along x. (rows, columns)
+        origin: World x, y of the centre of cell (0, 0), in metres. (2,)
+        cell_m: Edge of a cell in metres.
+        height_m: Height of each cell in metres, rows along y, columns along x. (rows, columns)
+
+    Raises:
+        ValueError: If ``height_m`` is no matrix or has cells that are not finite.
     """
 
     origin: Array
@@ -63,7 +66,7 @@ class HeightGrid:
     height_m: Array
 
     def __post_init__(self) -> None:
-        """Refuse holes: the renderer would show them as cliffs."""
+        """Reject holes, which would be rendered as cliffs."""
         if self.height_m.ndim != 2 or not np.isfinite(self.height_m).all():
             raise ValueError(
                 f"height_m must be a finite (rows, columns) array, got shape "
@@ -74,14 +77,15 @@ class HeightGrid:
 
 @dataclass
 class SceneMap:
-    """The ground of a scene.
+    """Ground of a scene.
 
     Attributes:
-        surfaces: Painted in order, later over earlier; what none covers is grass.
-        kerbs: Kerb lines. Each (n, 2)
-        markings: Paint, over the surfaces.
-        height: Height of the ground, or the constant ``ground_z_m``.
-        ground_z_m: Height of flat ground, used where ``height`` is None.
+        surfaces: Surfaces in the order of painting, later ones over earlier ones; ground without
+            a surface is grass.
+        kerbs: Kerb lines in the world, in metres. Each (n, 2)
+        markings: Paint over the surfaces.
+        height: Height of uneven ground; None for flat ground at ``ground_z_m``.
+        ground_z_m: Height of flat ground in metres, used where ``height`` is None.
     """
 
     surfaces: list[Surface] = field(default_factory=list)
@@ -92,38 +96,59 @@ class SceneMap:
 
 
 def solid_line(line: Array, width_m: float) -> list[Array]:
-    """The painted area of an unbroken line. (n, 2) -> one (2n, 2)"""
-    return [strip(line, width_m / 2)] if len(line) > 1 and arc_lengths(line)[-1] > 0.05 else []
+    """Painted area of an unbroken line.
+
+    Args:
+        line: Centre line in metres. (n, 2)
+        width_m: Width of the paint in metres.
+
+    Returns:
+        One outline (2n, 2), or none for a line of at most 5 cm.
+    """
+    if len(line) > 1 and arc_lengths(line)[-1] > 0.05:
+        return [strip(line, width_m / 2)]
+    return []
 
 
 def dashed_line(line: Array, width_m: float, dash_m: float, gap_m: float) -> list[Array]:
-    """Return the painted areas of a dashed line. each (m, 2)
+    """Painted areas of a dashed line.
 
     Args:
-        line: Its middle, in metres. (n, 2)
-        width_m: Width of the paint.
-        dash_m: Length of a dash.
-        gap_m: Length between dashes.
+        line: Centre line in metres. (n, 2)
+        width_m: Width of the paint in metres.
+        dash_m: Length of a dash in metres.
+        gap_m: Length between two dashes in metres.
+
+    Returns:
+        One outline per dash. Each (m, 2)
     """
     total = float(arc_lengths(line)[-1]) if len(line) > 1 else 0.0
     starts = np.arange(0.0, max(total - 0.3, 0.0), dash_m + gap_m)
-    return [strip(subline(line, s, min(s + dash_m, total)), width_m / 2) for s in starts]
+    outlines = []
+    for start in starts:
+        dash = subline(line, start_m=start, end_m=min(start + dash_m, total))
+        outlines.append(strip(dash, width_m / 2))
+    return outlines
 
 
 def double_line(line: Array, width_m: float, gap_m: float) -> list[Array]:
-    """Return the painted areas of two unbroken lines side by side. two (2n, 2)
+    """Painted areas of two unbroken lines side by side.
 
     Args:
-        line: The middle between them, in metres. (n, 2)
-        width_m: Width of each line.
-        gap_m: Distance between them.
+        line: Middle between the two lines, in metres. (n, 2)
+        width_m: Width of each line in metres.
+        gap_m: Distance between the two lines in metres.
+
+    Returns:
+        The left and the right outline, or none for fewer than two points. Each (2n, 2)
     """
     if len(line) < 2:
         return []
-    band, inner = strip(line, gap_m / 2 + width_m), strip(line, gap_m / 2)
+    outer = strip(line, gap_m / 2 + width_m)
+    inner = strip(line, gap_m / 2)
     n = len(line)
-    left = np.concatenate([band[:n], inner[:n][::-1]])
-    right = np.concatenate([band[n:], inner[n:][::-1]])
+    left = np.concatenate([outer[:n], inner[:n][::-1]])
+    right = np.concatenate([outer[n:], inner[n:][::-1]])
     return [left, right]
 
 
@@ -131,29 +156,32 @@ def zebra(side_a: Array, side_b: Array, stripe_m: float = 0.5, gap_m: float = 0.
     """Stripes of a crossing, parallel to the traffic.
 
     Args:
-        side_a: One long side of the crossing, kerb to kerb. (n, 2)
-        side_b: The other long side, in the same direction. (m, 2)
-        stripe_m: Width of a stripe.
-        gap_m: Bare space between stripes.
+        side_a: One long side of the crossing, kerb to kerb, in metres. (n, 2)
+        side_b: The other long side, in the direction of ``side_a``. (m, 2)
+        stripe_m: Width of a stripe in metres.
+        gap_m: Bare space between two stripes in metres.
 
     Returns:
-        Painted areas, each (4, 2).
+        One outline per stripe. Each (4, 2)
     """
-    lengths = arc_lengths(side_a), arc_lengths(side_b)
-    total = float(lengths[0][-1])
+    lengths_a = arc_lengths(side_a)
+    lengths_b = arc_lengths(side_b)
+    total = float(lengths_a[-1])
     count = max(1, int((total - 0.3) / (stripe_m + gap_m)))
     first = (total - count * (stripe_m + gap_m) + gap_m) / 2
     stripes = []
     for k in range(count):
-        at = (
-            np.array([first + k * (stripe_m + gap_m), first + k * (stripe_m + gap_m) + stripe_m])
-            / total
-        )
-        edge_a = _at(side_a, lengths[0], at)
-        edge_b = _at(side_b, lengths[1], at)
+        start = first + k * (stripe_m + gap_m)
+        shares = np.array([start, start + stripe_m]) / total
+        edge_a = _points_at_shares(side_a, lengths_a, shares)
+        edge_b = _points_at_shares(side_b, lengths_b, shares)
         stripes.append(np.concatenate([edge_a, edge_b[::-1]]))
     return stripes
 
 
-def _at(line: Array, lengths: Array, share: Array) -> Array:
-    return np.stack([np.interp(share * lengths[-1], lengths, column) for column in line.T], axis=1)
+def _points_at_shares(line: Array, lengths: Array, shares: Array) -> Array:
+    """Points of a polyline (n, 2) at shares (k,) of its length, in [0, 1]. (k, 2)"""
+    at = shares * lengths[-1]
+    x = np.interp(at, lengths, line[:, 0])
+    y = np.interp(at, lengths, line[:, 1])
+    return np.stack([x, y], axis=1)

@@ -1,9 +1,10 @@
-"""A whole town: roads, junctions, crossings, car parks, buildings and street furniture."""
+"""Town: roads, junctions, crossings, car parks, buildings and street furniture."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 from shapely.geometry import Polygon
 
 from minicity.config import make_rng
@@ -14,6 +15,10 @@ from minicity.roads import CROSSING_GAP_M, STOP_LINE_M, Lane, Road
 
 MAX_SIDE = 8
 LARGEST_HOUSE_M = 22.0
+END_STOP_M = 0.6  # between a stop line without a crossing and the end of its road
+BAY_WIDTH_M = 2.6
+BAY_LENGTH_M = 5.0
+CARPARK_DEPTH_M = 15.0
 WALLS = [
     (150, 165, 190),
     (120, 140, 175),
@@ -26,13 +31,13 @@ WALLS = [
 
 @dataclass(frozen=True)
 class Carpark:
-    """A car park beside a road.
+    """Car park beside a road. Coordinates are in metres.
 
     Attributes:
-        outline: Its surface. (n, 2)
-        driveway: The strip that joins it to the road, across the pavement. (4, 2)
+        outline: Outline of the surface. (n, 2)
+        driveway: Outline of the strip from the road across the pavement. (4, 2)
         bays: Lines between the bays. Each (2, 2)
-        slots: Centres and headings of the bays. (n, 3)
+        slots: Centre x, y and heading in radians of each bay. (n, 3)
     """
 
     outline: Array
@@ -43,7 +48,13 @@ class Carpark:
 
 @dataclass(frozen=True)
 class Building:
-    """A house: footprint and height in metres, wall colour in BGR."""
+    """House on a rectangular footprint.
+
+    Attributes:
+        footprint: Corners in metres, anticlockwise. (4, 2)
+        height_m: Height in metres.
+        color: Colour of the walls, BGR in [0, 255].
+    """
 
     footprint: Array
     height_m: float
@@ -52,19 +63,19 @@ class Building:
 
 @dataclass
 class Town:
-    """All that a map file and a renderer need to know of one town.
+    """Town, complete for a map file and for the renderer. Coordinates are in metres.
 
     Attributes:
-        name: Its location name.
-        size_m: Edge of the square canvas that holds it.
+        name: Location name.
+        size_m: Edge of the square canvas around the town, in metres.
         roads: Streets between junctions.
-        junctions: Meeting places of three or more streets.
+        junctions: Junctions of three or four roads.
         lanes: Every lane by its key.
-        connectors: Paths across junctions by the key of the lane they leave.
+        connectors: Paths across junctions, by the key of the lane that leads to them.
         carparks: Car parks.
         buildings: Houses.
-        trees: x, y, height of trees. (n, 3)
-        poles: x, y, height of lamp posts and signals. (n, 3)
+        trees: x, y and height of the trees. (n, 3)
+        poles: x, y and height of the lamp posts. (n, 3)
         walkways: Pavement polygons.
         drivable: Union of all surfaces for vehicles.
     """
@@ -84,7 +95,7 @@ class Town:
 
 
 def town_side(num_scenes: int) -> int:
-    """Grid nodes along a town's edge, so that its scenes rarely share a street."""
+    """Number of grid nodes along the edge of a town in which scenes rarely share a street."""
     return int(np.clip(np.ceil(np.sqrt(1.3 * num_scenes)), 3, MAX_SIDE))
 
 
@@ -92,184 +103,246 @@ def make_town(name: str, seed: int, num_scenes: int) -> Town:
     """Build a town. The result depends on the arguments alone.
 
     Args:
-        name: Location name; two names with one seed give unrelated towns.
+        name: Location name; towns of different names differ for each seed.
         seed: Seed of the data set.
-        num_scenes: Scenes that will be driven in it: decides its size; 0 gives an empty town.
+        num_scenes: Number of scenes in the town, which decides its size; 0 gives an empty town.
 
     Returns:
-        The town, its polygons valid.
+        The town, with valid polygons.
     """
     if num_scenes == 0:
-        return Town(name, 2 * MARGIN_M, [], [], {}, {})
+        return Town(name, 2 * MARGIN_M, roads=[], junctions=[], lanes={}, connectors={})
     side = town_side(num_scenes)
-    nodes = make_nodes(side, seed, name)
-    roads, meetings = make_roads(nodes, make_chains(nodes, seed, name), seed, name)
+    nodes = make_nodes(side, seed, name=name)
+    chains = make_chains(nodes, seed, name=name)
+    roads, meetings = make_roads(nodes, chains, seed=seed, name=name)
     for road in roads:
         _add_crossings(road, make_rng(seed, name, "crossings", road.index))
     lanes_by_road = {road.index: road.lanes() for road in roads}
-    junctions = [
-        make_junction(n, [(c, at_start) for c, at_start, _ in meeting], roads)
-        for n, meeting in enumerate(meetings)
-        if len(meeting) >= 3
-    ]
+    junctions = []
+    for node, meeting in enumerate(meetings):
+        if len(meeting) >= 3:
+            arms = [(road_index, at_start) for road_index, at_start, _ in meeting]
+            junctions.append(make_junction(node, arms, roads=roads))
     connectors: dict[tuple[int, bool, int], list[Connector]] = {}
     for junction in junctions:
         for connector in make_connectors(junction, lanes_by_road):
             connectors.setdefault(connector.source.key, []).append(connector)
-    lanes = {lane.key: lane for group in lanes_by_road.values() for lane in group}
-    size = 2 * MARGIN_M + (side - 1) * PITCH_M
-    town = Town(name, size, roads, junctions, lanes, connectors)
+    lanes = {}
+    for road_lanes in lanes_by_road.values():
+        for lane in road_lanes:
+            lanes[lane.key] = lane
+    town = Town(
+        name=name,
+        size_m=2 * MARGIN_M + (side - 1) * PITCH_M,
+        roads=roads,
+        junctions=junctions,
+        lanes=lanes,
+        connectors=connectors,
+    )
     _add_surroundings(town, make_rng(seed, name, "surroundings"))
     return town
 
 
 def _add_crossings(road: Road, rng: np.random.Generator) -> None:
+    """Add random crossings and stop lines to a road, in place."""
     length = road.length_m
     if length < MIN_ROAD_M:
         return
     for at_start in (True, False):
-        comes_in = road.section.backward if at_start else road.section.forward
+        lanes_in = road.section.backward if at_start else road.section.forward
         if rng.random() < 0.62:
-            gap = CROSSING_GAP_M + float(rng.choice([0.0, 2.0]))
-            road.add_crossing(
-                gap, float(rng.uniform(2.5, 4.5)), at_start, comes_in > 0 and rng.random() < 0.8
-            )
-        elif comes_in and rng.random() < 0.6:
+            gap_m = CROSSING_GAP_M + float(rng.choice([0.0, 2.0]))
+            depth_m = float(rng.uniform(low=2.5, high=4.5))
+            stop = lanes_in > 0 and rng.random() < 0.8
+            road.add_crossing(gap_m, depth_m, at_start=at_start, stop=stop)
+        elif lanes_in and rng.random() < 0.6:
             if at_start:
-                road.stop_backward, road.clear_start_m = (0.6, 0.6 + STOP_LINE_M), 0.6 + STOP_LINE_M
+                road.stop_backward = (END_STOP_M, END_STOP_M + STOP_LINE_M)
+                road.clear_start_m = END_STOP_M + STOP_LINE_M
             else:
-                road.stop_forward = (length - 0.6 - STOP_LINE_M, length - 0.6)
-                road.clear_end_m = length - 0.6 - STOP_LINE_M
+                road.stop_forward = (length - END_STOP_M - STOP_LINE_M, length - END_STOP_M)
+                road.clear_end_m = length - END_STOP_M - STOP_LINE_M
     if length > 70 and rng.random() < 0.25:
-        middle = float(rng.uniform(0.4, 0.6)) * length
+        middle = float(rng.uniform(low=0.4, high=0.6)) * length
         road.crossings.append((middle - 1.6, middle + 1.6))
 
 
 def road_surface(road: Road) -> list[Polygon]:
-    """Kerb-to-kerb polygons of a road."""
+    """Kerb-to-kerb polygons of a road, in metres."""
     return [Polygon(road.band_with_mouths(right, left)) for right, left in road.carriageways()]
 
 
 def _add_surroundings(town: Town, rng: np.random.Generator) -> None:
-    surfaces = [p for road in town.roads for p in road_surface(road)]
-    surfaces += [Polygon(j.outline) for j in town.junctions]
-    medians = [
-        Polygon(road.band(road.section.forward_edges[0], road.section.backward_edges[0]))
-        for road in town.roads
-        if road.section.median_m > 0
-    ]
-    streets = shapely.union_all(surfaces)
-    pavements = [
-        Polygon(
-            road.band(
-                road.section.right_m - road.style.walkway_m,
-                road.section.left_m + road.style.walkway_m,
-            )
+    """Add car parks, pavements, houses and furniture to the roads of a town, in place."""
+    surfaces = []
+    medians = []
+    pavements = []
+    for road in town.roads:
+        section = road.section
+        surfaces += road_surface(road)
+        if section.median_m > 0:
+            median = road.band(section.forward_edges[0], section.backward_edges[0])
+            medians.append(Polygon(median))
+        pavement = road.band(
+            right_m=section.right_m - road.style.walkway_m,
+            left_m=section.left_m + road.style.walkway_m,
         )
-        for road in town.roads
-    ]
-    pavements += [Polygon(j.outline).buffer(2.5) for j in town.junctions]
+        pavements.append(Polygon(pavement))
+    for junction in town.junctions:
+        outline = Polygon(junction.outline)
+        surfaces.append(outline)
+        pavements.append(outline.buffer(2.5))
+    streets = shapely.union_all(surfaces)
     blocked = shapely.union_all([p.buffer(0) for p in [*pavements, *medians, *surfaces]])
-    _add_carparks(town, blocked, rng)
+    _add_carparks(town, blocked, rng=rng)
     parks = [Polygon(p.outline).union(Polygon(p.driveway)) for p in town.carparks]
     town.drivable = shapely.union_all([streets, *parks])
     around = shapely.union_all([p.buffer(0) for p in pavements])
     raised = shapely.union_all(medians)
     pieces = shapely.get_parts(around.difference(town.drivable).difference(raised))
     town.walkways = [p for p in pieces if p.geom_type == "Polygon" and p.area > 0.5]
-    _add_buildings(
-        town, shapely.union_all([blocked.buffer(0.6), *[p.buffer(1.0) for p in parks]]), rng
-    )
+    park_margins = [p.buffer(1.0) for p in parks]
+    built_up = shapely.union_all([blocked.buffer(0.6), *park_margins])
+    _add_buildings(town, blocked=built_up, rng=rng)
     _add_furniture(town, rng)
 
 
 def _add_carparks(town: Town, blocked: Polygon, rng: np.random.Generator) -> None:
+    """Add car parks beside random roads, outside of ``blocked`` and of one another, in place."""
     for road in town.roads:
         if road.length_m < 60 or rng.random() > 0.45:
             continue
         sign = 1 if rng.random() < 0.5 else -1
-        kerb = road.section.left_m if sign > 0 else road.section.right_m
-        near = abs(kerb) + road.style.walkway_m + 0.5
-        middle = float(rng.uniform(0.35, 0.65)) * road.length_m
-        bays, depth, width = int(rng.integers(6, 11)), 15.0, 2.6
-        length = bays * width
-        yaw = road.direction(middle)
-        center = road.point(middle, sign * (near + depth / 2))
-        outline = rectangle(center, yaw, length, depth)
-        if Polygon(outline).buffer(0.3).intersects(blocked):
+        middle = float(rng.uniform(low=0.35, high=0.65)) * road.length_m
+        bays = int(rng.integers(6, 11))
+        park = _make_carpark(road, sign, middle_m=middle, bays=bays)
+        surface = Polygon(park.outline)
+        if surface.buffer(0.3).intersects(blocked):
             continue
-        inner = road.point(middle, sign * (abs(kerb) - 0.3))
-        mouth = road.point(middle, sign * (near + 0.5))
-        driveway = rectangle(0.5 * (inner + mouth), yaw, 5.0, float(np.linalg.norm(mouth - inner)))
-        along, across = outline[0] - outline[1], sign * (outline[0] - outline[3]) / depth
-        along = along / np.linalg.norm(along)
-        far = center + across * (depth / 2 - 0.3)
-        ends = [far + along * (k * width - length / 2) for k in range(bays + 1)]
-        lines = [np.stack([e, e - 5.0 * across]) for e in ends]
-        heading = float(np.arctan2(across[1], across[0]))
-        slots = [np.append(e + along * width / 2 - 2.6 * across, heading) for e in ends[:-1]]
-        town.carparks.append(Carpark(outline, driveway, lines, np.array(slots)))
-        blocked = blocked.union(Polygon(outline).buffer(0.5))
+        town.carparks.append(park)
+        blocked = blocked.union(surface.buffer(0.5))
+
+
+def _make_carpark(road: Road, sign: int, middle_m: float, bays: int) -> Carpark:
+    """Make a car park behind the pavement of a road.
+
+    Args:
+        road: The road.
+        sign: 1 for the left side of the road, -1 for the right side.
+        middle_m: Arc length of the middle of the car park, in metres.
+        bays: Number of bays.
+    """
+    kerb = road.section.left_m if sign > 0 else road.section.right_m
+    near = abs(kerb) + road.style.walkway_m + 0.5
+    length = bays * BAY_WIDTH_M
+    yaw = road.direction(middle_m)
+    center = road.point(middle_m, sign * (near + CARPARK_DEPTH_M / 2))
+    outline = rectangle(center, yaw, length_m=length, width_m=CARPARK_DEPTH_M)
+    inner = road.point(middle_m, sign * (abs(kerb) - 0.3))
+    mouth = road.point(middle_m, sign * (near + 0.5))
+    driveway = rectangle(
+        center=0.5 * (inner + mouth),
+        yaw_rad=yaw,
+        length_m=5.0,
+        width_m=float(np.linalg.norm(mouth - inner)),
+    )
+    along = outline[0] - outline[1]
+    along = along / np.linalg.norm(along)
+    across = sign * (outline[0] - outline[3]) / CARPARK_DEPTH_M
+    heading = float(np.arctan2(across[1], across[0]))
+    far = center + across * (CARPARK_DEPTH_M / 2 - 0.3)
+    lines = []
+    slots = []
+    for k in range(bays + 1):
+        end = far + along * (k * BAY_WIDTH_M - length / 2)
+        lines.append(np.stack([end, end - BAY_LENGTH_M * across]))
+        if k < bays:
+            slot = end + along * BAY_WIDTH_M / 2 - 2.6 * across
+            slots.append(np.append(slot, heading))
+    return Carpark(outline, driveway, bays=lines, slots=np.array(slots))
 
 
 def _add_buildings(town: Town, blocked: Polygon, rng: np.random.Generator) -> None:
-    """Line both sides of every road with houses that touch neither a surface nor one another."""
+    """Add houses along both sides of every road, clear of surfaces and of one another, in place."""
     shapely.prepare(blocked)
-    built = np.full((0, 2), np.inf)
+    centers = np.full((0, 2), np.inf)
     for road in town.roads:
         dense = rng.random() < 0.75
         for sign, kerb in ((1, road.section.left_m), (-1, -road.section.right_m)):
-            at = float(rng.uniform(0, 10))
+            at = float(rng.uniform(low=0, high=10))
             while at < road.length_m - 5:
-                front = float(rng.uniform(8, 16))
-                setback = road.style.walkway_m + float(rng.uniform(1.0, 3.0 if dense else 9.0))
-                middle = min(at + front / 2, road.length_m - 0.1)
-                house = _draw_building(road, middle, sign * (kerb + setback), front, rng)
-                at += front + float(rng.uniform(0.5, 3.0) if dense else rng.uniform(4, 25))
-                outline, center = Polygon(house.footprint), house.footprint.mean(0)
-                near = np.flatnonzero(np.abs(built - center).max(1, initial=0.0) < LARGEST_HOUSE_M)
-                if blocked.intersects(outline) or any(
-                    outline.intersects(Polygon(town.buildings[k].footprint)) for k in near
-                ):
+                front = float(rng.uniform(low=8, high=16))
+                depth = 3.0 if dense else 9.0
+                setback = road.style.walkway_m + float(rng.uniform(low=1.0, high=depth))
+                house = _draw_building(
+                    road=road,
+                    at_m=min(at + front / 2, road.length_m - 0.1),
+                    front_offset_m=sign * (kerb + setback),
+                    front_m=front,
+                    rng=rng,
+                )
+                gap = rng.uniform(low=0.5, high=3.0) if dense else rng.uniform(low=4, high=25)
+                at += front + float(gap)
+                outline = Polygon(house.footprint)
+                center = house.footprint.mean(axis=0)
+                distances = np.abs(centers - center).max(axis=1, initial=0.0)
+                neighbours = np.flatnonzero(distances < LARGEST_HOUSE_M)
+                if blocked.intersects(outline) or _touches_building(town, outline, neighbours):
                     continue
                 town.buildings.append(house)
-                built = np.concatenate([built, center[None]])
+                centers = np.concatenate([centers, center[None]])
+
+
+def _touches_building(town: Town, outline: Polygon, candidates: NDArray[np.int64]) -> bool:
+    """Whether an outline touches one of the buildings with the indices ``candidates``. (n,)"""
+    return any(outline.intersects(Polygon(town.buildings[k].footprint)) for k in candidates)
 
 
 def _draw_building(
     road: Road, at_m: float, front_offset_m: float, front_m: float, rng: np.random.Generator
 ) -> Building:
-    """A house whose front lies ``front_offset_m`` left of a road (right if negative)."""
-    depth = float(rng.uniform(8, 12))
+    """Draw a house beside a road.
+
+    Args:
+        road: The road.
+        at_m: Arc length of the middle of the front, in metres.
+        front_offset_m: Offset of the front in metres, positive to the left of the road.
+        front_m: Length of the front in metres.
+        rng: Source of depth, height and colour.
+    """
+    depth = float(rng.uniform(low=8, high=12))
     center = road.point(at_m, front_offset_m + np.sign(front_offset_m) * depth / 2)
-    footprint = rectangle(center, road.direction(at_m), front_m, depth)
-    height = float(rng.uniform(4, 9) if rng.random() < 0.6 else rng.uniform(9, 22))
-    shade = float(rng.uniform(0.75, 1.15))
+    footprint = rectangle(center, road.direction(at_m), length_m=front_m, width_m=depth)
+    low = rng.random() < 0.6
+    height = float(rng.uniform(low=4, high=9) if low else rng.uniform(low=9, high=22))
+    shade = float(rng.uniform(low=0.75, high=1.15))
     blue, green, red = WALLS[int(rng.integers(len(WALLS)))]
-    return Building(footprint, height, (blue * shade, green * shade, red * shade))
+    return Building(footprint, height, color=(blue * shade, green * shade, red * shade))
 
 
 def _add_furniture(town: Town, rng: np.random.Generator) -> None:
-    trees, poles = [], []
-    keep_clear = shapely.union_all(
-        [Polygon(b.footprint).buffer(1.2) for b in town.buildings] + [town.drivable.buffer(0.5)]
-    )
+    """Add trees and lamp posts along every road, clear of houses and vehicles, in place."""
+    trees = []
+    poles = []
+    houses = [Polygon(b.footprint).buffer(1.2) for b in town.buildings]
+    keep_clear = shapely.union_all([*houses, town.drivable.buffer(0.5)])
     shapely.prepare(keep_clear)
     for road in town.roads:
-        leafy = rng.random()
+        tree_share = rng.random()
         for sign, kerb in ((1, road.section.left_m), (-1, -road.section.right_m)):
-            for at in np.arange(rng.uniform(3, 12), road.length_m - 3, 11.0):
-                back = (
-                    float(rng.uniform(0.9, 1.5))
-                    if rng.random() < 0.6
-                    else road.style.walkway_m + 1.0
-                )
-                spot = road.point(float(at), sign * (kerb + back))
-                if rng.random() < leafy and not keep_clear.contains(shapely.Point(spot)):
-                    trees.append([*spot, rng.uniform(3.5, 7.5)])
-            for at in np.arange(rng.uniform(2, 20), road.length_m - 2, 27.0):
-                spot = road.point(float(at), sign * (kerb + 0.65))
-                if not keep_clear.contains(shapely.Point(spot)):
-                    poles.append([*spot, rng.uniform(5.0, 8.0)])
+            first_tree = rng.uniform(low=3, high=12)
+            for at in np.arange(first_tree, road.length_m - 3, 11.0):
+                back = road.style.walkway_m + 1.0
+                if rng.random() < 0.6:
+                    back = float(rng.uniform(low=0.9, high=1.5))
+                x, y = road.point(float(at), sign * (kerb + back))
+                if rng.random() < tree_share and not keep_clear.contains(shapely.Point(x, y)):
+                    trees.append([x, y, rng.uniform(low=3.5, high=7.5)])
+            first_pole = rng.uniform(low=2, high=20)
+            for at in np.arange(first_pole, road.length_m - 2, 27.0):
+                x, y = road.point(float(at), sign * (kerb + 0.65))
+                if not keep_clear.contains(shapely.Point(x, y)):
+                    poles.append([x, y, rng.uniform(low=5.0, high=8.0)])
     town.trees = np.array(trees).reshape(-1, 3)
     town.poles = np.array(poles).reshape(-1, 3)
