@@ -1,8 +1,8 @@
-"""The ground in a camera's image, filtered so that thin paint survives at a distance.
+"""Ground in a camera's image, filtered so that thin paint survives at a distance.
 
 Far away a pixel covers much more ground along the line of sight than across it. A plain mip-map
 would blur a lane line of 15 cm away, so image rows are grouped into bands, each sampled several
-times per row from the level that fits its width.
+times per row from the texture level that fits its width.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ import numpy as np
 from minicity.camera import Camera
 from minicity.curves import Array
 from minicity.scene_map import HeightGrid
-from minicity.terrain import Footprints, see_terrain, terrain_footprints
+from minicity.terrain import Footprints, make_terrain, terrain_footprints
 from minicity.texture import GroundTexture, Image
 
 MAX_SAMPLES = 8
@@ -28,7 +28,7 @@ class Band:
     Attributes:
         start: First row.
         stop: Row after the last.
-        level: Texture level to read.
+        level: Texture level of the samples.
         samples: Samples per row.
     """
 
@@ -38,67 +38,80 @@ class Band:
     samples: int
 
     def sample_rows(self) -> Array:
-        """Image rows at which the band is sampled. ((stop - start) * samples,)"""
+        """Image rows of the samples, in pixels. ((stop - start) * samples,)"""
         count = (self.stop - self.start) * self.samples
         return self.start - 0.5 + (np.arange(count) + 0.5) / self.samples
 
 
 def ground_from_pixel(camera: Camera, ground_z_m: float) -> Array:
-    """Homography from pixels to world x, y on the plane z = ``ground_z_m``. (3, 3)
+    """Homography from pixels to world x, y on the plane z = ``ground_z_m``, in metres. (3, 3)
 
     Its third row gives the vertical part of the viewing direction: negative below the horizon.
     """
-    ray, center = camera.world_from_pixel, camera.center
-    height = center[2] - ground_z_m
-    return np.stack(
-        [center[0] * ray[2] - height * ray[0], center[1] * ray[2] - height * ray[1], ray[2]]
-    )
+    ray = camera.world_from_pixel
+    x, y, z = camera.center
+    height = z - ground_z_m
+    return np.stack([x * ray[2] - height * ray[0], y * ray[2] - height * ray[1], ray[2]])
 
 
 def plane_footprints(camera: Camera, homography: Array) -> Footprints:
-    """Footprints on flat ground, at the picture's middle column."""
+    """Footprints of the image rows on flat ground, at the middle column of the image.
+
+    Args:
+        camera: The camera, above the ground.
+        homography: Transform from pixels to the ground (``ground_from_pixel``). (3, 3)
+
+    Returns:
+        Footprints of all rows.
+    """
     rows = np.arange(camera.height + 1)
     column = np.full(rows.shape, (camera.width - 1) / 2)
     center = homography @ np.stack([column, rows - 0.5, np.ones(rows.shape)])
     beside = homography @ np.stack([column + 1, rows - 0.5, np.ones(rows.shape)])
     hit = center[:2] / np.minimum(center[2], -4 * HORIZON_EPS)
-    along = np.linalg.norm(np.diff(hit, axis=1), axis=0)
-    across = np.linalg.norm(hit - beside[:2] / np.minimum(beside[2], -4 * HORIZON_EPS), axis=0)
+    hit_beside = beside[:2] / np.minimum(beside[2], -4 * HORIZON_EPS)
     distance = np.linalg.norm(hit - camera.center[:2, None], axis=0)
-    # A tilted camera sees the horizon at another row on each side: one end below it is enough.
+    # The horizon of a tilted camera lies at another row on each side: one end below it is enough.
     ends = homography[2, 0] * np.array([0, camera.width - 1]) + homography[2, 2]
-    visible = (ends + homography[2, 1] * rows[:-1, None]).min(1) < -HORIZON_EPS
-    return Footprints(along, across[:-1], distance[:-1], visible)
+    vertical = (ends + homography[2, 1] * rows[:-1, None]).min(axis=1)
+    return Footprints(
+        along=np.linalg.norm(np.diff(hit, axis=1), axis=0),
+        across=np.linalg.norm(hit - hit_beside, axis=0)[:-1],
+        distance=distance[:-1],
+        visible=vertical < -HORIZON_EPS,
+    )
 
 
 def make_bands(footprints: Footprints, resolution_m: float, num_levels: int) -> list[Band]:
-    """Group rows that need the same texture level and the same number of samples.
+    """Group adjacent rows with equal texture levels and numbers of samples.
 
     Args:
-        footprints: What the picture's rows see.
-        resolution_m: Pixel edge of texture level 0.
+        footprints: Footprints of the image rows.
+        resolution_m: Pixel edge of texture level 0, in metres.
         num_levels: Number of texture levels.
 
     Returns:
-        Bands from the top of the picture to its bottom.
+        Bands from the top of the image to its bottom.
     """
-    wanted = np.maximum(footprints.across, footprints.along / MAX_SAMPLES)
-    fit = np.floor(np.log2(np.maximum(wanted / resolution_m, 1.0) * 1.2))
+    target = np.maximum(footprints.across, footprints.along / MAX_SAMPLES)
+    fit = np.floor(np.log2(np.maximum(target / resolution_m, 1.0) * 1.2))
     levels = np.clip(fit, 0, num_levels - 1).astype(int)
-    needed = np.clip(np.ceil(footprints.along / (resolution_m * 2.0**levels)), 1, MAX_SAMPLES)
-    samples = (2 ** np.ceil(np.log2(needed))).astype(int)
+    counts = np.clip(np.ceil(footprints.along / (resolution_m * 2.0**levels)), 1, MAX_SAMPLES)
+    samples = (2 ** np.ceil(np.log2(counts))).astype(int)
     bands: list[Band] = []
     for row in np.flatnonzero(footprints.visible).tolist():
-        level, count = int(levels[row]), int(samples[row])
+        level = int(levels[row])
+        count = int(samples[row])
         last = bands[-1] if bands else None
         if last and last.stop == row and (last.level, last.samples) == (level, count):
-            bands[-1] = Band(last.start, row + 1, level, count)
+            bands[-1] = Band(last.start, row + 1, level=level, samples=count)
         else:
-            bands.append(Band(row, row + 1, level, count))
+            bands.append(Band(row, row + 1, level=level, samples=count))
     return bands
 
 
 def _texture_from_world(texture: GroundTexture, level: int) -> Array:
+    """Transform from world x, y in metres to pixels of a texture level. (3, 3)"""
     scale = 1.0 / (texture.resolution_m * 2**level)
     x, y = -texture.origin * scale - 0.5
     return np.array([[scale, 0, x], [0, scale, y], [0, 0, 1.0]])
@@ -107,88 +120,90 @@ def _texture_from_world(texture: GroundTexture, level: int) -> Array:
 def render_flat_ground(
     camera: Camera, texture: GroundTexture, background: Image, border: Color, ground_z_m: float
 ) -> tuple[Image, Array]:
-    """Draw flat ground into a picture of the sky.
+    """Render flat ground into a picture of the sky.
 
     Args:
-        camera: Viewing camera, above the ground.
-        texture: The ground from above.
-        background: What is seen where no ground is. (H, W, 3)
+        camera: The camera, above the ground.
+        texture: Texture of the ground.
+        background: Picture of the sky, BGR. (H, W, 3)
         border: Colour of ground outside the texture, BGR.
-        ground_z_m: Height of the ground.
+        ground_z_m: Height of the ground in metres.
 
     Returns:
-        The picture (H, W, 3) and the distance of the ground in each row, metres, inf where none is
-        seen (H,).
+        The picture (H, W, 3), and the distance of the ground in each row in metres, inf for rows
+        without ground (H,).
     """
     image = background.copy()
     homography = ground_from_pixel(camera, ground_z_m)
     skyline = _plane_skyline(camera, homography[2])
     footprints = plane_footprints(camera, homography)
-    for band in make_bands(footprints, texture.resolution_m, len(texture.levels)):
+    for band in make_bands(footprints, texture.resolution_m, num_levels=len(texture.levels)):
         first_row = band.start - 0.5 + 0.5 / band.samples
         pixel_from_sample = np.array([[1.0, 0, 0], [0, 1.0 / band.samples, first_row], [0, 0, 1.0]])
-        warp = _texture_from_world(texture, band.level) @ homography @ pixel_from_sample
-        drawn = cv2.warpPerspective(
+        samples = cv2.warpPerspective(
             texture.levels[band.level],
-            warp,
-            (camera.width, (band.stop - band.start) * band.samples),
+            M=_texture_from_world(texture, band.level) @ homography @ pixel_from_sample,
+            dsize=(camera.width, (band.stop - band.start) * band.samples),
             flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
             borderMode=cv2.BORDER_CONSTANT,
             borderValue=border,
         )
-        _put(image, drawn, band, skyline)
+        _paste_band(image, samples, band=band, skyline=skyline)
     return image, np.where(footprints.visible, footprints.distance, np.inf)
 
 
 def render_uneven_ground(
     camera: Camera, texture: GroundTexture, background: Image, border: Color, height: HeightGrid
 ) -> tuple[Image, Array]:
-    """Draw uneven ground into a picture of the sky, as ``render_flat_ground`` does flat ground.
+    """Render uneven ground into a picture of the sky.
 
     Args:
-        camera: The camera in the world.
-        texture: The ground from above.
-        background: Picture of the sky. (H, W, 3)
-        border: Colour beyond the texture, BGR.
-        height: Height of the ground in metres.
+        camera: The camera, above the ground.
+        texture: Texture of the ground.
+        background: Picture of the sky, BGR. (H, W, 3)
+        border: Colour of ground outside the texture, BGR.
+        height: Height of the ground.
 
     Returns:
-        The picture (H, W, 3), and the distance to the ground in metres, inf in the sky. (H, W)
+        The picture (H, W, 3), and the distance of the ground in each row in metres, inf for rows
+        without ground (H,).
     """
     image = background.copy()
-    terrain = see_terrain(camera, height)
+    terrain = make_terrain(camera, height)
     skyline = terrain.horizon()
     footprints = terrain_footprints(terrain)
-    for band in make_bands(footprints, texture.resolution_m, len(texture.levels)):
-        to_texture = _texture_from_world(texture, band.level)
+    for band in make_bands(footprints, texture.resolution_m, num_levels=len(texture.levels)):
+        texture_from_world = _texture_from_world(texture, band.level)
         world = terrain.points(band.sample_rows())
-        at = [(world[..., i] * to_texture[i, i] + to_texture[i, 2]) for i in (0, 1)]
-        drawn = cv2.remap(
+        texture_x = world[..., 0] * texture_from_world[0, 0] + texture_from_world[0, 2]
+        texture_y = world[..., 1] * texture_from_world[1, 1] + texture_from_world[1, 2]
+        samples = cv2.remap(
             texture.levels[band.level],
-            at[0].astype(np.float32),
-            at[1].astype(np.float32),
-            cv2.INTER_LINEAR,
+            map1=texture_x.astype(np.float32),
+            map2=texture_y.astype(np.float32),
+            interpolation=cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_CONSTANT,
             borderValue=border,
         )
-        _put(image, drawn, band, skyline)
+        _paste_band(image, samples, band=band, skyline=skyline)
     return image, np.where(footprints.visible, footprints.distance, np.inf)
 
 
 def _plane_skyline(camera: Camera, horizon: Array) -> Array:
-    """Image row of a plane's horizon in every column; ``horizon`` is the third row. (W,)"""
+    """Image row of a plane's horizon in every column, from the homography's third row (3,). (W,)"""
     slope = min(horizon[1], -1e-9)
     return -(horizon[0] * np.arange(camera.width) + horizon[2] + HORIZON_EPS) / slope
 
 
-def _put(image: Image, drawn: Image, band: Band, skyline: Array) -> None:
-    """Average a band's samples and copy it into place, leaving out pixels above the skyline."""
+def _paste_band(image: Image, samples: Image, band: Band, skyline: Array) -> None:
+    """Average the samples of a band and paste the pixels below the skyline, in place."""
+    rows = samples
     if band.samples > 1:
         size = (image.shape[1], band.stop - band.start)
-        drawn = cv2.resize(drawn, size, interpolation=cv2.INTER_AREA)
+        rows = cv2.resize(samples, size, interpolation=cv2.INTER_AREA)
     target = image[band.start : band.stop]
     if skyline.max() < band.start:
-        target[:] = drawn
+        target[:] = rows
         return
     below = np.arange(band.start, band.stop)[:, None] > skyline
-    np.copyto(target, drawn, where=below[..., None])
+    np.copyto(target, rows, where=below[..., None])

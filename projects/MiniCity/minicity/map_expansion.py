@@ -1,4 +1,4 @@
-"""A town in the format of the nuScenes map expansion."""
+"""Map of a town in the format of the nuScenes map expansion."""
 
 import json
 from itertools import pairwise
@@ -12,7 +12,7 @@ from shapely.geometry import MultiPolygon, Polygon
 
 from minicity.config import make_token
 from minicity.curves import Array, arc_lengths, strip
-from minicity.junctions import CONNECTOR_M
+from minicity.junctions import CONNECTOR_M, Connector
 from minicity.paint import divider_pieces, has_center_line, lane_divider_offsets
 from minicity.roads import Lane, Road
 from minicity.town import Town, road_surface
@@ -38,11 +38,16 @@ MASK_RESOLUTION_M = 0.1
 PIECE_M = 4.0
 
 
+def _rings(polygon: Polygon) -> list[Array]:
+    """Rings of a polygon in metres, the exterior first, each closed. Each (n, 2)"""
+    return [np.array(ring.coords) for ring in (polygon.exterior, *polygon.interiors)]
+
+
 class MapWriter:
-    """Collects the records of one map.
+    """Writer that collects the records of one map.
 
     Args:
-        town: The town to write.
+        town: The town.
         seed: Seed of the data set, part of every token.
     """
 
@@ -54,21 +59,22 @@ class MapWriter:
         self.connectivity: dict[str, dict[str, list[str]]] = {}
 
     def _token(self, layer: str) -> str:
-        """The next token of a layer: a prefix of its own, then a running number."""
+        """Next token of a layer: the layer's prefix, then a running number."""
         return f"{self._prefixes[layer]}{len(self.tables[layer]):08x}"
 
     def _nodes(self, points: Array) -> list[str]:
+        """Add a node per point (n, 2) in metres and return the n tokens."""
         tokens = []
         for x, y in np.round(points, 4).tolist():
-            tokens.append(self._token("node"))
-            self.tables["node"].append({"token": tokens[-1], "x": x, "y": y})
+            token = self._token("node")
+            self.tables["node"].append({"token": token, "x": x, "y": y})
+            tokens.append(token)
         return tokens
 
     def polygon(self, polygon: Polygon) -> str:
-        """Add a polygon and return its token."""
+        """Add a polygon in metres and return its token."""
         token = self._token("polygon")
-        rings = [np.array(r.coords)[:-1] for r in (polygon.exterior, *polygon.interiors)]
-        exterior, *holes = (self._nodes(ring) for ring in rings)
+        exterior, *holes = [self._nodes(ring[:-1]) for ring in _rings(polygon)]
         self.tables["polygon"].append(
             {
                 "token": token,
@@ -79,7 +85,7 @@ class MapWriter:
         return token
 
     def line(self, points: Array) -> str:
-        """Add a line and return its token."""
+        """Add a line (n, 2) in metres and return its token."""
         token = self._token("line")
         self.tables["line"].append({"token": token, "node_tokens": self._nodes(points)})
         return token
@@ -91,7 +97,7 @@ class MapWriter:
         return token
 
     def as_dict(self) -> dict[str, Any]:
-        """The whole map, ready for JSON."""
+        """Whole map as a JSON-ready dictionary."""
         return {
             "version": "1.3",
             "canvas_edge": [self.town.size_m, self.town.size_m],
@@ -101,7 +107,7 @@ class MapWriter:
         }
 
     def add_road(self, road: Road) -> None:
-        """Add a road's surface, blocks, dividers, crossings and stop lines."""
+        """Add the surface, blocks, dividers, crossings and stop lines of a road."""
         for surface in road_surface(road):
             segment = self.add(
                 "road_segment",
@@ -109,84 +115,102 @@ class MapWriter:
                 is_intersection=False,
                 drivable_area_token="",
             )
-        section = road.section
-        for edges, name in (
-            (section.forward_edges, "forward"),
-            (section.backward_edges, "backward"),
-        ):
-            if len(edges) > 1:
-                band = Polygon(road.band(min(edges), max(edges)))
-                self.add(
-                    "road_block",
-                    polygon_token=self.polygon(band),
-                    road_segment_token=segment,
-                    from_edge_line_token="",
-                    to_edge_line_token="",
-                    direction=name,
-                )
+        self._add_block(road, road.section.forward_edges, segment=segment, direction="forward")
+        self._add_block(road, road.section.backward_edges, segment=segment, direction="backward")
         for start, end in divider_pieces(road):
             if has_center_line(road):
-                self._divider("road_divider", road.line(0.0, start, end), segment)
+                center = self.line(road.line(0.0, start, end_m=end))
+                self.add("road_divider", line_token=center, road_segment_token=segment)
             for offset in lane_divider_offsets(road):
-                self._divider("lane_divider", road.line(offset, start, end), segment)
+                divider = self.line(road.line(offset, start, end_m=end))
+                self.add("lane_divider", line_token=divider, lane_divider_segments=[])
         for start, end in road.crossings:
             for right, left in road.carriageways():
-                crossing = Polygon(road.band(right, left, start, end))
+                crossing = Polygon(road.band(right, left, start_m=start, end_m=end))
                 self.add(
                     "ped_crossing",
                     polygon_token=self.polygon(crossing),
                     road_segment_token=segment,
                 )
-        self._stop_lines(road, segment)
+        self._add_stop_line(road, road.stop_forward, road.section.forward_edges)
+        self._add_stop_line(road, road.stop_backward, road.section.backward_edges)
 
-    def _divider(self, layer: str, points: Array, segment: str) -> None:
-        line = self.line(points)
-        extra: dict[str, Any] = (
-            {"road_segment_token": segment}
-            if layer == "road_divider"
-            else {"lane_divider_segments": []}
+    def _add_block(self, road: Road, edges: list[float], segment: str, direction: str) -> None:
+        """Add the block of the lanes of one direction, given their edges in metres."""
+        if len(edges) < 2:
+            return
+        band = Polygon(road.band(min(edges), max(edges)))
+        self.add(
+            "road_block",
+            polygon_token=self.polygon(band),
+            road_segment_token=segment,
+            from_edge_line_token="",
+            to_edge_line_token="",
+            direction=direction,
         )
-        self.add(layer, line_token=line, **extra)
 
-    def _stop_lines(self, road: Road, segment: str) -> None:
-        for stop, edges in (
-            (road.stop_forward, road.section.forward_edges),
-            (road.stop_backward, road.section.backward_edges),
-        ):
-            if stop is not None:
-                area = Polygon(road.band(min(edges), max(edges), *stop))
-                self.add(
-                    "stop_line",
-                    polygon_token=self.polygon(area),
-                    stop_line_type="TURN_STOP",
-                    ped_crossing_tokens=[],
-                    traffic_light_tokens=[],
-                    road_block_token="",
-                )
+    def _add_stop_line(
+        self, road: Road, stop: tuple[float, float] | None, edges: list[float]
+    ) -> None:
+        """Add the stop line between two arc lengths, if any, across lanes with edges in metres."""
+        if stop is None:
+            return
+        start, end = stop
+        area = Polygon(road.band(min(edges), max(edges), start_m=start, end_m=end))
+        self.add(
+            "stop_line",
+            polygon_token=self.polygon(area),
+            stop_line_type="TURN_STOP",
+            ped_crossing_tokens=[],
+            traffic_light_tokens=[],
+            road_block_token="",
+        )
 
     def add_lane(self, lane: Lane) -> str:
-        """Add a lane, its neighbours' lines and its centre."""
+        """Add a lane with its outline and centre line, and return its token."""
         road = self.town.roads[lane.road]
         edges = road.section.forward_edges if lane.forward else road.section.backward_edges
-        inner, outer = edges[lane.index], edges[lane.index + 1]
+        inner = edges[lane.index]
+        outer = edges[lane.index + 1]
+        outline = road.band(min(inner, outer), max(inner, outer))
         token = self.add(
             "lane",
-            polygon_token=self.polygon(Polygon(road.band(min(inner, outer), max(inner, outer)))),
+            polygon_token=self.polygon(Polygon(outline)),
             lane_type="CAR",
             from_edge_line_token="",
             to_edge_line_token="",
             left_lane_divider_segments=[],
             right_lane_divider_segments=[],
         )
-        self._center(token, lane.center)
+        self._add_center(token, lane.center)
         return token
 
-    def _center(self, token: str, center: Array) -> None:
-        """A centre line as an arc-line path of straight pieces."""
+    def add_connector(self, connector: Connector, source: str, target: str) -> None:
+        """Add the path across a junction and connect it to its lanes.
+
+        Args:
+            connector: The path.
+            source: Token of the lane that leads to the junction.
+            target: Token of the lane that leaves the junction.
+        """
+        area = self.polygon(Polygon(strip(connector.center, CONNECTOR_M / 2)))
+        token = self.add("lane_connector", polygon_token=area, lane_type="CAR")
+        self._add_center(token, connector.center)
+        self.connectivity[token] = {"incoming": [source], "outgoing": [target]}
+        self.connectivity[source]["outgoing"].append(token)
+        self.connectivity[target]["incoming"].append(token)
+
+    def _add_center(self, token: str, center: Array) -> None:
+        """Add the centre line (n, 2) of a lane or connector as an arc-line path of straight pieces.
+
+        The path starts without neighbours in the connectivity.
+        """
         lengths = arc_lengths(center)
         count = max(1, round(lengths[-1] / PIECE_M))
-        at = np.linspace(0.0, lengths[-1], count + 1)
-        points = np.stack([np.interp(at, lengths, column) for column in center.T], axis=1)
+        at = np.linspace(0.0, lengths[-1], num=count + 1)
+        x = np.interp(at, lengths, center[:, 0])
+        y = np.interp(at, lengths, center[:, 1])
+        points = np.stack([x, y], axis=1)
         pieces = []
         for a, b in pairwise(points):
             yaw = float(np.arctan2(b[1] - a[1], b[0] - a[0]))
@@ -205,12 +229,20 @@ class MapWriter:
 
 
 def polygon_parts(area: Polygon | MultiPolygon) -> list[Polygon]:
-    """The polygons that an area consists of."""
+    """Polygons of an area, without empty ones."""
     return [part for part in shapely.get_parts(area) if not part.is_empty]
 
 
 def town_to_map(town: Town, seed: int) -> dict[str, Any]:
-    """A town as the content of a map expansion file."""
+    """Convert a town to the content of a map expansion file.
+
+    Args:
+        town: The town.
+        seed: Seed of the data set, part of every token.
+
+    Returns:
+        JSON-ready dictionary.
+    """
     writer = MapWriter(town, seed)
     for road in town.roads:
         writer.add_road(road)
@@ -220,49 +252,46 @@ def town_to_map(town: Town, seed: int) -> dict[str, Any]:
         writer.add(
             "road_segment", polygon_token=outline, is_intersection=True, drivable_area_token=""
         )
-    for connector in (c for group in town.connectors.values() for c in group):
-        area = writer.polygon(Polygon(strip(connector.center, CONNECTOR_M / 2)))
-        token = writer.add("lane_connector", polygon_token=area, lane_type="CAR")
-        writer._center(token, connector.center)
-        source, target = lanes[connector.source.key], lanes[connector.target.key]
-        writer.connectivity[token] = {"incoming": [source], "outgoing": [target]}
-        writer.connectivity[source]["outgoing"].append(token)
-        writer.connectivity[target]["incoming"].append(token)
-    parts = polygon_parts(town.drivable)
-    writer.add("drivable_area", polygon_tokens=[writer.polygon(p) for p in parts])
+    for connectors in town.connectors.values():
+        for connector in connectors:
+            source = lanes[connector.source.key]
+            target = lanes[connector.target.key]
+            writer.add_connector(connector, source, target=target)
+    drivable = [writer.polygon(part) for part in polygon_parts(town.drivable)]
+    writer.add("drivable_area", polygon_tokens=drivable)
     for walkway in town.walkways:
         writer.add("walkway", polygon_token=writer.polygon(walkway))
     for park in town.carparks:
-        writer.add(
-            "carpark_area", polygon_token=writer.polygon(Polygon(park.outline)), orientation=0.0
-        )
+        outline = writer.polygon(Polygon(park.outline))
+        writer.add("carpark_area", polygon_token=outline, orientation=0.0)
     return writer.as_dict()
 
 
 def write_map(root: Path, town: Town, seed: int) -> str:
-    """Write a town's expansion file and its drivable-area picture.
+    """Write the expansion file and the drivable-area picture of a town.
 
     Args:
-        root: Data root.
+        root: Root folder of the data set.
         town: The town.
-        seed: Number that tokens are made of.
+        seed: Seed of the data set, part of every token.
 
     Returns:
-        The picture's path relative to ``root``.
+        Path of the picture relative to ``root``.
+
+    Raises:
+        OSError: If a file cannot be written.
     """
     expansion = root / "maps" / "expansion"
     expansion.mkdir(parents=True, exist_ok=True)
     (expansion / f"{town.name}.json").write_text(json.dumps(town_to_map(town, seed)))
     size = round(town.size_m / MASK_RESOLUTION_M)
-    mask = np.zeros((size, size), np.uint8)
+    mask = np.zeros((size, size), dtype=np.uint8)
     for polygon in polygon_parts(town.drivable):
-        rings = [
-            np.array(r.coords) / MASK_RESOLUTION_M for r in (polygon.exterior, *polygon.interiors)
-        ]
-        flipped = [
-            np.round(np.column_stack([r[:, 0], size - r[:, 1]])).astype(np.int32) for r in rings
-        ]
-        cv2.fillPoly(mask, flipped, (255.0,))
+        rings_px = []
+        for ring in _rings(polygon):
+            x, y = (ring / MASK_RESOLUTION_M).T
+            rings_px.append(np.round(np.column_stack([x, size - y])).astype(np.int32))
+        cv2.fillPoly(mask, rings_px, color=(255.0,))
     name = f"maps/{make_token(seed, town.name, 'mask')}.png"
     if not cv2.imwrite(str(root / name), mask):
         raise OSError(f"could not write {root / name}.")

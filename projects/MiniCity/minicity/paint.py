@@ -1,4 +1,4 @@
-"""A town as the renderer sees it: what its map says, laid out as surfaces, kerbs and paint."""
+"""Surfaces, kerbs and paint of a town, laid out for the renderer."""
 
 from itertools import pairwise
 
@@ -16,146 +16,187 @@ from minicity.scene_map import (
     solid_line,
     zebra,
 )
-from minicity.town import Town, road_surface
+from minicity.town import Carpark, Town, road_surface
+
+ASPHALT_GREY = 82  # grey level of asphalt of tone 1
+EDGE_LINE_M = 0.12  # width of edge lines and of the lines between parking bays
 
 
 def make_scene_map(town: Town, bounds: tuple[float, float, float, float]) -> SceneMap:
-    """The surfaces, kerbs and paint of a town inside ``bounds`` (xmin, ymin, xmax, ymax)."""
+    """Lay out the ground of a part of a town.
+
+    Args:
+        town: The town.
+        bounds: xmin, ymin, xmax, ymax of the part in metres; objects that touch it are included.
+
+    Returns:
+        Flat ground with surfaces, kerbs and paint.
+    """
     window = box(*bounds)
     scene = SceneMap()
-    scene.surfaces += [Surface(p, "walkway") for p in town.walkways if p.intersects(window)]
+    for walkway in town.walkways:
+        if walkway.intersects(window):
+            scene.surfaces.append(Surface(walkway, "walkway"))
     for road in town.roads:
-        if (
-            Polygon(road.band(road.section.right_m, road.section.left_m))
-            .buffer(0)
-            .intersects(window)
-        ):
+        outline = Polygon(road.band(road.section.right_m, road.section.left_m))
+        if outline.buffer(0).intersects(window):
             _add_road(scene, road)
     for junction in town.junctions:
         outline = Polygon(junction.outline)
         if outline.intersects(window):
-            tone = np.mean([town.roads[r].style.asphalt for r, _ in junction.arms]) / 82
-            scene.surfaces.append(Surface(outline, "asphalt", float(tone)))
+            grey = np.mean([town.roads[r].style.asphalt for r, _ in junction.arms])
+            tone = float(grey / ASPHALT_GREY)
+            scene.surfaces.append(Surface(outline, "asphalt", tone=tone))
             scene.kerbs += junction.corners
     for park in town.carparks:
         if Polygon(park.outline).intersects(window):
-            scene.surfaces += [
-                Surface(Polygon(p), "carpark") for p in (park.outline, park.driveway)
-            ]
-            scene.markings.append(
-                Marking([s for bay in park.bays for s in solid_line(bay, 0.12)], "white", 0.25)
-            )
+            _add_carpark(scene, park)
     return scene
 
 
+def _add_carpark(scene: SceneMap, park: Carpark) -> None:
+    """Add the surfaces and bay lines of a car park, in place."""
+    scene.surfaces.append(Surface(Polygon(park.outline), "carpark"))
+    scene.surfaces.append(Surface(Polygon(park.driveway), "carpark"))
+    lines = []
+    for bay in park.bays:
+        lines += solid_line(bay, EDGE_LINE_M)
+    scene.markings.append(Marking(lines, paint="white", wear=0.25))
+
+
 def _add_road(scene: SceneMap, road: Road) -> None:
+    """Add the surfaces, kerbs and paint of a road, in place."""
     section = road.section
-    scene.surfaces += [Surface(p, "asphalt", road.style.asphalt / 82) for p in road_surface(road)]
-    scene.kerbs += [road.line(section.right_m), road.line(section.left_m)]
+    tone = road.style.asphalt / ASPHALT_GREY
+    for polygon in road_surface(road):
+        scene.surfaces.append(Surface(polygon, "asphalt", tone=tone))
+    scene.kerbs.append(road.line(section.right_m))
+    scene.kerbs.append(road.line(section.left_m))
     if section.median_m > 0:
-        inner, outer = section.forward_edges[0], section.backward_edges[0]
-        scene.surfaces.append(Surface(Polygon(road.band(inner, outer)), "median"))
-        ring = road.band(inner, outer)
+        ring = road.band(section.forward_edges[0], section.backward_edges[0])
+        scene.surfaces.append(Surface(Polygon(ring), "median"))
         scene.kerbs.append(np.concatenate([ring, ring[:1]]))
     scene.markings += road_markings(road)
 
 
 def divider_pieces(road: Road) -> list[tuple[float, float]]:
-    """Arc lengths between which divider paint runs: it breaks at crossings in mid-block."""
-    pieces, start = [], road.clear_start_m
-    for a, b in sorted(road.crossings):
-        if a > road.clear_start_m and b < road.clear_end_m:
-            pieces.append((start, a - 0.4))
-            start = b + 0.4
-    return [*pieces, (start, road.clear_end_m)]
+    """Arc lengths (start, end) of the pieces of divider paint, in metres.
+
+    Paint is interrupted at crossings between the ends of the road.
+    """
+    pieces = []
+    start = road.clear_start_m
+    for crossing_start, crossing_end in sorted(road.crossings):
+        if crossing_start > road.clear_start_m and crossing_end < road.clear_end_m:
+            pieces.append((start, crossing_start - 0.4))
+            start = crossing_end + 0.4
+    pieces.append((start, road.clear_end_m))
+    return pieces
 
 
 def lane_divider_offsets(road: Road) -> list[float]:
-    """Offsets of the lines between lanes of one direction."""
+    """Offsets in metres of the lines between lanes of one direction."""
     return [*road.section.forward_edges[1:-1], *road.section.backward_edges[1:-1]]
 
 
 def has_center_line(road: Road) -> bool:
-    """Whether paint, not a median, parts the two directions."""
+    """Whether paint instead of a median separates the two directions."""
     return road.section.median_m == 0 and road.section.backward > 0
 
 
 def road_markings(road: Road) -> list[Marking]:
-    """All paint on a road."""
+    """Paint of a road: the white markings, then the yellow ones if there are any."""
     style = road.style
+    dash_m, gap_m = style.dash_m
     white: list[Array] = []
     yellow: list[Array] = []
     for start, end in divider_pieces(road):
-        for at in lane_divider_offsets(road):
-            white += dashed_line(road.line(at, start, end), style.line_m, *style.dash_m)
+        for offset in lane_divider_offsets(road):
+            line = road.line(offset, start, end_m=end)
+            white += dashed_line(line, style.line_m, dash_m=dash_m, gap_m=gap_m)
         if has_center_line(road):
-            center = road.line(0.0, start, end)
-            (white if style.divider.endswith("white") else yellow).extend(
-                _center_paint(center, road)
-            )
+            paint = _center_paint(road.line(0.0, start, end_m=end), road)
+            if style.divider.endswith("white"):
+                white += paint
+            else:
+                yellow += paint
         if style.edge_line:
             white += _edge_lines(road, start, end)
-    for a, b in road.crossings:
-        white += _crossing_paint(road, a, b)
+    for start, end in road.crossings:
+        white += _crossing_paint(road, start, end)
     white += _stop_paint(road)
     white += _arrows(road)
-    found = [Marking(white, "white", style.wear)]
-    return [*found, Marking(yellow, "yellow", style.wear)] if yellow else found
+    markings = [Marking(white, paint="white", wear=style.wear)]
+    if yellow:
+        markings.append(Marking(yellow, paint="yellow", wear=style.wear))
+    return markings
 
 
 def _center_paint(center: Array, road: Road) -> list[Array]:
+    """Painted areas of a centre line (n, 2) in the style of a road. Each (m, 2)"""
     style = road.style
     if style.divider == "double_yellow":
-        return double_line(center, style.line_m * 0.8, 0.12)
+        return double_line(center, style.line_m * 0.8, gap_m=0.12)
     if style.divider == "dashed_white":
-        return dashed_line(center, style.line_m, *style.dash_m)
+        dash_m, gap_m = style.dash_m
+        return dashed_line(center, style.line_m, dash_m=dash_m, gap_m=gap_m)
     return solid_line(center, style.line_m)
 
 
 def _edge_lines(road: Road, start: float, end: float) -> list[Array]:
-    section, painted = road.section, []
+    """Painted areas of the lines beside wide shoulders, between two arc lengths. Each (n, 2)"""
+    section = road.section
+    outlines = []
     if section.right_shoulder_m > 0.5:
-        painted += solid_line(road.line(section.forward_edges[-1], start, end), 0.12)
+        right = road.line(section.forward_edges[-1], start, end_m=end)
+        outlines += solid_line(right, EDGE_LINE_M)
     if section.left_shoulder_m > 0.5:
-        painted += solid_line(road.line(section.backward_edges[-1], start, end), 0.12)
-    return painted
+        left = road.line(section.backward_edges[-1], start, end_m=end)
+        outlines += solid_line(left, EDGE_LINE_M)
+    return outlines
 
 
 def _crossing_paint(road: Road, start: float, end: float) -> list[Array]:
-    painted = []
+    """Painted areas of a crossing between two arc lengths. Each (n, 2)"""
+    outlines = []
     for right, left in road.carriageways():
-        offsets = np.linspace(right + 0.15, left - 0.15, 6)
-        sides = [np.stack([road.point(at, float(o)) for o in offsets]) for at in (start, end)]
+        offsets = np.linspace(right + 0.15, left - 0.15, num=6).tolist()
+        near_side = np.stack([road.point(start, offset) for offset in offsets])
+        far_side = np.stack([road.point(end, offset) for offset in offsets])
         if road.style.crossing == "zebra":
-            painted += zebra(sides[0], sides[1])
+            outlines += zebra(near_side, far_side)
         else:
-            painted += [piece for side in sides for piece in solid_line(side, 0.3)]
-    return painted
+            outlines += solid_line(near_side, 0.3)
+            outlines += solid_line(far_side, 0.3)
+    return outlines
 
 
 def _stop_paint(road: Road) -> list[Array]:
-    section, painted = road.section, []
+    """Painted areas of the stop lines of a road. Each (n, 2)"""
+    section = road.section
+    outlines = []
     if road.stop_forward:
-        painted.append(
-            road.band(section.forward_edges[-1], section.forward_edges[0] - 0.1, *road.stop_forward)
-        )
+        start, end = road.stop_forward
+        right = section.forward_edges[-1]
+        left = section.forward_edges[0] - 0.1
+        outlines.append(road.band(right, left, start_m=start, end_m=end))
     if road.stop_backward:
-        painted.append(
-            road.band(
-                section.backward_edges[0] + 0.1, section.backward_edges[-1], *road.stop_backward
-            )
-        )
-    return painted
+        start, end = road.stop_backward
+        right = section.backward_edges[0] + 0.1
+        left = section.backward_edges[-1]
+        outlines.append(road.band(right, left, start_m=start, end_m=end))
+    return outlines
 
 
+# Outline of an arrow: metres forward, metres to the left.
 _ARROW = np.array(
     [[0, -0.1], [1.6, -0.1], [1.6, -0.35], [2.8, 0], [1.6, 0.35], [1.6, 0.1], [0, 0.1]]
 )
 
 
 def _arrows(road: Road) -> list[Array]:
-    """Arrows in the lanes that lead to a stop line, where there are several."""
-    painted = []
+    """Arrows in the lanes before a stop line, on roads with several lanes there. Each (7, 2)"""
+    arrows = []
     for stop, edges, sign in (
         (road.stop_forward, road.section.forward_edges, 1),
         (road.stop_backward, road.section.backward_edges, -1),
@@ -167,5 +208,5 @@ def _arrows(road: Road) -> list[Array]:
         side = np.array([-forward[1], forward[0]])
         for inner, outer in pairwise(edges):
             base = road.point(at, 0.5 * (inner + outer))
-            painted.append(base + _ARROW[:, :1] * forward + _ARROW[:, 1:] * side)
-    return painted
+            arrows.append(base + _ARROW[:, :1] * forward + _ARROW[:, 1:] * side)
+    return arrows

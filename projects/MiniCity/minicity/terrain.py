@@ -1,4 +1,4 @@
-"""Where the rays of a camera meet uneven ground."""
+"""Intersections of a camera's rays with uneven ground."""
 
 from dataclasses import dataclass
 
@@ -18,31 +18,41 @@ _ROW = 1024
 
 
 def sample_height(grid: HeightGrid, points: Array) -> Array:
-    """Ground height at world points, linear between cells. (..., 2) -> (...)"""
-    at = ((points - grid.origin) / grid.cell_m).reshape(-1, 2).astype(np.float32)
+    """Sample the ground height, linear between cells.
+
+    Args:
+        grid: Height of the ground.
+        points: World x, y in metres. (..., 2)
+
+    Returns:
+        Heights in metres. (...)
+    """
+    cells = ((points - grid.origin) / grid.cell_m).reshape(-1, 2).astype(np.float32)
+    count = len(cells)
     # cv2.remap takes no side longer than 32767, so the list is folded into rows.
-    folded = np.zeros((-(-len(at) // _ROW), _ROW, 2), np.float32)
-    folded.reshape(-1, 2)[: len(at)] = at
+    rows = -(-count // _ROW)
+    folded = np.zeros((rows, _ROW, 2), dtype=np.float32)
+    folded.reshape(-1, 2)[:count] = cells
     heights = cv2.remap(
         grid.height_m.astype(np.float32, copy=False),
-        folded[..., 0],
-        folded[..., 1],
-        cv2.INTER_LINEAR,
+        map1=folded[..., 0],
+        map2=folded[..., 1],
+        interpolation=cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
     )
-    return np.asarray(heights, np.float64).reshape(-1)[: len(at)].reshape(points.shape[:-1])
+    return np.asarray(heights, dtype=np.float64).reshape(-1)[:count].reshape(points.shape[:-1])
 
 
 @dataclass(frozen=True)
 class Terrain:
-    """The ground as one camera sees it, in some hundred of its image columns.
+    """Uneven ground in the view of one camera, at about a hundred of its image columns.
 
     Attributes:
         camera: The camera.
         grid: Height of the ground.
-        columns: The image columns. (c,)
-        distances_m: Level distances at which the ground was looked up. (RINGS,)
-        lowest_row: Topmost image row that the ground up to each distance reaches. (RINGS, c)
+        columns: Image columns in pixels. (c,)
+        distances_m: Horizontal distances of the height samples in metres, ascending. (RINGS,)
+        lowest_row: Topmost image row of the ground up to each distance, in pixels. (RINGS, c)
     """
 
     camera: Camera
@@ -52,13 +62,17 @@ class Terrain:
     lowest_row: Array
 
     def horizon(self) -> Array:
-        """Image row of the ground's skyline in every column of the picture. (W,)"""
+        """Image row of the skyline of the ground in every image column. (W,)"""
         return np.interp(np.arange(self.camera.width), self.columns, self.lowest_row[-1])
 
     def distances(self, rows: Array) -> Array:
-        """Level distance to the ground along the rays of ``columns`` at some image rows. (h, c)
+        """Horizontal distance to the ground along the rays of ``columns``.
 
-        Rays that pass over the skyline get the farthest distance.
+        Args:
+            rows: Image rows in pixels. (h,)
+
+        Returns:
+            Distances in metres; about ``FARTHEST_M`` for rays above the skyline. (h, c)
         """
         reach = np.empty((len(rows), len(self.columns)))
         for i, profile in enumerate(self.lowest_row.T):
@@ -76,7 +90,14 @@ class Terrain:
         return reach
 
     def points(self, rows: Array) -> Array:
-        """World x, y where the rays of all columns at some image rows meet the ground. (h, W, 2)"""
+        """World x, y at which the rays of some image rows meet the ground.
+
+        Args:
+            rows: Image rows in pixels. (h,)
+
+        Returns:
+            Points for all image columns, in metres. (h, W, 2)
+        """
         direction, _ = self._rays(rows)
         hits = self.camera.center[:2] + self.distances(rows)[..., None] * direction
         at = np.arange(self.camera.width)
@@ -88,42 +109,65 @@ class Terrain:
         return hits[:, left] * (1 - share) + hits[:, left + 1] * share
 
     def _rays(self, rows: Array) -> tuple[Array, Array]:
-        """Level unit directions (h, c, 2) of the rays, and their rise per level metre (h, c)."""
+        """Directions of the rays of ``columns`` at image rows (h,).
+
+        Returns:
+            Horizontal unit directions (h, c, 2), and the rise per horizontal metre (h, c).
+        """
         u, v = np.meshgrid(self.columns, rows)
-        rays = np.stack([u, v, np.ones_like(u)], -1) @ self.camera.world_from_pixel.T
+        rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ self.camera.world_from_pixel.T
         level = np.maximum(np.linalg.norm(rays[..., :2], axis=-1), 1e-9)
         return rays[..., :2] / level[..., None], rays[..., 2] / level
 
 
-def see_terrain(camera: Camera, grid: HeightGrid) -> Terrain:
-    """Look at uneven ground: crests hide what lies behind, slopes may rise above the horizon."""
+def make_terrain(camera: Camera, grid: HeightGrid) -> Terrain:
+    """Compute the profile of uneven ground for a camera.
+
+    Crests hide the ground behind them, and slopes may rise above the horizon.
+
+    Args:
+        camera: The camera, at least 2 pixels wide.
+        grid: Height of the ground.
+
+    Returns:
+        The ground in the camera's view.
+
+    Raises:
+        ValueError: If the image is narrower than 2 pixels.
+    """
     last = camera.width - 1
     if last < 1:
         raise ValueError(f"the picture must be at least 2 pixels wide, got {camera.width}.")
-    columns = np.linspace(0.0, last, min(last, COLUMNS_PER_PICTURE) + 1)
-    distances = np.geomspace(NEAREST_M, FARTHEST_M, RINGS)
+    columns = np.linspace(0.0, last, num=min(last, COLUMNS_PER_PICTURE) + 1)
+    distances = np.geomspace(NEAREST_M, FARTHEST_M, num=RINGS)
     middle = np.stack([columns, np.full_like(columns, 0.65 * camera.height), np.ones_like(columns)])
     rays = (camera.world_from_pixel @ middle)[:2].T
     direction = rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-9)
     spots = camera.center[:2] + distances[:, None, None] * direction  # (RINGS, c, 2)
     world = np.concatenate([spots, sample_height(grid, spots)[..., None]], axis=-1)
-    seen = camera.to_camera(world)
-    in_front = seen[..., 2] > NEAR_M
-    rows = camera.to_pixels(np.where(in_front[..., None], seen, [0.0, 0.0, 1.0]))[..., 1]
-    below_everything = 10.0 * camera.height + 10.0 * np.geomspace(1.0, 0.1, RINGS)[:, None]
-    rows = np.where(in_front, np.minimum(rows, below_everything), below_everything)
-    return Terrain(camera, grid, columns, distances, np.minimum.accumulate(rows, axis=0))
+    points_cam = camera.to_camera(world)
+    in_front = points_cam[..., 2] > NEAR_M
+    rows = camera.to_pixels(np.where(in_front[..., None], points_cam, [0.0, 0.0, 1.0]))[..., 1]
+    below_image = 10.0 * camera.height + 10.0 * np.geomspace(1.0, 0.1, num=RINGS)[:, None]
+    rows = np.where(in_front, np.minimum(rows, below_image), below_image)
+    return Terrain(
+        camera=camera,
+        grid=grid,
+        columns=columns,
+        distances_m=distances,
+        lowest_row=np.minimum.accumulate(rows, axis=0),
+    )
 
 
 @dataclass(frozen=True)
 class Footprints:
-    """What a pixel of each image row covers on the ground.
+    """Area on the ground that a pixel of each image row covers.
 
     Attributes:
-        along: Length along the line of sight, metres. (H,)
-        across: Width across it, metres. (H,)
-        distance: Level distance, metres. (H,)
-        visible: Whether any ground is seen. (H,)
+        along: Length along the line of sight, in metres. (H,)
+        across: Width across the line of sight, in metres. (H,)
+        distance: Horizontal distance in metres. (H,)
+        visible: Whether the row shows any ground. (H,)
     """
 
     along: Array
@@ -133,10 +177,13 @@ class Footprints:
 
 
 def terrain_footprints(terrain: Terrain) -> Footprints:
-    """Footprints on uneven ground, medians over the columns."""
+    """Footprints of the image rows on uneven ground, as medians over the columns."""
     camera = terrain.camera
     edges = terrain.distances(np.arange(camera.height + 1) - 0.5)
-    along = np.median(np.abs(np.diff(edges, axis=0)), axis=1)
     distance = np.median(edges[:-1], axis=1)
-    visible = np.arange(camera.height) > terrain.lowest_row[-1].min()
-    return Footprints(along, distance / camera.intrinsics[0, 0], distance, visible)
+    return Footprints(
+        along=np.median(np.abs(np.diff(edges, axis=0)), axis=1),
+        across=distance / camera.intrinsics[0, 0],
+        distance=distance,
+        visible=np.arange(camera.height) > terrain.lowest_row[-1].min(),
+    )
