@@ -1,4 +1,4 @@
-"""The ground seen from above, at several resolutions."""
+"""Texture of the ground from above, at several resolutions."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -14,18 +14,20 @@ from minicity.scene_map import MATERIALS, PAINTS, SceneMap
 SHIFT = 4
 TILE_PX = 1024
 LEVELS = 6
+BLOTCH_WEIGHT = 0.16  # of the large noise in the brightness of the ground
+GRAIN_WEIGHT = 0.75  # of the fine noise in the brightness of the ground
 Image = MatLike
 
 
 @dataclass(frozen=True)
 class GroundTexture:
-    """Top views of the ground. Row 0 has the smallest y; a pixel's value is taken at its centre.
+    """Top views of the ground. Row 0 has the smallest y; the value of a pixel is at its centre.
 
     Attributes:
-        origin: World x, y of the corner of pixel (0, 0). (2,)
-        resolution_m: Edge of a pixel at level 0; it doubles from level to level.
+        origin: World x, y of the corner of pixel (0, 0), in metres. (2,)
+        resolution_m: Edge of a pixel at level 0 in metres; it doubles from level to level.
         levels: Colour images, BGR. Each (rows, columns, 3)
-        reflectivity: How strongly level 0 returns a laser pulse. (rows, columns)
+        reflectivity: Reflectivity for laser pulses at level 0, in [0, 255]. (rows, columns)
     """
 
     origin: Array
@@ -34,38 +36,50 @@ class GroundTexture:
     reflectivity: Image
 
     def sample_reflectivity(self, points: Array) -> Image:
-        """Reflectivity at world points; 0 outside. (n, 2) -> (n,)"""
+        """Sample the reflectivity at world points.
+
+        Args:
+            points: World x, y in metres. (n, 2)
+
+        Returns:
+            Values in [0, 255], 0 outside the texture. (n,)
+        """
         cells = np.floor((points - self.origin) / self.resolution_m).astype(int)
         rows, columns = self.reflectivity.shape
-        inside = (cells >= 0).all(1) & (cells[:, 0] < columns) & (cells[:, 1] < rows)
-        values = np.zeros(len(points), np.uint8)
+        inside = (cells >= 0).all(axis=1) & (cells[:, 0] < columns) & (cells[:, 1] < rows)
+        values = np.zeros(len(points), dtype=np.uint8)
         values[inside] = self.reflectivity[cells[inside, 1], cells[inside, 0]]
         return values
 
 
 @lru_cache(maxsize=1)
 def _noise_tiles() -> tuple[Image, Image]:
-    """(blotches, grain): periodic noise, the same in every process. (TILE_PX, TILE_PX)"""
+    """Periodic noise, equal in every process: blotches and grain. Each (TILE_PX, TILE_PX)"""
     rng = np.random.default_rng(20)
-    blotches = np.zeros((TILE_PX, TILE_PX), np.float32)
+    blotches = np.zeros((TILE_PX, TILE_PX), dtype=np.float32)
     for cells, weight in ((16, 1.0), (64, 0.8), (256, 0.6), (512, 0.5)):
         coarse = np.pad(rng.random((cells, cells), dtype=np.float32), 1, mode="wrap")
         scale = TILE_PX // cells
         fine = cv2.resize(coarse, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
         blotches += weight * fine[scale : scale + TILE_PX, scale : scale + TILE_PX]
-    rank = np.argsort(np.argsort(blotches, axis=None, kind="stable"), kind="stable")
-    flat = (rank * (255.0 / rank.size)).astype(np.uint8).reshape(TILE_PX, TILE_PX)
-    grain = np.clip(128 + 20 * rng.standard_normal((TILE_PX, TILE_PX)), 0, 255).astype(np.uint8)
-    return flat, grain
+    # Ranks in place of values: a threshold then covers a known share of the ground.
+    order = np.argsort(blotches, axis=None, kind="stable")
+    rank = np.argsort(order, kind="stable")
+    uniform = (rank * (255.0 / rank.size)).astype(np.uint8).reshape(TILE_PX, TILE_PX)
+    normal = rng.standard_normal((TILE_PX, TILE_PX))
+    grain = np.clip(128 + 20 * normal, 0, 255).astype(np.uint8)
+    return uniform, grain
 
 
-def _tiled(tile: Image, shape: tuple[int, int], start: list[int]) -> Image:
-    rolled = np.roll(tile, tuple(start), axis=(0, 1))
+def _tile_noise(tile: Image, shape: tuple[int, int], start: list[int]) -> Image:
+    """Repeat a periodic tile to (rows, columns) pixels, from an offset (row, column). (H, W)"""
+    shifted = np.roll(tile, (start[0], start[1]), axis=(0, 1))
     repeats = [-(-n // TILE_PX) for n in shape]
-    return np.tile(rolled, repeats)[: shape[0], : shape[1]]
+    return np.tile(shifted, repeats)[: shape[0], : shape[1]]
 
 
-def _pixels(points: Array, origin: Array, resolution_m: float) -> NDArray[np.int32]:
+def _fixed_point_pixels(points: Array, origin: Array, resolution_m: float) -> NDArray[np.int32]:
+    """Pixels of world points in OpenCV's fixed-point format. (n, 2) or (n, 3) -> (n, 2)"""
     px = (np.asarray(points)[:, :2] - origin) / resolution_m - 0.5
     return np.round(px * (1 << SHIFT)).astype(np.int32)
 
@@ -79,116 +93,170 @@ def paint_ground(
     """Paint the ground of a scene.
 
     Args:
-        scene: What lies on the ground.
-        bounds: xmin, ymin, xmax, ymax of the painted area in the world, metres.
-        resolution_m: Edge of a pixel of the finest level.
+        scene: Surfaces, kerbs and paint.
+        bounds: xmin, ymin, xmax, ymax of the texture in the world, in metres.
+        resolution_m: Edge of a pixel of the finest level, in metres, > 0.
         rng: Source of the surface noise.
 
     Returns:
         The ground at ``LEVELS`` resolutions.
     """
-    origin = np.array(bounds[:2])
-    columns, rows = (int(np.ceil(e)) for e in (np.array(bounds[2:]) - origin) / resolution_m)
-    starts = rng.integers(0, TILE_PX, (2, 2)).tolist()
-    blotches, grain = (
-        _tiled(t, (rows, columns), s) for t, s in zip(_noise_tiles(), starts, strict=True)
-    )
-    color: Image = np.empty((rows, columns, 3), np.uint8)
+    xmin, ymin, xmax, ymax = bounds
+    origin = np.array([xmin, ymin])
+    columns = int(np.ceil((xmax - xmin) / resolution_m))
+    rows = int(np.ceil((ymax - ymin) / resolution_m))
+    blotch_start, grain_start = rng.integers(0, TILE_PX, size=(2, 2)).tolist()
+    blotch_tile, grain_tile = _noise_tiles()
+    blotches = _tile_noise(blotch_tile, (rows, columns), start=blotch_start)
+    grain = _tile_noise(grain_tile, (rows, columns), start=grain_start)
+    color: Image = np.empty((rows, columns, 3), dtype=np.uint8)
     color[:] = MATERIALS["grass"]
-    for surface in scene.surfaces:
-        shade = [min(255.0, c * surface.tone) for c in MATERIALS[surface.material]]
-        rings = [surface.polygon.exterior, *surface.polygon.interiors]
-        outlines = [_pixels(np.array(ring.coords), origin, resolution_m) for ring in rings]
-        cv2.fillPoly(color, outlines, shade, cv2.LINE_AA, SHIFT)
-    _paint_kerbs(color, scene, origin, resolution_m)
-    texture = cv2.addWeighted(blotches, 0.16, grain, 0.75, 128 - 0.16 * 127.5 - 0.75 * 128)
-    color = cv2.multiply(color, cv2.merge([texture] * 3), scale=1 / 128)
-    painted = np.zeros((rows, columns), np.uint8)
+    _paint_surfaces(color, scene, origin=origin, resolution_m=resolution_m)
+    _paint_kerbs(color, scene, origin=origin, resolution_m=resolution_m)
+    mean = 128 - BLOTCH_WEIGHT * 127.5 - GRAIN_WEIGHT * 128
+    noise = cv2.addWeighted(blotches, BLOTCH_WEIGHT, grain, beta=GRAIN_WEIGHT, gamma=mean)
+    color = cv2.multiply(color, cv2.merge([noise] * 3), scale=1 / 128)
+    opacity = np.zeros((rows, columns), dtype=np.uint8)
     for marking in scene.markings:
-        coat = _coat(marking.outlines, marking.wear, blotches, origin, resolution_m)
+        coat = _paint_coat(
+            outlines=marking.outlines,
+            wear=marking.wear,
+            blotches=blotches,
+            origin=origin,
+            resolution_m=resolution_m,
+        )
         if coat is not None:
             window, alpha = coat
-            _blend(color[window], PAINTS[marking.paint], alpha)
-            painted[window] = np.maximum(painted[window], alpha)
+            _blend(color[window], PAINTS[marking.paint], alpha=alpha)
+            opacity[window] = np.maximum(opacity[window], alpha)
     gray = cv2.cvtColor(color, cv2.COLOR_BGR2GRAY)
-    reflectivity = cv2.addWeighted(gray, 0.12, painted, 0.45, 0)
+    return GroundTexture(
+        origin=origin,
+        resolution_m=resolution_m,
+        levels=_halve_repeatedly(color),
+        reflectivity=cv2.addWeighted(gray, 0.12, opacity, beta=0.45, gamma=0),
+    )
+
+
+def _halve_repeatedly(color: Image) -> list[Image]:
+    """Image (H, W, 3) at ``LEVELS`` resolutions, each half of the one before."""
     levels: list[Image] = [color]
     for _ in range(LEVELS - 1):
-        half = (max(1, levels[-1].shape[1] // 2), max(1, levels[-1].shape[0] // 2))
-        even = levels[-1][: 2 * half[1], : 2 * half[0]]
-        levels.append(cv2.resize(even, half, interpolation=cv2.INTER_AREA))
-    return GroundTexture(origin, resolution_m, levels, reflectivity)
+        rows, columns = levels[-1].shape[:2]
+        half_rows = max(1, rows // 2)
+        half_columns = max(1, columns // 2)
+        even = levels[-1][: 2 * half_rows, : 2 * half_columns]
+        levels.append(cv2.resize(even, (half_columns, half_rows), interpolation=cv2.INTER_AREA))
+    return levels
+
+
+def _paint_surfaces(color: Image, scene: SceneMap, origin: Array, resolution_m: float) -> None:
+    """Fill the surfaces of a scene in an image (H, W, 3), in place."""
+    for surface in scene.surfaces:
+        shade = [min(255.0, c * surface.tone) for c in MATERIALS[surface.material]]
+        outlines = []
+        for ring in (surface.polygon.exterior, *surface.polygon.interiors):
+            outlines.append(_fixed_point_pixels(np.array(ring.coords), origin, resolution_m))
+        cv2.fillPoly(color, outlines, color=shade, lineType=cv2.LINE_AA, shift=SHIFT)
 
 
 def _paint_kerbs(color: Image, scene: SceneMap, origin: Array, resolution_m: float) -> None:
+    """Draw the kerbs of a scene in an image (H, W, 3): a light band with a dark gutter in it."""
     for line in scene.kerbs:
-        px = _pixels(line, origin, resolution_m)
+        px = _fixed_point_pixels(line, origin, resolution_m)
         for width_m, shade in ((0.34, (172, 178, 180)), (0.1, (58, 58, 58))):
-            thickness = max(1, round(width_m / resolution_m))
-            cv2.polylines(color, [px], False, shade, thickness, cv2.LINE_AA, SHIFT)
+            cv2.polylines(
+                color,
+                [px],
+                isClosed=False,
+                color=shade,
+                thickness=max(1, round(width_m / resolution_m)),
+                lineType=cv2.LINE_AA,
+                shift=SHIFT,
+            )
 
 
-def _coat(
+def _paint_coat(
     outlines: list[Array], wear: float, blotches: Image, origin: Array, resolution_m: float
 ) -> tuple[tuple[slice, slice], Image] | None:
-    """The window of the texture that paint covers, and its opacity, worn off in blotches."""
+    """Opacity of paint that is worn off in blotches.
+
+    Args:
+        outlines: Painted areas in the world, in metres. Each (n, 2)
+        wear: Share of the paint that is worn off, in [0, 1).
+        blotches: Noise over the whole texture. (H, W)
+        origin: World x, y of the texture's corner, in metres. (2,)
+        resolution_m: Edge of a pixel in metres.
+
+    Returns:
+        Window (rows, columns) of the texture and the opacity inside it in [0, 255] (h, w), or None
+        where no paint lies on the texture.
+    """
     if not outlines:
         return None
     # Drawn twice as fine and averaged: OpenCV rounds level edges to whole pixels.
-    px = [_pixels(outline, origin, resolution_m / 2) for outline in outlines]
-    everything = np.concatenate(px) >> (SHIFT + 1)
-    low = np.maximum(everything.min(0) - 2, 0)
-    high = np.minimum(everything.max(0) + 3, blotches.shape[::-1])
+    px = [_fixed_point_pixels(outline, origin, resolution_m / 2) for outline in outlines]
+    all_px = np.concatenate(px) >> (SHIFT + 1)
+    low = np.maximum(all_px.min(axis=0) - 2, 0)
+    high = np.minimum(all_px.max(axis=0) + 3, blotches.shape[::-1])
     if (high <= low).any():
         return None
-    window = (slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0])))
-    columns, rows = (int(n) for n in high - low)
-    fine = np.zeros((2 * rows, 2 * columns), np.uint8)
+    left, top = low.tolist()
+    right, bottom = high.tolist()
+    window = (slice(top, bottom), slice(left, right))
+    rows = bottom - top
+    columns = right - left
+    fine = np.zeros((2 * rows, 2 * columns), dtype=np.uint8)
     shift = (2 * low << SHIFT).astype(np.int32)
     for outline in px:
-        cv2.fillPoly(fine, [outline - shift], (255.0,), cv2.LINE_AA, SHIFT)
+        cv2.fillPoly(fine, [outline - shift], color=(255.0,), lineType=cv2.LINE_AA, shift=SHIFT)
     mask = cv2.resize(fine, (columns, rows), interpolation=cv2.INTER_AREA)
     # Opaque where the noise stays below 1 - wear, bare above, with a soft edge between.
-    limit = np.arange(256) / 255.0
-    left = np.clip((1.0 - wear - limit) * 5 + 0.35, 0.12, 0.97)
-    keep = cv2.LUT(blotches[window], (left * 255).astype(np.uint8))
-    return window, cv2.multiply(mask, keep, scale=1 / 255)
+    noise = np.arange(256) / 255.0
+    cover = np.clip((1.0 - wear - noise) * 5 + 0.35, 0.12, 0.97)
+    cover_px = cv2.LUT(blotches[window], (cover * 255).astype(np.uint8))
+    return window, cv2.multiply(mask, cover_px, scale=1 / 255)
 
 
 def _blend(target: Image, paint: tuple[int, int, int], alpha: Image) -> None:
-    """Lay a colour over ``target`` in place where ``alpha`` is set."""
+    """Blend a BGR colour over an image (h, w, 3) with opacity ``alpha`` (h, w), in place."""
     rows, columns = np.nonzero(alpha)
     opacity = alpha[rows, columns, None].astype(np.float32) / 255
     under = target[rows, columns].astype(np.float32)
-    # The surface's grain shows through the paint, so that it is no flat colour.
-    coat = np.asarray(paint, np.float32) * (
-        0.86 + 0.14 * np.clip(under.mean(1, keepdims=True) / 90, 0.5, 1.4)
-    )
+    # The grain of the surface modulates the paint.
+    brightness = np.clip(under.mean(axis=1, keepdims=True) / 90, 0.5, 1.4)
+    coat = np.asarray(paint, dtype=np.float32) * (0.86 + 0.14 * brightness)
     target[rows, columns] = np.clip(under + opacity * (coat - under), 0, 255).astype(np.uint8)
 
 
 def darken(texture: GroundTexture, outlines: list[Array], strength: float) -> GroundTexture:
-    """Return the ground under shadows with soft edges.
+    """Darken the ground by shadows with soft edges.
 
     Args:
-        texture: The ground.
-        outlines: Shadow outlines in the world. Each (n, 2)
-        strength: Share of the light that they take, in [0, 1].
+        texture: The ground in full light.
+        outlines: Outlines of the shadows in the world, in metres. Each (n, 2)
+        strength: Share of the light that is lost in a shadow, in [0, 1].
 
     Returns:
-        A new texture; the laser's reflectivity is not touched.
+        A texture with shadows and with the reflectivity of ``texture``.
     """
     if not outlines or strength <= 0:
         return texture
     shape = texture.levels[0].shape[:2]
-    light: Image = np.full(shape, 255, np.uint8)
+    light: Image = np.full(shape, 255, dtype=np.uint8)
+    shade = 255 * (1 - strength)
     for outline in outlines:
-        px = _pixels(outline, texture.origin, texture.resolution_m)
-        cv2.fillPoly(light, [px], (255 * (1 - strength),), cv2.LINE_AA, SHIFT)
+        px = _fixed_point_pixels(outline, texture.origin, texture.resolution_m)
+        cv2.fillPoly(light, [px], color=(shade,), lineType=cv2.LINE_AA, shift=SHIFT)
     size = 2 * max(1, round(0.15 / texture.resolution_m)) + 1
     light = cv2.blur(light, (size, size))
     levels = []
     for level in texture.levels:
         small = cv2.resize(light, level.shape[1::-1], interpolation=cv2.INTER_AREA)
         levels.append(cv2.multiply(level, cv2.merge([small] * 3), scale=1 / 255))
-    return GroundTexture(texture.origin, texture.resolution_m, levels, texture.reflectivity)
+    return GroundTexture(
+        origin=texture.origin,
+        resolution_m=texture.resolution_m,
+        levels=levels,
+        reflectivity=texture.reflectivity,
+    )

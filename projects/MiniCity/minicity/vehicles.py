@@ -1,4 +1,4 @@
-"""Vehicles and people: what they look like at the origin, and where they are."""
+"""Vehicles and people, and their meshes."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -20,15 +20,15 @@ BACK_FACE, FRONT_FACE, TOP_FACE = 1, 3, 4
 
 @dataclass(frozen=True)
 class Vehicle:
-    """A vehicle or a person at one moment.
+    """Vehicle or person at one moment.
 
     Attributes:
-        category: nuScenes category; ``human.*`` is drawn as a person, ``vehicle.car`` with a cabin.
-        center: x, y, z of the box's centre in the world. (3,)
-        yaw_rad: Heading.
+        category: nuScenes category; ``human.*`` has the shape of a person, ``vehicle.car`` a cabin.
+        center: x, y, z of the box's centre in the world, in metres. (3,)
+        yaw_rad: Heading in radians, anticlockwise from +x.
         size: Length, width, height in metres.
-        color: Paint, BGR.
-        identity: Name that stays with it through a scene.
+        color: Colour of the paint, BGR in [0, 255].
+        identity: Name, constant through a scene.
         speed: Speed in m/s.
     """
 
@@ -42,84 +42,97 @@ class Vehicle:
 
 
 def _body(size: Size, back: float, front: float, width: float) -> Array:
-    """A rectangle in shares of a vehicle's size, -0.5 at its back, 0.5 at its front. (4, 2)"""
+    """Rectangle in shares of a vehicle's size, from -0.5 at its back to 0.5 at its front. (4, 2)"""
     center = np.array([(back + front) / 2 * size[0], 0.0])
-    return rectangle(center, 0.0, (front - back) * size[0], width * size[1])
+    length_m = (front - back) * size[0]
+    return rectangle(center, 0.0, length_m=length_m, width_m=width * size[1])
 
 
 def _add_lights(mesh: Mesh, face: Array, color: Color) -> None:
+    """Add two lamps to a face (4, 3)."""
     for left, right in ((0.04, 0.22), (0.78, 0.96)):
-        mesh.add_quad(patch(face, left, right, 0.5, 0.8), color, 2, glow=True)
+        lamp = patch(face, left, right, bottom=0.5, top=0.8)
+        mesh.add_quad(lamp, color, layer=2, glow=True)
 
 
 def _add_motor(mesh: Mesh, size: Size, color: Color, tall: bool) -> None:
-    """A car with a cabin on its body, or a tall box with windows along its sides."""
-    height, shoulder = size[2], size[2] * (0.9 if tall else 0.55)
-    for face in prism_faces(_body(size, -0.5, 0.5, 1.0), 0.0, 0.28):
-        mesh.add_quad(face, TYRES, 0)
-    for k, face in enumerate(prism_faces(_body(size, -0.5, 0.5, 1.0), 0.22, shoulder, 0.97)):
-        mesh.add_quad(face, color, 1)
+    """Add a car with a cabin on its body, or a tall box with windows along its sides."""
+    height = size[2]
+    shoulder = height * (0.9 if tall else 0.55)
+    outline = _body(size, back=-0.5, front=0.5, width=1.0)
+    for face in prism_faces(outline, low_m=0.0, high_m=0.28):
+        mesh.add_quad(face, TYRES, layer=0)
+    body = prism_faces(outline, low_m=0.22, high_m=shoulder, top_scale=0.97)
+    for k, face in enumerate(body):
+        mesh.add_quad(face, color, layer=1)
         if k == BACK_FACE:
-            _add_lights(mesh, face, TAIL_LIGHT)
+            _add_lights(mesh, face, color=TAIL_LIGHT)
         elif k == FRONT_FACE:
-            _add_lights(mesh, face, HEAD_LIGHT)
+            _add_lights(mesh, face, color=HEAD_LIGHT)
         if tall and k != TOP_FACE:
-            mesh.add_quad(patch(face, 0.05, 0.95, 0.55, 0.85), GLASS, 2)
+            window = patch(face, left=0.05, right=0.95, bottom=0.55, top=0.85)
+            mesh.add_quad(window, GLASS, layer=2)
     if not tall:
-        for k, face in enumerate(
-            prism_faces(_body(size, -0.42, 0.22, 0.92), shoulder, height, 0.82)
-        ):
-            mesh.add_quad(face, color if k == TOP_FACE else GLASS, 3)
+        outline = _body(size, back=-0.42, front=0.22, width=0.92)
+        cabin = prism_faces(outline, low_m=shoulder, high_m=height, top_scale=0.82)
+        for k, face in enumerate(cabin):
+            mesh.add_quad(face, color if k == TOP_FACE else GLASS, layer=3)
 
 
 def _add_person(mesh: Mesh, size: Size, color: Color) -> None:
+    """Add legs, a torso and a head."""
     height = size[2]
-    for face in prism_faces(_body(size, -0.3, 0.3, 0.7), 0.0, 0.48 * height):
-        mesh.add_quad(face, TROUSERS, 0)
-    for face in prism_faces(_body(size, -0.4, 0.4, 1.0), 0.46 * height, 0.84 * height):
-        mesh.add_quad(face, color, 1)
-    mesh.add_disc(np.array([0.0, 0.0, 0.92 * height]), 0.08 * height, SKIN)
+    legs = _body(size, back=-0.3, front=0.3, width=0.7)
+    for face in prism_faces(legs, low_m=0.0, high_m=0.48 * height):
+        mesh.add_quad(face, TROUSERS, layer=0)
+    torso = _body(size, back=-0.4, front=0.4, width=1.0)
+    for face in prism_faces(torso, low_m=0.46 * height, high_m=0.84 * height):
+        mesh.add_quad(face, color, layer=1)
+    mesh.add_disc(np.array([0.0, 0.0, 0.92 * height]), 0.08 * height, color=SKIN)
 
 
 @lru_cache(maxsize=4096)
 def _template(category: str, size: Size, color: Color) -> FrozenMesh:
-    """A vehicle or person at the origin, standing on z = 0 and heading along +x."""
+    """Mesh of a vehicle or person at the origin, on z = 0 and heading along +x."""
     mesh = Mesh()
     mesh.begin(np.array([0.0, 0.0, size[2] / 2]))
     if category.startswith("human"):
-        _add_person(mesh, size, color)
+        _add_person(mesh, size, color=color)
     else:
-        _add_motor(mesh, size, color, tall=category != "vehicle.car")
+        _add_motor(mesh, size, color=color, tall=category != "vehicle.car")
     return mesh.freeze()
 
 
 def vehicle_mesh(vehicles: list[Vehicle]) -> FrozenMesh:
-    """Vehicles and people where they are. An object's number is its place in the list."""
-    templates = [_template(v.category, v.size, v.color) for v in vehicles]
-    if not templates:
+    """Mesh of vehicles and people in the world. The object index is the position in the list."""
+    if not vehicles:
         return Mesh().freeze()
+    templates = [_template(v.category, v.size, color=v.color) for v in vehicles]
     numbers = np.arange(len(templates))
-    of_quad = np.repeat(numbers, [len(t.quads) for t in templates])
-    of_disc = np.repeat(numbers, [len(t.discs) for t in templates])
-    turn = np.zeros((len(vehicles), 3, 3))
+    quad_groups = np.repeat(numbers, [len(t.quads) for t in templates])
+    disc_groups = np.repeat(numbers, [len(t.discs) for t in templates])
     yaw = np.array([v.yaw_rad for v in vehicles])
-    turn[:, 0, 0] = turn[:, 1, 1] = np.cos(yaw)
-    turn[:, 1, 0], turn[:, 0, 1], turn[:, 2, 2] = np.sin(yaw), -np.sin(yaw), 1.0
+    turn = np.zeros((len(vehicles), 3, 3))
+    turn[:, 0, 0] = np.cos(yaw)
+    turn[:, 0, 1] = -np.sin(yaw)
+    turn[:, 1, 0] = np.sin(yaw)
+    turn[:, 1, 1] = np.cos(yaw)
+    turn[:, 2, 2] = 1.0
     centers = np.array([v.center for v in vehicles])
     floor = centers - np.array([[0.0, 0.0, v.size[2] / 2] for v in vehicles])
     quads = np.concatenate([t.quads for t in templates])
     discs = np.concatenate([t.discs for t in templates])
-    quads = np.einsum("fij,fkj->fki", turn[of_quad], quads) + floor[of_quad][:, None]
-    discs[:, :3] += floor[of_disc]
+    discs[:, :3] += floor[disc_groups]
+    world_quads = np.einsum("fij,fkj->fki", turn[quad_groups], quads) + floor[quad_groups][:, None]
     return FrozenMesh(
-        quads,
-        np.concatenate([t.colors for t in templates]),
-        of_quad,
-        np.concatenate([t.layers for t in templates]),
-        np.concatenate([t.glow for t in templates]),
-        discs,
-        np.concatenate([t.disc_colors for t in templates]),
-        of_disc,
-        centers,
-        np.zeros(len(vehicles), bool),
+        quads=world_quads,
+        colors=np.concatenate([t.colors for t in templates]),
+        groups=quad_groups,
+        layers=np.concatenate([t.layers for t in templates]),
+        glow=np.concatenate([t.glow for t in templates]),
+        discs=discs,
+        disc_colors=np.concatenate([t.disc_colors for t in templates]),
+        disc_groups=disc_groups,
+        anchors=centers,
+        backdrop=np.zeros(len(vehicles), dtype=bool),
     )
