@@ -1,4 +1,4 @@
-"""A spinning LiDAR: rays against flat ground, vehicles and buildings."""
+"""Spinning LiDAR: rays against flat ground, vehicles and buildings."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,35 +15,60 @@ RANGE_NOISE_M = 0.015
 
 
 def footprint_array(footprints: list[Array], heights: list[float]) -> Array:
-    """Rectangles and their heights as rows: 4 corners, then the height. (n, 9)"""
-    rows = [np.append(f.reshape(-1), h) for f, h in zip(footprints, heights, strict=True)]
-    return np.array(rows, float).reshape(-1, 9)
+    """Pack rectangles and their heights into rows.
+
+    Args:
+        footprints: Corners x, y of each rectangle in metres. Each (4, 2)
+        heights: Height of each box in metres.
+
+    Returns:
+        Four corners, then the height. (n, 9)
+    """
+    rows = []
+    for footprint, height in zip(footprints, heights, strict=True):
+        rows.append(np.append(footprint.reshape(-1), height))
+    return np.array(rows, dtype=float).reshape(-1, 9)
 
 
 def vehicle_footprints(vehicles: list[Vehicle]) -> Array:
-    """The rectangles of vehicles and people. (n, 9)"""
+    """Footprints of vehicles and people: four corners x, y and the height, in metres. (n, 9)"""
     if not vehicles:
         return np.zeros((0, 9))
     yaw = np.array([v.yaw_rad for v in vehicles])
-    size, center = np.array([v.size for v in vehicles]), np.array([v.center for v in vehicles])
+    size = np.array([v.size for v in vehicles])
+    middle = np.array([v.center for v in vehicles])[:, :2]
     forward = np.stack([np.cos(yaw), np.sin(yaw)], axis=1) * size[:, :1] / 2
     left = np.stack([-np.sin(yaw), np.cos(yaw)], axis=1) * size[:, 1:2] / 2
-    middle = center[:, :2]
-    corners = [middle + forward + left, middle - forward + left, middle - forward - left]
-    corners.append(middle + forward - left)
-    return np.column_stack([*corners, size[:, 2]])
+    return np.column_stack(
+        [
+            middle + forward + left,
+            middle - forward + left,
+            middle - forward - left,
+            middle + forward - left,
+            size[:, 2],
+        ]
+    )
 
 
 def _entry_distances(origin: Array, directions: Array, boxes: Array) -> Array:
-    """Distances at which level rays enter each rectangle, inf where they miss. (A, n)"""
-    corners = boxes[:, :8].reshape(-1, 4, 2) - origin
-    start, edge = corners, np.roll(corners, -1, axis=1) - corners
-    dx, dy = directions[:, 0, None, None], directions[:, 1, None, None]
+    """Distances at which horizontal rays enter rectangles.
+
+    Args:
+        origin: Start of all rays in metres. (2,)
+        directions: Unit directions. (A, 2)
+        boxes: Four corners and a height per box, in metres. (n, 9)
+
+    Returns:
+        Distances in metres, inf where a ray misses the rectangle. (A, n)
+    """
+    start = boxes[:, :8].reshape(-1, 4, 2) - origin
+    edge = np.roll(start, -1, axis=1) - start
+    dx = directions[:, 0, None, None]
+    dy = directions[:, 1, None, None]
     cross = dx * edge[None, ..., 1] - dy * edge[None, ..., 0]
     cross = np.where(np.abs(cross) < 1e-12, 1e-12, cross)
-    reach = (
-        start[None, ..., 0] * edge[None, ..., 1] - start[None, ..., 1] * edge[None, ..., 0]
-    ) / cross
+    area = start[None, ..., 0] * edge[None, ..., 1] - start[None, ..., 1] * edge[None, ..., 0]
+    reach = area / cross
     share = (start[None, ..., 0] * dy - start[None, ..., 1] * dx) / cross
     hit = (reach > 0.3) & (share >= 0) & (share <= 1)
     return np.where(hit, reach, np.inf).min(axis=2)
@@ -52,49 +77,50 @@ def _entry_distances(origin: Array, directions: Array, boxes: Array) -> Array:
 def scan(
     world_from_lidar: Array, texture: GroundTexture, boxes: Array, rng: np.random.Generator
 ) -> NDArray[np.float32]:
-    """One revolution.
+    """Simulate one revolution of the LiDAR.
 
     Args:
-        world_from_lidar: Pose of the sensor. (4, 4)
+        world_from_lidar: Pose of the sensor, in metres. (4, 4)
         texture: The ground, for its reflectivity.
-        boxes: Vehicles and buildings: 4 corners and a height each. (n, 9)
+        boxes: Vehicles and buildings: four corners and a height each, in metres. (n, 9)
         rng: Source of the range noise.
 
     Returns:
-        x, y, z in the sensor's frame, intensity in [0, 255], beam index. (N, 5)
+        x, y, z in the sensor frame in metres, intensity in [0, 255], beam index. (N, 5)
     """
     origin = world_from_lidar[:3, 3]
-    azimuth = np.linspace(-np.pi, np.pi, COLUMNS, endpoint=False) + rng.uniform(
-        0, 2 * np.pi / COLUMNS
-    )
-    elevation = np.linspace(LOWEST_RAD, HIGHEST_RAD, BEAMS)
+    first_rad = rng.uniform(low=0, high=2 * np.pi / COLUMNS)
+    azimuth = np.linspace(-np.pi, np.pi, num=COLUMNS, endpoint=False) + first_rad
+    elevation = np.linspace(LOWEST_RAD, HIGHEST_RAD, num=BEAMS)
     level = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
     slope = np.tan(elevation)
     ground = np.where(slope < -1e-3, -origin[2] / np.minimum(slope, -1e-3), np.inf)
     reach = np.broadcast_to(ground[:, None], (BEAMS, COLUMNS)).copy()
-    struck = np.full((BEAMS, COLUMNS), -1)
-    near = boxes[
-        np.linalg.norm(boxes[:, :8].reshape(-1, 4, 2) - origin[:2], axis=-1).min(1) < RANGE_M
-    ]
-    entry = _entry_distances(origin[:2], level, near)
+    hit_box = np.full((BEAMS, COLUMNS), -1)
+    corner_distances = np.linalg.norm(boxes[:, :8].reshape(-1, 4, 2) - origin[:2], axis=-1)
+    near = boxes[corner_distances.min(axis=1) < RANGE_M]
+    entry = _entry_distances(origin[:2], level, boxes=near)
     column, box = np.nonzero(np.isfinite(entry))
     # Far hits first: of several hits of one ray, the nearest is written last and stays.
     order = np.argsort(-entry[column, box], kind="stable")
-    column, box = column[order], box[order]
+    column = column[order]
+    box = box[order]
     distance = entry[column, box]
-    at = origin[2] + slope[:, None] * distance
-    rows, hit = np.nonzero((at > 0) & (at < near[box, 8]))
+    height = origin[2] + slope[:, None] * distance
+    rows, hit = np.nonzero((height > 0) & (height < near[box, 8]))
     reach[rows, column[hit]] = distance[hit]
-    struck[rows, column[hit]] = box[hit]
+    hit_box[rows, column[hit]] = box[hit]
     rows, columns = np.nonzero(reach / np.cos(elevation)[:, None] < RANGE_M)
-    distance = reach[rows, columns] + rng.normal(0, RANGE_NOISE_M, len(rows))
-    world = np.column_stack(
-        [origin[:2] + level[columns] * distance[:, None], origin[2] + slope[rows] * distance]
-    )
-    on_box = struck[rows, columns]
-    intensity = texture.sample_reflectivity(world[:, :2]).astype(float)
+    noise = rng.normal(loc=0, scale=RANGE_NOISE_M, size=len(rows))
+    distance = reach[rows, columns] + noise
+    world_xy = origin[:2] + level[columns] * distance[:, None]
+    world_z = origin[2] + slope[rows] * distance
+    world = np.column_stack([world_xy, world_z])
+    point_box = hit_box[rows, columns]
     tint = 18.0 + 7.0 * (np.arange(len(near) + 1) % 9)
-    intensity = np.where(on_box >= 0, tint[on_box], intensity) + rng.normal(0, 2.0, len(rows))
+    ground_intensity = texture.sample_reflectivity(world[:, :2]).astype(float)
+    intensity = np.where(point_box >= 0, tint[point_box], ground_intensity)
+    intensity = intensity + rng.normal(loc=0, scale=2.0, size=len(rows))
     local_points = (world - origin) @ world_from_lidar[:3, :3]
     cloud = np.column_stack([local_points, np.clip(np.round(intensity), 0, 255), rows])
     return cloud.astype(np.float32)

@@ -1,23 +1,25 @@
-"""Who is on the street: the ego vehicle's drive, other traffic, parked vehicles and people."""
+"""Road users of a scene: the ego vehicle's drive, other traffic, parked vehicles and people."""
 
 import math
 from bisect import bisect_right
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from minicity.curves import Array, arc_lengths, resample, tangents
 from minicity.meshes import Color
-from minicity.roads import Lane
+from minicity.roads import Lane, Road
 from minicity.town import Town
 from minicity.vehicles import Vehicle
 
+# Category, size in metres and share of all vehicles.
 KINDS: list[tuple[str, tuple[float, float, float], float]] = [
     ("vehicle.car", (4.5, 1.85, 1.55), 0.78),
     ("vehicle.truck", (6.6, 2.2, 2.7), 0.14),
     ("vehicle.bus.rigid", (10.8, 2.5, 3.2), 0.08),
 ]
+CAR_KIND = 0
 PAINTS: list[Color] = [
     (225, 225, 225),
     (40, 40, 42),
@@ -33,15 +35,15 @@ SWING_M = 6.0
 
 @dataclass(frozen=True)
 class Drive:
-    """A path driven at constant speed, swinging gently about the lane's centre.
+    """Drive along a path at constant speed, with a gentle swing around the lane's centre.
 
     Attributes:
-        path: Lane centres one after another. (n, 2)
-        speed: Speed along it in m/s.
-        start_m: Arc length at time 0.
-        swing_m: Amplitude of the swing.
-        swing_rad: Phase of the swing.
-        shift_m: Constant offset to the left.
+        path: Lane centres one after another, in metres. (n, 2)
+        speed: Speed along the path in m/s.
+        start_m: Arc length at time 0, in metres.
+        swing_m: Amplitude of the swing in metres.
+        swing_rad: Phase of the swing in radians.
+        shift_m: Constant offset to the left in metres.
     """
 
     path: Array
@@ -52,22 +54,23 @@ class Drive:
     shift_m: float = 0.0
 
     def __post_init__(self) -> None:
-        """Prepare the path's tables: plain lists, since ``pose`` reads single entries."""
+        """Tabulate the path as plain lists, from which ``pose`` reads single entries."""
         lengths = arc_lengths(self.path)
         rows = np.column_stack([self.path, tangents(self.path)])
         object.__setattr__(self, "_lengths", lengths.tolist())
         object.__setattr__(self, "_rows", rows.tolist())
 
     def pose(self, time_s: float) -> tuple[float, float, float]:
-        """x, y and heading at a time."""
+        """Position x, y in metres and heading in radians at a time in seconds."""
         lengths: list[float] = self._lengths  # type: ignore[attr-defined]
         rows: list[list[float]] = self._rows  # type: ignore[attr-defined]
         at = min(max(self.start_m + self.speed * time_s, 0.0), lengths[-1])
         i = min(max(bisect_right(lengths, at) - 1, 0), len(lengths) - 2)
         share = (at - lengths[i]) / (lengths[i + 1] - lengths[i])
-        x, y, dx, dy = (a + share * (b - a) for a, b in zip(rows[i], rows[i + 1], strict=True))
+        x, y, dx, dy = [a + share * (b - a) for a, b in zip(rows[i], rows[i + 1], strict=True)]
         norm = math.hypot(dx, dy)
-        dx, dy = dx / norm, dy / norm
+        dx = dx / norm
+        dy = dy / norm
         phase = self.swing_rad + at / SWING_M
         side = self.shift_m + self.swing_m * math.sin(phase)
         slope = self.swing_m * math.cos(phase) / SWING_M
@@ -75,15 +78,27 @@ class Drive:
 
 
 def follow_lanes(town: Town, first: Lane, length_m: float, rng: np.random.Generator) -> Array:
-    """A path that starts at the head of a lane and turns at random at junctions. (n, 2)"""
-    pieces, total, lane = [first.center], float(arc_lengths(first.center)[-1]), first
+    """Follow lanes from the head of a lane, with random turns at junctions.
+
+    Args:
+        town: The town.
+        first: First lane.
+        length_m: Least length of the path in metres, unless the lanes end before.
+        rng: Source of the turns.
+
+    Returns:
+        Path of equally spaced points in metres. (n, 2)
+    """
+    lane = first
+    pieces = [first.center]
+    total = float(arc_lengths(first.center)[-1])
     while total < length_m and town.connectors.get(lane.key):
         options = town.connectors[lane.key]
-        choice = options[int(rng.integers(len(options)))]
-        pieces += [choice.center[1:-1], choice.target.center]
-        total += sum(float(arc_lengths(p)[-1]) for p in (choice.center, choice.target.center))
-        lane = choice.target
-    return resample(np.concatenate(pieces), 1.5)
+        connector = options[int(rng.integers(len(options)))]
+        lane = connector.target
+        pieces += [connector.center[1:-1], lane.center]
+        total += float(arc_lengths(connector.center)[-1]) + float(arc_lengths(lane.center)[-1])
+    return resample(np.concatenate(pieces), spacing_m=1.5)
 
 
 def plan_ego(town: Town, scene: int, duration_s: float, rng: np.random.Generator) -> Drive:
@@ -94,28 +109,35 @@ def plan_ego(town: Town, scene: int, duration_s: float, rng: np.random.Generator
     Args:
         town: The town.
         scene: Number of the scene in its town.
-        duration_s: Length of the scene in seconds.
-        rng: Draws lane, speed and start.
+        duration_s: Duration of the scene in seconds.
+        rng: Source of lane, speed and start.
+
+    Returns:
+        A drive that lasts for the scene.
+
+    Raises:
+        RuntimeError: If the town has no path of sufficient length.
     """
     order = np.random.default_rng(len(town.roads)).permutation(len(town.roads))
     for attempt in range(60):
         road = town.roads[int(order[(scene + attempt * 7) % len(order)])]
         lanes = road.lanes()
         lane = lanes[int(rng.integers(len(lanes)))]
-        speed = float(rng.uniform(5.0, 13.0))
-        needed = speed * duration_s + 8.0
+        speed = float(rng.uniform(low=5.0, high=13.0))
+        length = speed * duration_s + 8.0
         lane_m = float(arc_lengths(lane.center)[-1])
         latest = max(lane_m - 6.0, 0.0)
-        start = float(
-            rng.uniform(max(0.0, latest - needed - 10.0), latest)
-            if rng.random() < 0.6
-            else rng.uniform(0, latest)
-        )
-        path = follow_lanes(town, lane, start + needed, rng)
-        if arc_lengths(path)[-1] >= start + needed - 4.0:
-            swing = float(rng.uniform(0.0, 0.55))
+        earliest = max(0.0, latest - length - 10.0) if rng.random() < 0.6 else 0.0
+        start = float(rng.uniform(low=earliest, high=latest))
+        path = follow_lanes(town, lane, length_m=start + length, rng=rng)
+        if arc_lengths(path)[-1] >= start + length - 4.0:
             return Drive(
-                path, speed, start, swing, float(rng.uniform(0, 6.28)), float(rng.normal(0, 0.2))
+                path=path,
+                speed=speed,
+                start_m=start,
+                swing_m=float(rng.uniform(low=0.0, high=0.55)),
+                swing_rad=float(rng.uniform(low=0, high=6.28)),
+                shift_m=float(rng.normal(loc=0, scale=0.2)),
             )
     raise RuntimeError(
         f"town {town.name} has no drive of {duration_s} s: please report this with the seed."
@@ -124,149 +146,203 @@ def plan_ego(town: Town, scene: int, duration_s: float, rng: np.random.Generator
 
 @dataclass(frozen=True)
 class Actor:
-    """A vehicle or person and how it moves.
+    """Vehicle or person of a scene.
 
     Attributes:
-        model: What it is; position and heading are ignored where ``drive`` is set.
-        drive: Its path, None for what stands still.
+        model: Kind, size and paint; position and heading count only where ``drive`` is None.
+        drive: Motion, None for vehicles and people at rest.
     """
 
     model: Vehicle
     drive: Drive | None
 
     def at(self, time_s: float) -> Vehicle:
-        """The actor at a time."""
+        """Vehicle or person at a time in seconds."""
         if self.drive is None:
             return self.model
         x, y, yaw = self.drive.pose(time_s)
-        m = self.model
-        center = np.array([x, y, m.size[2] / 2])
-        return Vehicle(m.category, center, yaw, m.size, m.color, m.identity, self.drive.speed)
+        center = np.array([x, y, self.model.size[2] / 2])
+        return replace(self.model, center=center, yaw_rad=yaw, speed=self.drive.speed)
 
 
-def _model(rng: np.random.Generator, identity: str, only_cars: bool = False) -> Vehicle:
-    kind = 0 if only_cars else int(rng.choice(len(KINDS), p=[k[2] for k in KINDS]))
-    category, size, _ = KINDS[kind]
-    scale = float(rng.uniform(0.93, 1.07))
-    size = (round(size[0] * scale, 3), round(size[1] * scale, 3), round(size[2] * scale, 3))
+def _random_vehicle(rng: np.random.Generator, identity: str, only_cars: bool = False) -> Vehicle:
+    """Draw kind, size and paint of a vehicle at the origin."""
+    kind = CAR_KIND
+    if not only_cars:
+        kind = int(rng.choice(len(KINDS), p=[share for _, _, share in KINDS]))
+    category, (length, width, height), _ = KINDS[kind]
+    scale = float(rng.uniform(low=0.93, high=1.07))
+    size = (round(length * scale, 3), round(width * scale, 3), round(height * scale, 3))
     color = PAINTS[int(rng.integers(len(PAINTS)))]
-    return Vehicle(category, np.zeros(3), 0.0, size, color, identity)
-
-
-def _stand(model: Vehicle, x: float, y: float, yaw: float) -> Actor:
-    center = np.array([x, y, model.size[2] / 2])
-    return Actor(
-        Vehicle(model.category, center, yaw, model.size, model.color, model.identity), None
+    return Vehicle(
+        category, center=np.zeros(3), yaw_rad=0.0, size=size, color=color, identity=identity
     )
 
 
+def _actor_at_rest(model: Vehicle, position: Array, yaw: float) -> Actor:
+    """Actor that stands on the ground at a position (2,) in metres."""
+    center = np.append(position, model.size[2] / 2)
+    return Actor(replace(model, center=center, yaw_rad=yaw), drive=None)
+
+
 def make_actors(town: Town, ego: Drive, duration_s: float, rng: np.random.Generator) -> list[Actor]:
-    """Make the traffic around the ego vehicle's drive; nobody touches it or one another.
+    """Make the traffic around the ego vehicle's drive, with gaps between all road users.
 
     Args:
         town: The town.
         ego: The ego vehicle's drive.
-        duration_s: Length of the scene in seconds.
-        rng: Draws who is there.
+        duration_s: Duration of the scene in seconds.
+        rng: Source of all random choices.
+
+    Returns:
+        Moving vehicles, parked vehicles and people.
     """
-    times = np.linspace(0.0, duration_s, 8).tolist()
+    times = np.linspace(0.0, duration_s, num=8).tolist()
     ego_track = np.array([ego.pose(t)[:2] for t in times])
-    density = float(rng.uniform(0.25, 1.0))
-    candidates = _moving(town, ego_track, density, rng) + _parked(town, ego_track, density, rng)
-    candidates += _people(town, ego_track, rng)
-    kept: list[Actor] = []
+    density = float(rng.uniform(low=0.25, high=1.0))
+    candidates = [
+        *_moving_vehicles(town, ego_track, density=density, rng=rng),
+        *_parked_vehicles(town, ego_track, density=density, rng=rng),
+        *_people(town, ego_track, rng=rng),
+    ]
+    actors: list[Actor] = []
     tracks: list[NDArray[np.float64]] = []
     for actor in candidates:
         track = np.array([actor.at(t).center[:2] for t in times])
-        to_ego, to_others = _room(actor)
-        if all(
-            np.linalg.norm(track - other, axis=1).min() >= gap
-            for other, gap in [(ego_track, to_ego), *((t, to_others) for t in tracks)]
-        ):
-            kept.append(actor)
-            tracks.append(track)
-    return kept
-
-
-def _room(actor: Actor) -> tuple[float, float]:
-    """Least distance in metres that an actor keeps from the ego vehicle and from the others."""
-    if actor.model.category.startswith("human"):
-        return 2.5, 0.7
-    half = actor.model.size[0] / 2
-    # What is parked may stand beside the ego vehicle; what moves may come at it lengthwise.
-    to_ego = 2.8 + 0.35 * half if actor.drive is None else 3.6 + half
-    return to_ego, 1.2 + 0.6 * half
-
-
-def _near(points: Array, track: Array, reach_m: float) -> bool:
-    return bool(np.linalg.norm(points[:, None] - track[None], axis=-1).min() < reach_m)
-
-
-def _moving(town: Town, track: Array, density: float, rng: np.random.Generator) -> list[Actor]:
-    actors: list[Actor] = []
-    for lane in town.lanes.values():
-        if not _near(lane.center[::6], track, REACH_M):
+        ego_gap, actor_gap = _least_gaps(actor)
+        if _least_distance(track, ego_track) < ego_gap:
             continue
-        at = float(rng.uniform(0, 40))
-        lane_m = float(arc_lengths(lane.center)[-1])
-        speed = float(rng.choice([0.0, rng.uniform(4, 12)], p=[0.25, 0.75]))
-        while at < lane_m:
-            path = follow_lanes(town, lane, at + speed * 20, rng)
-            drive = Drive(path, speed, at, 0.1, float(rng.uniform(0, 6)), float(rng.normal(0, 0.1)))
-            actors.append(Actor(_model(rng, f"m{len(actors)}"), drive))
-            at += float(rng.uniform(12, 60)) / density
+        if any(_least_distance(track, other) < actor_gap for other in tracks):
+            continue
+        actors.append(actor)
+        tracks.append(track)
     return actors
 
 
-def _parked(town: Town, track: Array, density: float, rng: np.random.Generator) -> list[Actor]:
+def _least_distance(track: Array, other: Array) -> float:
+    """Least distance in metres between two tracks (T, 2) of equal times."""
+    return np.linalg.norm(track - other, axis=1).min()
+
+
+def _least_gaps(actor: Actor) -> tuple[float, float]:
+    """Least distance in metres from an actor to the ego vehicle, and to the other actors."""
+    if actor.model.category.startswith("human"):
+        return 2.5, 0.7
+    half = actor.model.size[0] / 2
+    # A parked vehicle may stand beside the ego vehicle; a moving one may approach it lengthwise.
+    ego_gap = 2.8 + 0.35 * half if actor.drive is None else 3.6 + half
+    return ego_gap, 1.2 + 0.6 * half
+
+
+def _is_near(points: Array, track: Array) -> bool:
+    """Whether any point (n, 2) lies within ``REACH_M`` of a track (T, 2), in metres."""
+    distances = np.linalg.norm(points[:, None] - track[None], axis=-1)
+    return bool(distances.min() < REACH_M)
+
+
+def _moving_vehicles(
+    town: Town, track: Array, density: float, rng: np.random.Generator
+) -> list[Actor]:
+    """Vehicles on the lanes near a track.
+
+    Args:
+        town: The town.
+        track: Positions of the ego vehicle in metres. (T, 2)
+        density: Number of vehicles relative to dense traffic, in (0, 1].
+        rng: Source of all random choices.
+    """
+    actors: list[Actor] = []
+    for lane in town.lanes.values():
+        if not _is_near(lane.center[::6], track):
+            continue
+        at = float(rng.uniform(low=0, high=40))
+        lane_m = float(arc_lengths(lane.center)[-1])
+        driving_speed = rng.uniform(low=4, high=12)
+        speed = float(rng.choice([0.0, driving_speed], p=[0.25, 0.75]))
+        while at < lane_m:
+            drive = Drive(
+                path=follow_lanes(town, lane, length_m=at + speed * 20, rng=rng),
+                speed=speed,
+                start_m=at,
+                swing_m=0.1,
+                swing_rad=float(rng.uniform(low=0, high=6)),
+                shift_m=float(rng.normal(loc=0, scale=0.1)),
+            )
+            actors.append(Actor(_random_vehicle(rng, f"m{len(actors)}"), drive=drive))
+            at += float(rng.uniform(low=12, high=60)) / density
+    return actors
+
+
+def _parked_vehicles(
+    town: Town, track: Array, density: float, rng: np.random.Generator
+) -> list[Actor]:
+    """Cars on wide shoulders and in car parks near a track.
+
+    Args:
+        town: The town.
+        track: Positions of the ego vehicle in metres. (T, 2)
+        density: Share of the places in use relative to dense traffic, in (0, 1].
+        rng: Source of all random choices.
+    """
     actors: list[Actor] = []
     for road in town.roads:
         section = road.section
-        if not _near(road.center[::6], track, REACH_M):
+        if not _is_near(road.center[::6], track):
             continue
-        for offset, width, turned in (
+        left_turn = np.pi if section.backward else 0.0
+        for offset, width, turn in (
             (section.right_m + 1.15, section.right_shoulder_m, 0.0),
-            (section.left_m - 1.15, section.left_shoulder_m, np.pi if section.backward else 0.0),
+            (section.left_m - 1.15, section.left_shoulder_m, left_turn),
         ):
-            at = float(rng.uniform(4, 12))
+            at = float(rng.uniform(low=4, high=12))
             while width > 2 and at < road.length_m - 12:
                 if rng.random() < 0.55 * density + 0.15:
-                    x, y = road.point(at, offset)
-                    actors.append(
-                        _stand(
-                            _model(rng, f"p{len(actors)}", True), x, y, road.direction(at) + turned
-                        )
-                    )
+                    car = _random_vehicle(rng, f"p{len(actors)}", only_cars=True)
+                    yaw = road.direction(at) + turn
+                    actors.append(_actor_at_rest(car, road.point(at, offset), yaw=yaw))
                 at += 6.2
     for park in town.carparks:
-        if _near(park.slots[:, :2], track, REACH_M):
-            for x, y, yaw in park.slots:
-                if rng.random() < 0.65:
-                    actors.append(_stand(_model(rng, f"p{len(actors)}", True), x, y, yaw))
+        if not _is_near(park.slots[:, :2], track):
+            continue
+        for slot in park.slots:
+            if rng.random() < 0.65:
+                car = _random_vehicle(rng, f"p{len(actors)}", only_cars=True)
+                actors.append(_actor_at_rest(car, slot[:2], yaw=slot[2]))
     return actors
 
 
 def _people(town: Town, track: Array, rng: np.random.Generator) -> list[Actor]:
+    """People on the pavements and crossings near a track (T, 2) in metres."""
     actors: list[Actor] = []
     for road in town.roads:
-        if not _near(road.center[::6], track, REACH_M):
+        if not _is_near(road.center[::6], track):
             continue
-        section = road.section
-        spots = []
-        for _ in range(int(road.length_m / 18)):
-            side = section.right_m - 1.2 if rng.random() < 0.5 else section.left_m + 1.2
-            spots.append((float(rng.uniform(0, road.length_m)), side))
-        for a, b in road.crossings:
-            if rng.random() < 0.4:
-                spots.append(
-                    (float(rng.uniform(a, b)), float(rng.uniform(section.right_m, section.left_m)))
-                )
-        for at, offset in spots:
-            x, y = road.point(at, offset)
-            size = (0.5, 0.6, round(float(rng.uniform(1.5, 1.9)), 3))
-            color = PAINTS[int(rng.integers(len(PAINTS)))]
-            model = Vehicle(
-                "human.pedestrian.adult", np.zeros(3), 0.0, size, color, f"w{len(actors)}"
+        for at, offset in _people_spots(road, rng):
+            height = round(float(rng.uniform(low=1.5, high=1.9)), 3)
+            person = Vehicle(
+                category="human.pedestrian.adult",
+                center=np.zeros(3),
+                yaw_rad=0.0,
+                size=(0.5, 0.6, height),
+                color=PAINTS[int(rng.integers(len(PAINTS)))],
+                identity=f"w{len(actors)}",
             )
-            actors.append(_stand(model, x, y, float(rng.uniform(0, 6.28))))
+            yaw = float(rng.uniform(low=0, high=6.28))
+            actors.append(_actor_at_rest(person, road.point(at, offset), yaw=yaw))
     return actors
+
+
+def _people_spots(road: Road, rng: np.random.Generator) -> list[tuple[float, float]]:
+    """Arc lengths and offsets of people beside a road and on its crossings, in metres."""
+    section = road.section
+    spots = []
+    for _ in range(int(road.length_m / 18)):
+        offset = section.right_m - 1.2 if rng.random() < 0.5 else section.left_m + 1.2
+        at = float(rng.uniform(low=0, high=road.length_m))
+        spots.append((at, offset))
+    for start, end in road.crossings:
+        if rng.random() < 0.4:
+            at = float(rng.uniform(low=start, high=end))
+            offset = float(rng.uniform(low=section.right_m, high=section.left_m))
+            spots.append((at, offset))
+    return spots
