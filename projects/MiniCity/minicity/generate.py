@@ -1,10 +1,10 @@
-"""Generates a MiniCity data set in the nuScenes format, whole or not at all."""
+"""Generate a MiniCity data set in the nuScenes format, whole or not at all."""
 
 import json
 import logging
 import os
 import shutil
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -45,7 +45,7 @@ LOGGER = logging.getLogger(__name__)
 
 
 def plan_scenes(config: MiniCityConfig) -> list[SceneTask]:
-    """Name the scenes as the official split does and share them out among the towns."""
+    """Name the scenes after the official split and distribute them among the towns."""
     from nuscenes.utils import splits
 
     tasks: list[SceneTask] = []
@@ -55,7 +55,13 @@ def plan_scenes(config: MiniCityConfig) -> list[SceneTask]:
     ):
         for i, name in enumerate(names[:count]):
             location = locations[i % len(locations)]
-            tasks.append(SceneTask(name, len(tasks), location, i // len(locations)))
+            task = SceneTask(
+                name=name,
+                index=len(tasks),
+                location=location,
+                index_in_town=i // len(locations),
+            )
+            tasks.append(task)
     return tasks
 
 
@@ -72,29 +78,36 @@ def generate(
 ) -> bool:
     """Generate a MiniCity data set.
 
-    The same arguments give the same bytes whatever the number of workers. Files are written beside
-    ``root`` and moved there when all are complete.
+    Equal arguments give equal bytes for any number of workers. Files are written to a folder beside
+    ``root``, which is renamed to ``root`` when it is complete.
 
     Args:
-        root: Folder to make. If it holds the same data set already, nothing is done.
-        scenes: Number of scenes, training and validation together.
-        seed: Seed of every random choice.
+        root: Output folder. A folder that holds this data set already is left as it is.
+        scenes: Number of scenes, training and validation together, >= 2.
+        seed: Seed of every random choice, >= 0.
         image_size: Width and height of the pictures in pixels.
-        samples_per_scene: Key frames per scene.
-        sweeps_per_sample: LiDAR sweeps between two key frames.
+        samples_per_scene: Key frames per scene, half a second apart, in [1, 40].
+        sweeps_per_sample: LiDAR sweeps between two key frames, in [0, 9].
         val_scenes: Validation scenes among ``scenes``; None takes a fifth.
-        workers: Processes; None takes one per core, 0 or 1 works in this process.
+        workers: Number of processes; None takes one per core, 0 or 1 works in this process.
         progress: Whether to show a progress bar.
 
     Returns:
-        Whether anything was generated: False if it was there already.
+        True if the data set was generated, False if it was complete already.
 
     Raises:
-        ValueError: If an argument is out of range or ``root`` holds anything else.
+        ValueError: If an argument is out of range or ``root`` has other contents.
         RuntimeError: If another process is generating into ``root``.
     """
+    width, height = image_size
     config = MiniCityConfig(
-        scenes, seed, *image_size, samples_per_scene, sweeps_per_sample, val_scenes
+        scenes=scenes,
+        seed=seed,
+        image_width=width,
+        image_height=height,
+        samples_per_scene=samples_per_scene,
+        sweeps_per_sample=sweeps_per_sample,
+        val_scenes=val_scenes,
     )
     if workers is not None and workers < 0:
         raise ValueError(f"workers must be >= 0, got {workers}.")
@@ -103,26 +116,33 @@ def generate(
         LOGGER.info("%s is complete already: nothing to do.", root)
         return False
     with _partial_folder(root) as folder:
-        _fill(folder, config, workers, progress)
+        _fill(folder, config, workers=workers, progress=progress)
         (folder / MARKER).write_text(json.dumps(config.as_dict(), indent=2) + "\n")
         os.replace(folder, root)
     return True
 
 
 def is_complete(root: Path, config: MiniCityConfig) -> bool:
-    """Whether ``root`` holds exactly this data set.
+    """Whether ``root`` holds exactly the data set of ``config``.
+
+    Args:
+        root: Folder of the data set.
+        config: Configuration of the data set.
 
     Raises:
-        ValueError: If it holds something else.
+        ValueError: If the folder has other contents.
     """
     marker = root / MARKER
     if marker.is_file():
-        found = json.loads(marker.read_text())
-        wanted = config.as_dict()
-        if found == wanted:
+        present = json.loads(marker.read_text())
+        requested = config.as_dict()
+        if present == requested:
             return True
-        keys = sorted(k for k in {*found, *wanted} if found.get(k) != wanted.get(k))
-        differences = ", ".join(f"{k} is {found.get(k)}, asked for {wanted.get(k)}" for k in keys)
+        parts = []
+        for key in sorted({*present, *requested}):
+            if present.get(key) != requested.get(key):
+                parts.append(f"{key} is {present.get(key)}, asked for {requested.get(key)}")
+        differences = ", ".join(parts)
         raise ValueError(
             f"{root} holds another MiniCity data set ({differences}): "
             "choose another --root or remove that folder."
@@ -137,7 +157,7 @@ def is_complete(root: Path, config: MiniCityConfig) -> bool:
 
 @contextmanager
 def _partial_folder(root: Path) -> Iterator[Path]:
-    """A locked folder beside ``root`` to write into, gone afterwards unless it was renamed."""
+    """Lock a folder beside ``root`` for writing, and delete it if writing fails."""
     root.parent.mkdir(parents=True, exist_ok=True)
     partial = root.with_name(f"{root.name}{SUFFIX}")
     require_no_link(partial)
@@ -152,8 +172,10 @@ def _partial_folder(root: Path) -> Iterator[Path]:
             )
         try:
             for leftover in partial.iterdir():
-                folder = leftover.is_dir() and not leftover.is_symlink()
-                shutil.rmtree(leftover) if folder else leftover.unlink()
+                if leftover.is_dir() and not leftover.is_symlink():
+                    shutil.rmtree(leftover)
+                else:
+                    leftover.unlink()
             yield partial
         except BaseException:
             shutil.rmtree(partial, ignore_errors=True)
@@ -164,30 +186,33 @@ def _partial_folder(root: Path) -> Iterator[Path]:
 
 def _fill(root: Path, config: MiniCityConfig, workers: int | None, progress: bool) -> None:
     """Write every file of a data set but its marker."""
-    for channel in (*(m.channel for m in CAMERAS), "LIDAR_TOP"):
-        (root / "samples" / channel).mkdir(parents=True)
+    for mount in CAMERAS:
+        (root / "samples" / mount.channel).mkdir(parents=True)
+    (root / "samples" / "LIDAR_TOP").mkdir()
     (root / "sweeps" / "LIDAR_TOP").mkdir(parents=True)
     (root / "can_bus").mkdir()
     tasks = plan_scenes(config)
-    towns = {
-        name: make_town(name, config.seed, sum(t.location == name for t in tasks))
-        for name in (*TRAIN_LOCATIONS, *VAL_LOCATIONS)
-    }
-    masks = {name: write_map(root, town, config.seed) for name, town in towns.items()}
-    by_scene = _run_scenes(root, config, tasks, towns, workers, progress)
+    scene_counts = Counter(task.location for task in tasks)
+    towns = {}
+    for name in (*TRAIN_LOCATIONS, *VAL_LOCATIONS):
+        towns[name] = make_town(name, config.seed, num_scenes=scene_counts[name])
+    masks = {name: write_map(root, town, seed=config.seed) for name, town in towns.items()}
+    records_by_scene = _run_scenes(
+        root, config, tasks=tasks, towns=towns, workers=workers, progress=progress
+    )
     tables: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for task in tasks:
-        for table, rows in by_scene[task.name].items():
+        for table, rows in records_by_scene[task.name].items():
             tables[table] += rows
     _add_fixed_tables(tables, config)
-    places = {log["token"]: log["location"] for log in tables["log"]}
     for name, filename in masks.items():
+        log_tokens = [log["token"] for log in tables["log"] if log["location"] == name]
         tables["map"].append(
             {
                 "token": make_token(config.seed, "map", name),
                 "category": "semantic_prior",
                 "filename": filename,
-                "log_tokens": [token for token, place in places.items() if place == name],
+                "log_tokens": log_tokens,
             }
         )
     folder = root / VERSION
@@ -197,7 +222,7 @@ def _fill(root: Path, config: MiniCityConfig, workers: int | None, progress: boo
 
 
 def _add_fixed_tables(tables: dict[str, list[dict[str, Any]]], config: MiniCityConfig) -> None:
-    """The tables that are the same for all scenes."""
+    """Add the tables that do not depend on the scenes, in place."""
     for table, names in (("category", CATEGORIES), ("attribute", ATTRIBUTES)):
         for name in names:
             token = make_token(table, name)
@@ -226,10 +251,11 @@ def _add_fixed_tables(tables: dict[str, list[dict[str, Any]]], config: MiniCityC
 def _make_scene(
     root: Path, config: MiniCityConfig, towns: dict[str, Town], task: SceneTask
 ) -> Records:
-    """Make a scene in one process."""
-    if parent_process() is not None:  # one of many processes, each of one thread
+    """Make a scene in this process."""
+    if parent_process() is not None:  # one of several workers, each of one thread
         cv2.setNumThreads(1)
-    return SceneMaker(config, task, towns[task.location], root).make()
+    maker = SceneMaker(config, task, town=towns[task.location], root=root)
+    return maker.make()
 
 
 def _run_scenes(
@@ -240,16 +266,19 @@ def _run_scenes(
     workers: int | None,
     progress: bool,
 ) -> dict[str, Records]:
-    """Make all scenes, each in one process, and return their records by scene name."""
+    """Make all scenes in worker processes.
+
+    Returns:
+        Records of each scene by table, by scene name.
+    """
     workers = min(default_workers() if workers is None else max(workers, 1), len(tasks))
     make = partial(_make_scene, root, config, towns)
     results = ordered_map(make, tasks, workers, timeout_s=7200.0)
-    per_scene = len(CAMERAS) * config.samples_per_scene
-    done: dict[str, Records] = {}
-    with Progress(
-        total=per_scene * len(tasks), unit="images", desc="MiniCity", disable=not progress
-    ) as bar:
+    images_per_scene = len(CAMERAS) * config.samples_per_scene
+    num_images = images_per_scene * len(tasks)
+    records_by_scene: dict[str, Records] = {}
+    with Progress(total=num_images, unit="images", desc="MiniCity", disable=not progress) as bar:
         for task, records in zip(tasks, results, strict=True):
-            done[task.name] = records
-            bar.update(per_scene)
-    return done
+            records_by_scene[task.name] = records
+            bar.update(images_per_scene)
+    return records_by_scene

@@ -1,4 +1,4 @@
-"""One scene of MiniCity: drives it, takes its pictures and sweeps, and writes its records."""
+"""One scene of MiniCity: its drive, pictures, sweeps and records."""
 
 import json
 import math
@@ -44,12 +44,12 @@ Records = dict[str, list[dict[str, Any]]]
 
 @dataclass(frozen=True)
 class SceneTask:
-    """What a worker needs to know to make a scene.
+    """Description of a scene to make.
 
     Attributes:
-        name: Official nuScenes scene name, which decides its split.
+        name: Official nuScenes scene name, which decides the split.
         index: Number of the scene in the data set.
-        location: Town in which it is driven.
+        location: Name of the town.
         index_in_town: Number of the scene within its town.
     """
 
@@ -60,89 +60,115 @@ class SceneTask:
 
 
 class SceneMaker:
-    """Makes one scene.
+    """Maker of one scene.
 
     Args:
-        config: The data set's configuration.
-        task: Which scene.
-        town: Its town.
-        root: Folder that the files go to.
+        config: Configuration of the data set.
+        task: The scene.
+        town: Town of the scene.
+        root: Folder of the data set.
     """
 
     def __init__(self, config: MiniCityConfig, task: SceneTask, town: Town, root: Path) -> None:
-        self.config, self.task, self.town, self.root = config, task, town, root
+        self.config = config
+        self.task = task
+        self.town = town
+        self.root = root
         self.records: Records = defaultdict(list)
         self.duration_s = SAMPLE_PERIOD_S * (config.samples_per_scene - 1)
-        self.ego: Drive = plan_ego(town, task.index_in_town, self.duration_s, self._rng("ego"))
+        self.samples = [self._token("sample", k) for k in range(config.samples_per_scene)]
+        self.ego: Drive = plan_ego(
+            town, task.index_in_town, duration_s=self.duration_s, rng=self._rng("ego")
+        )
         self.lighting: Lighting = random_lighting(self._rng("light"))
         self.actors: list[Actor] = make_actors(
-            town, self.ego, self.duration_s, self._rng("traffic")
+            town, self.ego, duration_s=self.duration_s, rng=self._rng("traffic")
         )
         self.renderer = self._make_renderer()
-        footprints = [b.footprint for b in town.buildings]
-        self.walls = footprint_array(footprints, [b.height_m for b in town.buildings])
-        self.tilt_rad = self._rng("tilt").uniform(0, 2 * np.pi, 2)
+        self.walls = footprint_array(
+            footprints=[building.footprint for building in town.buildings],
+            heights=[building.height_m for building in town.buildings],
+        )
+        self.tilt_rad = self._rng("tilt").uniform(low=0, high=2 * np.pi, size=2)
 
     def _rng(self, *parts: object) -> np.random.Generator:
+        """Random generator for a part of the scene."""
         return make_rng(self.config.seed, self.task.name, *parts)
 
     def _token(self, *parts: object) -> str:
+        """Token of a record of the scene."""
         return make_token(self.config.seed, self.task.name, *parts)
 
     def _add(self, table: str, **record: Any) -> None:
         self.records[table].append(record)
 
     def _make_renderer(self) -> SceneRenderer:
-        times = np.linspace(-0.1, self.duration_s, 12)
-        track = np.array([self.ego.pose(float(t))[:2] for t in times])
-        low, high = track.min(0) - GROUND_MARGIN_M, track.max(0) + GROUND_MARGIN_M
-        bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-        resolution = float(np.clip(0.0625 * 800 / self.config.image_width, 0.05, 0.09))
-        mesh, shadows = _surroundings(self.town, track, self.lighting)
-        scene_map = make_scene_map(self.town, bounds)
+        """Lay out the ground and the objects around the drive."""
+        times = np.linspace(-0.1, self.duration_s, num=12).tolist()
+        track = np.array([self.ego.pose(t)[:2] for t in times])
+        xmin, ymin = (track.min(axis=0) - GROUND_MARGIN_M).tolist()
+        xmax, ymax = (track.max(axis=0) + GROUND_MARGIN_M).tolist()
+        bounds = (xmin, ymin, xmax, ymax)
+        mesh, shadows = _make_surroundings(self.town, track, lighting=self.lighting)
         return SceneRenderer(
-            scene_map, bounds, self.lighting, resolution, self._rng("ground"), mesh, shadows
+            make_scene_map(self.town, bounds),
+            bounds=bounds,
+            lighting=self.lighting,
+            resolution_m=float(np.clip(0.0625 * 800 / self.config.image_width, 0.05, 0.09)),
+            rng=self._rng("ground"),
+            static=mesh,
+            shadows=shadows,
         )
 
     def ego_pose(self, time_s: float) -> Array:
-        """Pose of the car, nodding and rolling a little. (4, 4)"""
+        """Pose of the car at a time in seconds, with slight pitch and roll. (4, 4)"""
+        x, y, yaw = self.ego.pose(time_s)
         pitch = 0.004 * np.sin(2.1 * time_s + self.tilt_rad[0])
         roll = 0.003 * np.sin(1.3 * time_s + self.tilt_rad[1])
-        return world_from_ego(*self.ego.pose(time_s), float(pitch), float(roll))
+        return world_from_ego(x, y, yaw=yaw, pitch=float(pitch), roll=float(roll))
 
     def make(self) -> Records:
-        """Write all files of the scene and return its records by table."""
-        samples = [self._token("sample", k) for k in range(self.config.samples_per_scene)]
-        self._add_scene(samples)
-        for k, token in enumerate(samples):
+        """Write all files of the scene.
+
+        Returns:
+            Records of the scene by table.
+
+        Raises:
+            OSError: If a file cannot be written.
+        """
+        self._add_scene()
+        last = len(self.samples) - 1
+        for k, token in enumerate(self.samples):
             time_s = k * SAMPLE_PERIOD_S
             self._add(
                 "sample",
                 token=token,
                 timestamp=self.timestamp_us(time_s),
-                prev=samples[k - 1] if k else "",
-                next=samples[k + 1] if k + 1 < len(samples) else "",
+                prev=self.samples[k - 1] if k > 0 else "",
+                next=self.samples[k + 1] if k < last else "",
                 scene_token=self._token("scene"),
             )
             for mount in CAMERAS:
-                self._take_picture(k, mount, samples)
-            cloud = self._sweep(k, 0, samples)
-            self._annotate(k, token, cloud)
-            if k + 1 < len(samples):
+                self._take_picture(k, mount)
+            cloud = self._sweep(k, 0)
+            self._annotate(k, cloud)
+            if k < last:
                 for j in range(1, self.config.sweeps_per_sample + 1):
-                    self._sweep(k, j, samples)
+                    self._sweep(k, j)
         self._link_lidar()
         self._link_annotations()
-        messages = pose_messages(self.ego_pose, self.timestamp_us(0.0), self.duration_s)
+        start_us = self.timestamp_us(0.0)
+        messages = pose_messages(self.ego_pose, start_us, duration_s=self.duration_s)
         path = self.root / "can_bus" / f"{self.task.name}_pose.json"
         path.write_text(json.dumps(messages))
         return dict(self.records)
 
     def timestamp_us(self, time_s: float) -> int:
-        """Time since the scene's start as a nuScenes timestamp."""
+        """Timestamp of nuScenes, in microseconds, of a time in seconds since the scene's start."""
         return FIRST_TIMESTAMP_US + self.task.index * 60_000_000 + round(time_s * 1e6)
 
-    def _add_scene(self, samples: list[str]) -> None:
+    def _add_scene(self) -> None:
+        """Add the log and scene records."""
         self._add(
             "log",
             token=self._token("log"),
@@ -155,19 +181,25 @@ class SceneMaker:
             "scene",
             token=self._token("scene"),
             log_token=self._token("log"),
-            nbr_samples=len(samples),
-            first_sample_token=samples[0],
-            last_sample_token=samples[-1],
+            nbr_samples=len(self.samples),
+            first_sample_token=self.samples[0],
+            last_sample_token=self.samples[-1],
             name=self.task.name,
             description=f"MiniCity, {self.lighting.weather}",
         )
 
     def _add_data(self, channel: str, time_s: float, **data: Any) -> None:
-        """Add a sample_data record and the ego pose of its moment."""
-        pose, token, timestamp = self.ego_pose(time_s), data["token"], self.timestamp_us(time_s)
-        rotation, translation = quaternion(pose), pose[:3, 3].tolist()
-        moment = {"token": token, "timestamp": timestamp}
-        self._add("ego_pose", **moment, rotation=rotation, translation=translation)
+        """Add a ``sample_data`` record and the ego pose at its time, under one token."""
+        pose = self.ego_pose(time_s)
+        token = data["token"]
+        timestamp = self.timestamp_us(time_s)
+        self._add(
+            "ego_pose",
+            token=token,
+            timestamp=timestamp,
+            rotation=quaternion(pose),
+            translation=pose[:3, 3].tolist(),
+        )
         self._add(
             "sample_data",
             **data,
@@ -176,52 +208,60 @@ class SceneMaker:
             timestamp=timestamp,
         )
 
-    def _take_picture(self, k: int, mount: CameraMount, samples: list[str]) -> None:
+    def _take_picture(self, k: int, mount: CameraMount) -> None:
+        """Render and write a picture of key frame ``k``."""
         channel = mount.channel
         time_s = k * SAMPLE_PERIOD_S + mount.delay_ms * 1e-3
-        width, height = self.config.image_width, self.config.image_height
-        camera = mounted_camera(mount, width, height, self.ego_pose(time_s))
+        width = self.config.image_width
+        height = self.config.image_height
+        camera = mounted_camera(mount, width, height=height, ego_pose=self.ego_pose(time_s))
         vehicles = [actor.at(time_s) for actor in self.actors]
-        image = self.renderer.render_camera(camera, vehicles, self._rng("picture", k, channel))
+        rng = self._rng("picture", k, channel)
+        image = self.renderer.render_camera(camera, vehicles, rng=rng)
         name = f"samples/{channel}/{self._stem(channel, time_s)}.jpg"
         parameters = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
-        if not cv2.imwrite(str(self.root / name), image, parameters):
+        if not cv2.imwrite(str(self.root / name), image, params=parameters):
             raise OSError(f"could not write {self.root / name}: is the disk full?")
+        last = len(self.samples) - 1
         self._add_data(
             channel,
             time_s,
             token=self._token("data", channel, k),
-            sample_token=samples[k],
+            sample_token=self.samples[k],
             fileformat="jpg",
             is_key_frame=True,
             height=height,
             width=width,
             filename=name,
-            prev=self._token("data", channel, k - 1) if k else "",
-            next=self._token("data", channel, k + 1) if k + 1 < len(samples) else "",
+            prev=self._token("data", channel, k - 1) if k > 0 else "",
+            next=self._token("data", channel, k + 1) if k < last else "",
         )
 
     def _stem(self, channel: str, time_s: float) -> str:
+        """File name of a sensor's data, without the suffix."""
         return f"minicity-{self.task.name}__{channel}__{self.timestamp_us(time_s)}"
 
-    def _sweep(self, k: int, j: int, samples: list[str]) -> NDArray[np.float32]:
-        """Write sweep ``j`` after key frame ``k``; number 0 is the key frame's own. (N, 5)"""
+    def _sweep(self, k: int, j: int) -> NDArray[np.float32]:
+        """Simulate and write sweep ``j`` after key frame ``k``; sweep 0 is the key frame. (N, 5)"""
         time_s = (k + j / (self.config.sweeps_per_sample + 1)) * SAMPLE_PERIOD_S
-        boxes = np.concatenate(
-            [vehicle_footprints([a.at(time_s) for a in self.actors]), self.walls]
+        vehicles = vehicle_footprints([actor.at(time_s) for actor in self.actors])
+        cloud = scan(
+            world_from_lidar=self.ego_pose(time_s) @ ego_from_lidar(),
+            texture=self.renderer.texture,
+            boxes=np.concatenate([vehicles, self.walls]),
+            rng=self._rng("sweep", k, j),
         )
-        pose = self.ego_pose(time_s) @ ego_from_lidar()
-        cloud = scan(pose, self.renderer.texture, boxes, self._rng("sweep", k, j))
-        folder = "samples" if j == 0 else "sweeps"
+        is_key_frame = j == 0
+        folder = "samples" if is_key_frame else "sweeps"
         name = f"{folder}/LIDAR_TOP/{self._stem('LIDAR_TOP', time_s)}.pcd.bin"
         cloud.tofile(self.root / name)
         self._add_data(
             "LIDAR_TOP",
             time_s,
             token=self._token("data", "LIDAR_TOP", k, j),
-            sample_token=samples[k if j == 0 else k + 1],
+            sample_token=self.samples[k if is_key_frame else k + 1],
             fileformat="pcd",
-            is_key_frame=j == 0,
+            is_key_frame=is_key_frame,
             height=0,
             width=0,
             filename=name,
@@ -231,51 +271,49 @@ class SceneMaker:
         return cloud
 
     def _link_lidar(self) -> None:
+        """Chain the LiDAR records by time."""
         sweeps = [d for d in self.records["sample_data"] if "LIDAR_TOP" in d["filename"]]
         sweeps.sort(key=lambda d: d["timestamp"])
-        for before, after in pairwise(sweeps):
-            before["next"], after["prev"] = after["token"], before["token"]
+        _chain(sweeps)
 
-    def _annotate(self, k: int, sample: str, cloud: NDArray[np.float32]) -> None:
+    def _annotate(self, k: int, cloud: NDArray[np.float32]) -> None:
+        """Add a box for each vehicle and person with LiDAR points in key frame ``k``. (N, 5)"""
         time_s = k * SAMPLE_PERIOD_S
         pose = self.ego_pose(time_s) @ ego_from_lidar()
         points = cloud[:, :3] @ pose[:3, :3].T + pose[:3, 3]
-        for vehicle in (actor.at(time_s) for actor in self.actors):
+        for actor in self.actors:
+            vehicle = actor.at(time_s)
             if np.linalg.norm(vehicle.center[:2] - pose[:2, 3]) > BOX_REACH_M:
                 continue
-            struck = _points_in_box(points, vehicle)
-            if not struck:
+            num_points = _points_in_box(points, vehicle)
+            if num_points == 0:
                 continue
             length, width, height = vehicle.size
             half_turn = vehicle.yaw_rad / 2
-            person = vehicle.category.startswith("human")
-            state = "standing" if person else ("moving" if vehicle.speed > 0 else "parked")
-            attribute = f"{'pedestrian' if person else 'vehicle'}.{state}"
             self._add(
                 "sample_annotation",
                 token=self._token("annotation", vehicle.identity, k),
-                sample_token=sample,
+                sample_token=self.samples[k],
                 instance_token=self._token("instance", vehicle.identity),
                 visibility_token="4",
-                attribute_tokens=[make_token("attribute", attribute)],
+                attribute_tokens=[make_token("attribute", _attribute(vehicle))],
                 translation=vehicle.center.tolist(),
                 size=[width, length, height],
                 rotation=[math.cos(half_turn), 0.0, 0.0, math.sin(half_turn)],
                 prev="",
                 next="",
-                num_lidar_pts=struck,
+                num_lidar_pts=num_points,
                 num_radar_pts=0,
                 category=vehicle.category,
             )
 
     def _link_annotations(self) -> None:
-        """Chain the boxes of each instance and write the instance table."""
+        """Chain the boxes of each instance and add the instance records."""
         by_instance: dict[str, list[dict[str, Any]]] = defaultdict(list)
         for box in self.records["sample_annotation"]:
             by_instance[box["instance_token"]].append(box)
         for token, boxes in by_instance.items():
-            for before, after in pairwise(boxes):
-                before["next"], after["prev"] = after["token"], before["token"]
+            _chain(boxes)
             self._add(
                 "instance",
                 token=token,
@@ -288,37 +326,69 @@ class SceneMaker:
             del box["category"]
 
 
+def _chain(records: list[dict[str, Any]]) -> None:
+    """Link consecutive records by their ``prev`` and ``next`` fields, in place."""
+    for before, after in pairwise(records):
+        before["next"] = after["token"]
+        after["prev"] = before["token"]
+
+
+def _attribute(vehicle: Vehicle) -> str:
+    """Attribute name in nuScenes of a vehicle or person."""
+    if vehicle.category.startswith("human"):
+        return "pedestrian.standing"
+    return "vehicle.moving" if vehicle.speed > 0 else "vehicle.parked"
+
+
 def _points_in_box(points: Array, vehicle: Vehicle) -> int:
-    dx, dy = points[:, 0] - vehicle.center[0], points[:, 1] - vehicle.center[1]
+    """Number of points (N, 3) in the world, in metres, inside the box of a vehicle."""
+    dx = points[:, 0] - vehicle.center[0]
+    dy = points[:, 1] - vehicle.center[1]
+    dz = points[:, 2] - vehicle.center[2]
     near = (np.abs(dx) < vehicle.size[0]) & (np.abs(dy) < vehicle.size[0])
-    dx, dy, dz = dx[near], dy[near], points[near, 2] - vehicle.center[2]
-    c, s = np.cos(vehicle.yaw_rad), np.sin(vehicle.yaw_rad)
-    local = np.stack([c * dx + s * dy, c * dy - s * dx, dz], axis=1)
-    return int((np.abs(local) <= np.array(vehicle.size) / 2 + BOX_SLACK_M).all(1).sum())
+    dx = dx[near]
+    dy = dy[near]
+    c = np.cos(vehicle.yaw_rad)
+    s = np.sin(vehicle.yaw_rad)
+    local = np.stack([c * dx + s * dy, c * dy - s * dx, dz[near]], axis=1)
+    inside = (np.abs(local) <= np.array(vehicle.size) / 2 + BOX_SLACK_M).all(axis=1)
+    return int(inside.sum())
 
 
-def _surroundings(town: Town, track: Array, lighting: Lighting) -> tuple[FrozenMesh, list[Array]]:
-    """What stands near the drive, and the shadows that it casts."""
-    mesh, shadows = Mesh(), []
+def _make_surroundings(
+    town: Town, track: Array, lighting: Lighting
+) -> tuple[FrozenMesh, list[Array]]:
+    """Buildings, trees and poles near a drive.
+
+    Args:
+        town: The town.
+        track: Positions of the ego vehicle in metres. (T, 2)
+        lighting: Direction of the sun, strength of shadows and weather.
+
+    Returns:
+        The mesh, and the outlines of shadows on the ground in metres, none without sun. Each (n, 2)
+    """
+    mesh = Mesh()
+    shadows = []
     cast = -lighting.sun[:2] / max(float(lighting.sun[2]), 0.2)
 
-    def reach(points: Array) -> Array:
-        return np.linalg.norm(points[:, None] - track[None], axis=-1).min(1)
+    def track_distance(points: Array) -> Array:
+        """Distance of points (n, 2) from the track in metres. (n,)"""
+        return np.linalg.norm(points[:, None] - track[None], axis=-1).min(axis=1)
 
     if town.buildings:
-        centers = np.array([b.footprint.mean(0) for b in town.buildings])
-        for i in np.flatnonzero(reach(centers) < 130):
+        centers = np.array([b.footprint.mean(axis=0) for b in town.buildings])
+        for i in np.flatnonzero(track_distance(centers) < 130):
             building = town.buildings[i]
-            add_building(mesh, building, lighting.weather == "dusk")
-            both = np.concatenate(
-                [building.footprint, building.footprint + cast * building.height_m]
-            )
-            shadows.append(np.array(shapely.MultiPoint(both).convex_hull.exterior.coords))
-    turn = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+            add_building(mesh, building, lit_windows=lighting.weather == "dusk")
+            roof_shadow = building.footprint + cast * building.height_m
+            corners = shapely.MultiPoint(np.concatenate([building.footprint, roof_shadow]))
+            shadows.append(np.array(corners.convex_hull.exterior.coords))
+    turn = np.linspace(0, 2 * np.pi, num=12, endpoint=False)
     ring = np.column_stack([np.cos(turn), np.sin(turn)])
-    for tree in town.trees[reach(town.trees[:, :2]) < 90]:
+    for tree in town.trees[track_distance(town.trees[:, :2]) < 90]:
         add_tree(mesh, tree)
         shadows.append(tree[:2] + cast * 0.68 * tree[2] + 0.26 * tree[2] * ring)
-    for pole in town.poles[reach(town.poles[:, :2]) < 90]:
+    for pole in town.poles[track_distance(town.poles[:, :2]) < 90]:
         add_pole(mesh, pole)
     return mesh.freeze(), shadows if lighting.shadow > 0 else []
