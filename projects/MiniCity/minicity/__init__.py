@@ -1,1 +1,1 @@
-"""MiniCity: a procedural town written in the nuScenes format."""
+"""MiniCity: procedural towns written in the nuScenes format."""

@@ -1,4 +1,4 @@
-"""The ground of an Argoverse 2 log for MiniCity's renderer: road, kerbs, paint and height."""
+"""Ground of an Argoverse 2 log for MiniCity's renderer: road, kerbs, paint and height."""
 
 from collections.abc import Sequence
 
@@ -23,7 +23,7 @@ WALKWAY_WIDTH_M = 3.0
 LINE_WIDTH_M = 0.15
 DOUBLE_GAP_M = 0.12
 DASH_M, GAP_M = 3.0, 6.0
-SAME_LINE_M = 0.3
+SAME_LINE_M = 0.3  # lines closer than this are one line
 WEAR = 0.15
 HEIGHT_SMOOTHING_M = 1.0  # heights are stored in steps of about 5 cm
 
@@ -33,111 +33,144 @@ Bounds = tuple[float, float, float, float]
 def make_scene(
     static_map: ArgoverseStaticMap, heights: GroundHeightLayer, bounds: Bounds
 ) -> SceneMap:
-    """Lay out what the map of a log says about the ground.
+    """Lay out the ground of a log from its map.
 
-    Paint is where the map says that there is some; lane boundaries without paint stay invisible.
+    Paint follows the lane markings and crossings of the map; a lane boundary without a marking has
+    no paint.
 
     Args:
-        static_map: The map of the log.
-        heights: Height of its ground.
-        bounds: xmin, ymin, xmax, ymax of the part that will be seen, city frame, in metres.
+        static_map: Map of the log.
+        heights: Ground height of the log.
+        bounds: xmin, ymin, xmax, ymax of the part to render, in the city frame, in metres.
+
+    Returns:
+        Surfaces, kerbs, paint and height in the city frame.
 
     Raises:
         ValueError: If no ground height is known inside the bounds.
     """
     window = shapely.box(*bounds)
-    areas = [shapely.Polygon(a.xyz[:, :2]) for a in static_map.get_scenario_vector_drivable_areas()]
-    road = shapely.union_all([shapely.make_valid(a) for a in areas if a.intersects(window)])
-    scene = SceneMap(height=height_grid(heights, bounds, road.buffer(ROI_ISOCONTOUR_M)))
-    walkway = _polygons(road.buffer(WALKWAY_WIDTH_M, join_style="mitre"))
-    scene.surfaces += [Surface(polygon, "walkway") for polygon in walkway]
+    areas = []
+    for area in static_map.get_scenario_vector_drivable_areas():
+        polygon = shapely.Polygon(area.xyz[:, :2])
+        if polygon.intersects(window):
+            areas.append(shapely.make_valid(polygon))
+    road = shapely.union_all(areas)
+    scene = SceneMap(height=height_grid(heights, bounds, trusted=road.buffer(ROI_ISOCONTOUR_M)))
+    for polygon in _polygons(road.buffer(WALKWAY_WIDTH_M, join_style="mitre")):
+        scene.surfaces.append(Surface(polygon, "walkway"))
     for polygon in _polygons(road):
         scene.surfaces.append(Surface(polygon, "asphalt"))
-        scene.kerbs += [np.array(r.coords) for r in (polygon.exterior, *polygon.interiors)]
+        for ring in (polygon.exterior, *polygon.interiors):
+            scene.kerbs.append(np.array(ring.coords))
     paint = lane_paint(static_map, window)
     for crossing in static_map.get_scenario_ped_crossings():
-        paint["white"] += zebra(*(edge[:, :2] for edge in crossing.get_edges_2d()))
-    scene.markings += [Marking(areas, colour, WEAR) for colour, areas in paint.items() if areas]
+        side_a, side_b = crossing.get_edges_2d()
+        paint["white"] += zebra(side_a[:, :2], side_b[:, :2])
+    for color, outlines in paint.items():
+        if outlines:
+            scene.markings.append(Marking(outlines, paint=color, wear=WEAR))
     return scene
 
 
 def lane_paint(
     static_map: ArgoverseStaticMap, window: shapely.Polygon
 ) -> dict[str, list[np.ndarray]]:
-    """Return the painted areas of all marked lane boundaries in a window of the city, by colour.
+    """Painted areas of the marked lane boundaries in a window of the city.
 
-    Two lanes that share a line describe it twice; it is painted once. each (n, 2)
+    Two lanes that share a line describe it twice; it is painted once.
+
+    Args:
+        static_map: Map of the log.
+        window: Area in the city frame, in metres; lines that touch it are included.
+
+    Returns:
+        Outlines in metres by colour, ``white`` and ``yellow``. Each (n, 2)
     """
-    markings = [
-        marking
-        for lane in static_map.get_scenario_lane_segments()
-        for marking in (lane.left_lane_marking, lane.right_lane_marking)
-        if marking.mark_type is not LaneMarkType.NONE
-    ]
-    lines = np.array([shapely.LineString(m.polyline[:, :2]) for m in markings], dtype=object)
-    painted: dict[str, list[np.ndarray]] = {"white": [], "yellow": []}
-    for i in _different(lines, window):
-        kind = markings[i].mark_type.value
-        colour = "yellow" if kind.endswith("YELLOW") else "white"
-        painted[colour] += _stroke(np.array(lines[i].coords), kind)
-    return painted
+    kinds = []
+    lines = []
+    for lane in static_map.get_scenario_lane_segments():
+        for marking in (lane.left_lane_marking, lane.right_lane_marking):
+            if marking.mark_type is not LaneMarkType.NONE:
+                kinds.append(marking.mark_type.value)
+                lines.append(shapely.LineString(marking.polyline[:, :2]))
+    paint: dict[str, list[np.ndarray]] = {"white": [], "yellow": []}
+    for i in _unique_lines(np.array(lines, dtype=object), window):
+        color = "yellow" if kinds[i].endswith("YELLOW") else "white"
+        paint[color] += _line_paint(np.array(lines[i].coords), kinds[i])
+    return paint
 
 
-def _different(lines: np.ndarray, window: shapely.Polygon) -> list[int]:
-    """Return the positions of the lines in the window without those that repeat an earlier one."""
+def _unique_lines(lines: np.ndarray, window: shapely.Polygon) -> list[int]:
+    """Indices of the lines in a window, without lines that repeat an earlier one."""
     tree = shapely.STRtree(lines)
-    kept: set[int] = set()
+    unique: set[int] = set()
     for i in sorted(tree.query(window, predicate="intersects").tolist()):
-        near = [j for j in tree.query(lines[i], "dwithin", SAME_LINE_M).tolist() if j in kept]
+        near = unique.intersection(tree.query(lines[i], "dwithin", distance=SAME_LINE_M).tolist())
         if not any(shapely.hausdorff_distance(lines[i], lines[j]) < SAME_LINE_M for j in near):
-            kept.add(i)
-    return sorted(kept)
+            unique.add(i)
+    return sorted(unique)
 
 
-def _stroke(line: np.ndarray, kind: str) -> list[np.ndarray]:
-    """Return the painted areas of one line of an Argoverse mark type. each (n, 2)"""
+def _line_paint(line: np.ndarray, kind: str) -> list[np.ndarray]:
+    """Painted areas of a line (n, 2) of an Argoverse mark type. Each (m, 2)"""
     if kind.startswith("DOUBLE"):
-        return double_line(line, LINE_WIDTH_M, DOUBLE_GAP_M)
+        return double_line(line, LINE_WIDTH_M, gap_m=DOUBLE_GAP_M)
     if kind.startswith("DASHED"):
-        return dashed_line(line, LINE_WIDTH_M, DASH_M, GAP_M)
+        return dashed_line(line, LINE_WIDTH_M, dash_m=DASH_M, gap_m=GAP_M)
     if kind.startswith(("DASH_SOLID", "SOLID_DASH")):  # one solid, one dashed line side by side
-        curves = (shapely.LineString(line).offset_curve(d) for d in (DOUBLE_GAP_M, -DOUBLE_GAP_M))
-        left, right = (np.array(curve.coords) for curve in curves)
-        dashed, solid = (left, right) if kind.startswith("DASH") else (right, left)
-        return dashed_line(dashed, LINE_WIDTH_M, DASH_M, GAP_M) + solid_line(solid, LINE_WIDTH_M)
+        curve = shapely.LineString(line)
+        dashed = np.array(curve.offset_curve(DOUBLE_GAP_M).coords)
+        solid = np.array(curve.offset_curve(-DOUBLE_GAP_M).coords)
+        if kind.startswith("SOLID"):
+            dashed, solid = solid, dashed
+        dashes = dashed_line(dashed, LINE_WIDTH_M, dash_m=DASH_M, gap_m=GAP_M)
+        return dashes + solid_line(solid, LINE_WIDTH_M)
     return solid_line(line, LINE_WIDTH_M)
 
 
 def height_grid(
     heights: GroundHeightLayer, bounds: Bounds, trusted: shapely.Geometry
 ) -> HeightGrid:
-    """Return the ground height inside bounds, smoothed, and outwards as it is at the edge.
+    """Smoothed ground height inside bounds, extended outwards from the edge of the road.
 
-    Stored heights count in the area ``trusted`` of the city: away from the road they include what
-    stands there, up to tall spikes. ``bounds`` are xmin, ymin, xmax, ymax in the city, in metres.
+    Away from the road the stored heights include trees and buildings, up to tall spikes, so only
+    heights inside ``trusted`` are used.
+
+    Args:
+        heights: Ground height of a log.
+        bounds: xmin, ymin, xmax, ymax in the city frame, in metres.
+        trusted: Area of usable heights in the city frame, in metres.
+
+    Returns:
+        Height of each cell inside the bounds, in the city frame.
 
     Raises:
-        ValueError: If no height is known inside the bounds, or the grid is turned.
+        ValueError: If no height is known inside the bounds, or the grid is rotated.
     """
-    to_grid = heights.array_Sim2_city
-    if not np.allclose(to_grid.R, np.eye(2)):
+    grid_from_city = heights.array_Sim2_city
+    if not np.allclose(grid_from_city.R, np.eye(2)):
         raise ValueError("the ground height grid is turned against the city frame.")
-    cell_m = 1.0 / to_grid.s
-    corners = to_grid.transform_from(np.array(bounds).reshape(2, 2))
+    cell_m = 1.0 / grid_from_city.s
+    corners = grid_from_city.transform_from(np.array(bounds).reshape(2, 2))
     rows, columns = heights.array.shape
     low = np.clip(np.floor(corners[0]).astype(int), 0, (columns - 1, rows - 1))
     high = np.clip(np.ceil(corners[1]).astype(int), low + 1, (columns, rows))
     part = heights.array[low[1] : high[1], low[0] : high[0]].astype(np.float64)
-    origin = (low + 0.5) * cell_m - to_grid.t  # p_grid = s (p_city + t), cells centred at + 0.5
-    x, y = (origin[i] + np.arange(n) * cell_m for i, n in enumerate(part.shape[::-1]))
+    # p_grid = s (p_city + t), with cells centred at + 0.5
+    origin = (low + 0.5) * cell_m - grid_from_city.t
+    x = origin[0] + np.arange(part.shape[1]) * cell_m
+    y = origin[1] + np.arange(part.shape[0]) * cell_m
+    grid_x, grid_y = np.meshgrid(x, y)
     shapely.prepare(trusted)
-    known = np.isfinite(part) & shapely.contains_xy(trusted, *np.meshgrid(x, y))
+    known = np.isfinite(part) & shapely.contains_xy(trusted, grid_x, y=grid_y)
     if not known.any():
         raise ValueError(f"no ground height is known on the road inside {bounds}.")
     nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-    filled = ndimage.gaussian_filter(part[tuple(nearest)], HEIGHT_SMOOTHING_M / cell_m)
-    return HeightGrid(origin, cell_m, filled)
+    filled = ndimage.gaussian_filter(part[tuple(nearest)], sigma=HEIGHT_SMOOTHING_M / cell_m)
+    return HeightGrid(origin, cell_m, height_m=filled)
 
 
 def _polygons(geometry: shapely.Geometry) -> Sequence[shapely.Polygon]:
+    """Polygons among the parts of a geometry."""
     return [p for p in shapely.get_parts(geometry).tolist() if p.geom_type == "Polygon"]

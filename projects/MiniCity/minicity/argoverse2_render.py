@@ -31,16 +31,22 @@ from minicity.lighting import random_lighting
 from minicity.renderer import SceneRenderer
 
 VIEW_M = 50.0
-GROUND_PIXELS_PER_IMAGE_PIXEL = 0.0625 * 800  # metres times image width, as MiniCity has it
+GROUND_PIXELS_PER_IMAGE_PIXEL = 0.0625 * 800  # metres times image width, equal to MiniCity's
 JPEG_QUALITY = 90
 
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """How logs are rendered: the options of ``tools/create_data.py av2-render``.
+    """Options of ``tools/create_data.py av2-render``.
 
-    ``scale`` is in (0, 1], ``rate_hz`` > 0 in pictures per second; None, as of ``max_frames``, is
-    all. The log in the folder ``calibration`` lends its own to logs that have none.
+    Attributes:
+        rate_hz: Pictures per second and camera, > 0; None for all poses.
+        scale: Size of the pictures relative to the real images, in (0, 1].
+        calibration: Folder of a log whose calibration is used for logs without one.
+        max_frames: Greatest number of frames per log, >= 1; None for all.
+
+    Raises:
+        ValueError: If a value is out of range.
     """
 
     rate_hz: float | None = 2.0
@@ -58,11 +64,19 @@ class RenderOptions:
 
 
 def scaled_camera(camera: PinholeCamera, scale: float) -> tuple[np.ndarray, int, int]:
-    """Return a camera's intrinsics (3, 3), width and height for pictures of ``scale`` its size.
+    """Camera parameters for a scaled picture.
 
-    Integer pixel coordinates lie at pixel centres, so the picture's corner (-0.5, -0.5) stays put.
+    Integer pixel coordinates lie at pixel centres, so the picture's corner (-0.5, -0.5) is fixed.
+
+    Args:
+        camera: Camera of the log.
+        scale: Size of the picture relative to the real image, in (0, 1].
+
+    Returns:
+        Intrinsic matrix (3, 3), width and height in pixels.
     """
-    width, height = (max(1, round(n * scale)) for n in (camera.width_px, camera.height_px))
+    width = max(1, round(camera.width_px * scale))
+    height = max(1, round(camera.height_px * scale))
     ratio = np.array([width / camera.width_px, height / camera.height_px])
     intrinsics = camera.intrinsics.K.copy()
     intrinsics[:2] *= ratio[:, None]
@@ -70,46 +84,71 @@ def scaled_camera(camera: PinholeCamera, scale: float) -> tuple[np.ndarray, int,
     return intrinsics, width, height
 
 
-def _prepare(
+def _make_photographer(
     log: Argoverse2Log, cameras: dict[str, PinholeCamera], times_ns: np.ndarray, scale: float
 ) -> Callable[[str, int], bytes]:
-    """Lay out the ground around a log's track and return what takes a picture there, as JPEG.
+    """Lay out the ground around a log's track and make a function that renders its pictures.
 
-    It takes the name of a camera and a row's time in the pose table.
+    Args:
+        log: The log.
+        cameras: Ring cameras by name.
+        times_ns: Timestamps of the pictures in nanoseconds, all in the pose table. (n,)
+        scale: Size of the pictures relative to the real images, in (0, 1].
+
+    Returns:
+        Function from a camera's name and a timestamp in nanoseconds to a picture in JPEG format.
+
+    Raises:
+        ValueError: If there is no ground height.
     """
-    track = np.array([log.poses[time][:2, 3] for time in times_ns.tolist()])  # (n, 2)
-    bounds = (*(track.min(0) - VIEW_M).tolist(), *(track.max(0) + VIEW_M).tolist())
+    track = np.array([log.poses[time_ns][:2, 3] for time_ns in times_ns.tolist()])  # (n, 2)
+    xmin, ymin = (track.min(axis=0) - VIEW_M).tolist()
+    xmax, ymax = (track.max(axis=0) + VIEW_M).tolist()
+    bounds = (xmin, ymin, xmax, ymax)
     static_map = ArgoverseStaticMap.from_json(find_map(log.log_dir))
     try:
         heights = GroundHeightLayer.from_file(log.log_dir / "map")
     except RuntimeError as error:
         raise ValueError(f"{error} in {log.log_dir / 'map'}") from error
-    pinholes = {name: scaled_camera(camera, scale) for name, camera in cameras.items()}
-    widest = max(width for _, width, _ in pinholes.values())
+    scaled_cameras = {name: scaled_camera(camera, scale) for name, camera in cameras.items()}
+    widest = max(width for _, width, _ in scaled_cameras.values())
     rng = np.random.default_rng(zlib.crc32(log.log_id.encode()))
     renderer = SceneRenderer(
-        make_scene(static_map, heights, bounds),
-        bounds,
-        random_lighting(rng),
-        float(np.clip(GROUND_PIXELS_PER_IMAGE_PIXEL / widest, 0.05, 0.12)),
-        rng,
+        make_scene(static_map, heights, bounds=bounds),
+        bounds=bounds,
+        lighting=random_lighting(rng),
+        resolution_m=float(np.clip(GROUND_PIXELS_PER_IMAGE_PIXEL / widest, 0.05, 0.12)),
+        rng=rng,
     )
 
-    def take(name: str, timestamp_ns: int) -> bytes:
+    def take_picture(name: str, timestamp_ns: int) -> bytes:
         city_from_cam = log.poses[timestamp_ns] @ cameras[name].ego_SE3_cam.transform_matrix
-        camera = Camera(*pinholes[name], np.linalg.inv(city_from_cam))
-        image = renderer.render_camera(camera, [], rng)
+        intrinsics, width, height = scaled_cameras[name]
+        camera = Camera(
+            intrinsics=intrinsics,
+            width=width,
+            height=height,
+            cam_from_world=np.linalg.inv(city_from_cam),
+        )
+        image = renderer.render_camera(camera, vehicles=[], rng=rng)
         return encode_jpeg(image, JPEG_QUALITY)
 
-    return take
+    return take_picture
 
 
 def render_log(log_dir: Path, out_dir: Path, options: RenderOptions) -> int:
-    """Render a log into a folder of the official layout, which appears when it is whole.
+    """Render a log into a folder of the official layout.
 
-    The map, the poses and the calibration (for the scaled pictures) are written along.
+    The folder appears when it is complete. It has the log's map, poses and calibration, the latter
+    for the scaled pictures.
 
-    Returns the number of pictures.
+    Args:
+        log_dir: Folder of the log.
+        out_dir: Output folder, which must not exist.
+        options: Rate, size and calibration of the pictures.
+
+    Returns:
+        Number of pictures.
 
     Raises:
         FileExistsError: If ``out_dir`` exists.
@@ -119,52 +158,66 @@ def render_log(log_dir: Path, out_dir: Path, options: RenderOptions) -> int:
     """
     if out_dir.exists():
         raise FileExistsError(f"{out_dir} is there already and kept: delete it to render it again")
-    source = log = Argoverse2Log(log_dir)
+    log = Argoverse2Log(log_dir)
+    calibrated_log = log
     if not log.calibration and options.calibration is not None:
-        source = Argoverse2Log(options.calibration)
-    if len(source.calibration) < len(RING_CAMERAS):
+        calibrated_log = Argoverse2Log(options.calibration)
+    cameras = calibrated_log.calibration
+    if len(cameras) < len(RING_CAMERAS):
         raise ValueError(
             "no calibration of the ring cameras (--calibration-from names another log)"
         )
     times = thin_out(np.array(list(log.poses)), options.rate_hz)
     if options.max_frames is not None and len(times) > options.max_frames:
-        times = times[np.linspace(0, len(times) - 1, options.max_frames).round().astype(int)]
-    take = _prepare(log, source.calibration, times, options.scale)
+        indices = np.linspace(0, len(times) - 1, num=options.max_frames).round().astype(int)
+        times = times[indices]
+    take_picture = _make_photographer(log, cameras, times_ns=times, scale=options.scale)
     out_dir.parent.mkdir(parents=True, exist_ok=True)
     with partial_path(out_dir, Path.mkdir) as partial_dir:
-        _copy_log(log_dir, source, partial_dir, options.scale)
+        _copy_log(log_dir, calibrated_log, target=partial_dir, scale=options.scale)
         for timestamp_ns in times.tolist():
             for name in RING_CAMERAS:
                 path = partial_dir / f"sensors/cameras/{name}/{timestamp_ns}.jpg"
-                path.write_bytes(take(name, timestamp_ns))
+                path.write_bytes(take_picture(name, timestamp_ns))
         os.rename(partial_dir, out_dir)
     return len(times) * len(RING_CAMERAS)
 
 
-def _copy_log(log_dir: Path, source: Argoverse2Log, target: Path, scale: float) -> None:
-    """Copy map and poses, write the calibration of the scaled cameras, make the image folders."""
+def _copy_log(log_dir: Path, calibrated_log: Argoverse2Log, target: Path, scale: float) -> None:
+    """Copy map and poses, write the calibration of the scaled cameras, make the image folders.
+
+    Args:
+        log_dir: Folder of the log.
+        calibrated_log: Log with the calibration, often the log itself.
+        target: Output folder.
+        scale: Size of the pictures relative to the real images, in (0, 1].
+    """
     shutil.copytree(log_dir / "map", target / "map", copy_function=shutil.copyfile)
     shutil.copyfile(log_dir / POSES, target / POSES)
     (target / "calibration").mkdir()
     extrinsics = "calibration/egovehicle_SE3_sensor.feather"
-    shutil.copyfile(source.log_dir / extrinsics, target / extrinsics)
-    table = read_feather(source.log_dir / "calibration" / "intrinsics.feather")
+    shutil.copyfile(calibrated_log.log_dir / extrinsics, target / extrinsics)
+    table = read_feather(calibrated_log.log_dir / "calibration" / "intrinsics.feather")
     table = table[table["sensor_name"].isin(RING_CAMERAS)].reset_index(drop=True)
     for row, name in enumerate(table["sensor_name"]):
-        intrinsics, width, height = scaled_camera(source.calibration[name], scale)
-        table.loc[row, ["fx_px", "fy_px"]] = intrinsics[0, 0], intrinsics[1, 1]
-        table.loc[row, ["cx_px", "cy_px"]] = intrinsics[0, 2], intrinsics[1, 2]
-        table.loc[row, ["width_px", "height_px"]] = width, height
-    table[["k1", "k2", "k3"]] = 0.0  # the renderer's lens is perfect
+        intrinsics, width, height = scaled_camera(calibrated_log.calibration[name], scale)
+        table.loc[row, ["fx_px", "fy_px"]] = [intrinsics[0, 0], intrinsics[1, 1]]
+        table.loc[row, ["cx_px", "cy_px"]] = [intrinsics[0, 2], intrinsics[1, 2]]
+        table.loc[row, ["width_px", "height_px"]] = [width, height]
+    table[["k1", "k2", "k3"]] = 0.0  # the renderer's lens has no distortion
     feather.write_feather(table, target / "calibration" / "intrinsics.feather")
     for name in RING_CAMERAS:
         (target / "sensors/cameras" / name).mkdir(parents=True)
 
 
 def _try_log(log_dir: Path, out: Path, options: RenderOptions) -> int | str:
-    """Render a log; return the reason where it cannot be rendered. A full disk stops everything."""
+    """Render a log into a folder of ``out``. A full disk raises, unlike an unusable log.
+
+    Returns:
+        Number of pictures, or the reason for which the log cannot be rendered.
+    """
     try:
-        return render_log(log_dir, out / log_dir.name, options)
+        return render_log(log_dir, out / log_dir.name, options=options)
     except (FileExistsError, FileNotFoundError, ValueError, shapely.errors.ShapelyError) as error:
         return str(error)
 
@@ -172,21 +225,36 @@ def _try_log(log_dir: Path, out: Path, options: RenderOptions) -> int | str:
 def render_logs(
     log_dirs: Sequence[Path], out: Path, options: RenderOptions, workers: int = 1
 ) -> str:
-    """Render logs into the folder ``out``; one that cannot be rendered does not stop the others.
+    """Render logs into a folder. A log that cannot be rendered does not stop the others.
 
-    Returns what was rendered and what was left out, for people.
+    Args:
+        log_dirs: Folders of the logs.
+        out: Output folder, with one folder per log.
+        options: Rate, size and calibration of the pictures.
+        workers: Number of processes, >= 1.
+
+    Returns:
+        Summary for the user: the number of pictures, and the logs left out with their reasons.
+
+    Raises:
+        OSError: If a file cannot be written.
     """
     render = partial(_try_log, out=out, options=options)
-    results = ordered_map(render, log_dirs, min(workers, max(len(log_dirs), 1)), timeout_s=3600.0)
+    workers = min(workers, max(len(log_dirs), 1))
+    results = ordered_map(render, log_dirs, workers=workers, timeout_s=3600.0)
+    counts = []
+    reasons = []
     with Progress(log_dirs, desc="av2-render", unit="logs") as logs:
-        done = {log_dir.name: result for log_dir, result in zip(logs, results, strict=True)}
-    counts = [result for result in done.values() if isinstance(result, int)]
-    lines = [f"log {name} left out: {why}" for name, why in done.items() if isinstance(why, str)]
-    return "\n".join([f"{sum(counts)} pictures of {len(counts)} logs in {out}", *lines])
+        for log_dir, result in zip(logs, results, strict=True):
+            if isinstance(result, int):
+                counts.append(result)
+            else:
+                reasons.append(f"log {log_dir.name} left out: {result}")
+    return "\n".join([f"{sum(counts)} pictures of {len(counts)} logs in {out}", *reasons])
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the renderer's options to a parser."""
+    """Add the options of ``tools/create_data.py av2-render`` to a parser."""
     add = parser.add_argument
     add_log_options(parser, "2hz")
     add("--out", type=Path, required=True, help="data root to write")
@@ -200,10 +268,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> str:
-    """Render as the command line asks and return the summary."""
-    root, split, log = arguments.root, arguments.split, arguments.calibration_from
-    calibration = find_logs(root, split, [log])[0] if log else None
+    """Render the logs of the command line.
+
+    Args:
+        arguments: Parsed options of ``add_arguments``.
+
+    Returns:
+        Summary for the user.
+    """
+    root = arguments.root
+    split = arguments.split
+    calibration = None
+    if arguments.calibration_from:
+        calibration = find_logs(root, split, [arguments.calibration_from])[0]
     options = options_from(RenderOptions, arguments, calibration=calibration)
     log_dirs = arguments.shard.part(find_logs(root, split, arguments.logs))
     out = arguments.out / (arguments.out_split or split)
-    return render_logs(log_dirs, out, options, arguments.workers)
+    return render_logs(log_dirs, out, options=options, workers=arguments.workers)

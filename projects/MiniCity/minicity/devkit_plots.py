@@ -1,7 +1,7 @@
 """Draw a sample and the map around it with the nuScenes devkit.
 
-``descartes``, with which the devkit draws polygons, was last released before shapely 2 and reads
-rings as arrays; `repair_descartes` mends that.
+The devkit draws polygons with ``descartes``, whose last release is older than shapely 2 and expects
+rings as arrays; `repair_descartes` replaces that part.
 """
 
 import argparse
@@ -21,7 +21,7 @@ RADIUS_M = 75.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Describe the command's arguments."""
+    """Add the options of ``python -m minicity draw`` to a parser."""
     parser.add_argument("root", help="folder of the data set")
     parser.add_argument("--out", type=Path, default=Path("work_dirs/minicity"), help="for pictures")
     parser.add_argument("--sample", type=int, default=0, help="number of the key frame")
@@ -31,10 +31,10 @@ def run(arguments: argparse.Namespace) -> str:
     """Draw the sensors of a key frame, its LiDAR in the front camera, and the map around it.
 
     Args:
-        arguments: Parsed arguments.
+        arguments: Parsed options of ``add_arguments``.
 
     Returns:
-        A line for the user.
+        Names and folder of the pictures, for the user.
 
     Raises:
         FileNotFoundError: If there is no data set.
@@ -69,13 +69,12 @@ def run(arguments: argparse.Namespace) -> str:
 
 
 def polygon_path(polygon: Polygon | MultiPolygon) -> Outline:
-    """A polygon, holes included, as a matplotlib path."""
-    rings = [
-        np.asarray(ring.coords)[:, :2]
-        for part in get_parts(polygon)
-        if not part.is_empty
-        for ring in (part.exterior, *part.interiors)
-    ]
+    """Convert a polygon with holes to a matplotlib path."""
+    rings = []
+    for part in get_parts(polygon):
+        if not part.is_empty:
+            for ring in (part.exterior, *part.interiors):
+                rings.append(np.asarray(ring.coords)[:, :2])
     if not rings:
         return Outline(np.zeros((0, 2)))
     codes = []
@@ -87,5 +86,5 @@ def polygon_path(polygon: Polygon | MultiPolygon) -> Outline:
 
 
 def repair_descartes() -> None:
-    """Let ``descartes.PolygonPatch`` take shapely 2 polygons, for this process."""
+    """Make ``descartes.PolygonPatch`` accept shapely 2 polygons, in this process."""
     descartes.patch.PolygonPath = polygon_path
