@@ -21,6 +21,7 @@ from gsmap.evaluation.core.raster_ap import RasterConfig
 from gsmap.evaluation.core.results_json import write_results
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
+from gsmap.utils.errors import WorkError
 from gsmap.utils.files import read_json
 from gsmap.utils.shipped import shipped
 
@@ -167,7 +168,7 @@ def _evaluate(files: tuple[Path, Path], metrics: list[str], grid: BEVGrid, worke
     wall = time.perf_counter() - start
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
-        raise RuntimeError(f"{' '.join(command)} ended with {process.returncode}.")
+        raise WorkError(f"{' '.join(command)} ended with {process.returncode}.")
     return Run(wall, usage.ru_utime + usage.ru_stime, peak)
 
 

@@ -13,6 +13,7 @@ from benchmarks.model import add_arguments, model_and_batch, report
 from gsmap.apis.export import export_onnx, quantize_onnx
 from gsmap.apis.onnx_inferencer import OnnxInferencer
 from gsmap.structures.calibration import calibration_arrays
+from gsmap.utils.errors import InputError
 
 __all__ = ["add_arguments", "run"]
 
@@ -24,7 +25,7 @@ def run(args: argparse.Namespace) -> None:
         ValueError: If another device or precision is asked for.
     """
     if args.device != "cpu" or args.fp16:
-        raise ValueError("benchmarks export measures single precision and 8 bits on the CPU.")
+        raise InputError("benchmarks export measures single precision and 8 bits on the CPU.")
     rows = []
     for path in args.configs:
         costs = {

@@ -26,6 +26,7 @@ from gsmap.checkpoints.reading import load_weights
 from gsmap.datasets.annotations.record import CLASSES
 from gsmap.engine.arguments import data_root_options, parse_options
 from gsmap.engine.launch import read_config
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import atomic_write, write_text
 from gsmap.utils.parallel import ordered_map
 
@@ -102,7 +103,7 @@ def run(args: argparse.Namespace) -> None:
 def refuse_others(path: Path, settings: dict[str, str]) -> None:
     """Note what a variant's figures come from, or raise an error if those there are of others."""
     if path.exists() and json.loads(path.read_text()) != settings:
-        raise ValueError(f"{path.parent} holds figures of other settings: give another --out.")
+        raise InputError(f"{path.parent} holds figures of other settings: give another --out.")
     write_text(path, json.dumps(settings, indent=1))
 
 

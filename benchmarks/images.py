@@ -15,6 +15,7 @@ from mmengine.registry import init_default_scope
 from torch.utils.data import DataLoader, Dataset
 
 import gsmap.registered  # noqa: F401
+from gsmap.utils.errors import InputError
 
 _CAMERAS = 6
 _LOAD = {"type": "LoadCameraImages"}
@@ -74,7 +75,7 @@ def measure_images(folder: Path, count: int = 10, workers: Sequence[int] = ()) -
     """
     files = sorted(file for file in folder.iterdir() if file.suffix.lower() in (".jpg", ".jpeg"))
     if len(files) < _CAMERAS:
-        raise ValueError(f"{folder} has {len(files)} JPEG files: give a folder of six or more.")
+        raise InputError(f"{folder} has {len(files)} JPEG files: give a folder of six or more.")
     cv2.setNumThreads(0)
     torch.set_num_threads(1)
     found = {}

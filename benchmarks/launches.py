@@ -21,6 +21,7 @@ from benchmarks.measure import markdown_table
 from benchmarks.pretended_gpu import DEVICE, PretendedGPU, available
 from gsmap.engine.figures import keep_figures
 from gsmap.engine.launch import read_config
+from gsmap.utils.errors import WorkError
 
 # attribute of the detector, its method, and what that is part of
 PARTS = (
@@ -55,7 +56,7 @@ def run(args: argparse.Namespace) -> None:
         RuntimeError: If torch is too old.
     """
     if not available():
-        raise RuntimeError(
+        raise WorkError(
             f"torch {torch.__version__} has no backends in Python: use a newer one, such as 2.13."
         )
     for path in args.configs:

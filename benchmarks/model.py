@@ -21,6 +21,7 @@ from gsmap.engine.launch import read_config
 from gsmap.engine.targets import needed_targets
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.rigid import rigid
+from gsmap.utils.errors import InputError
 
 # transforms of images, cameras and LiDAR, whose targets `add_auxiliary_targets` makes
 AT_RANDOM = {"MakeBEVMask", "MakePVMask", "MakeDepthMap"}
@@ -91,7 +92,7 @@ def image_shape(path: str, args: argparse.Namespace) -> tuple[int, int, int]:
     if args.size:
         return len(dataset.cameras), *args.size
     if "_file_size" not in cfg:
-        raise ValueError(f"{path} says nothing of _file_size (width, height): give --size H W.")
+        raise InputError(f"{path} says nothing of _file_size (width, height): give --size H W.")
     step: dict = next((step for step in dataset.pipeline if step.type == "ScaleImages"), {})
     if step.get("size"):
         return len(dataset.cameras), step["size"][1], step["size"][0]

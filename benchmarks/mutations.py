@@ -22,6 +22,7 @@ from types import CodeType
 import numpy as np
 
 from benchmarks.measure import markdown_table
+from gsmap.utils.errors import InputError
 from gsmap.utils.shipped import shipped
 
 REPO = shipped()
@@ -59,7 +60,7 @@ def run(args: argparse.Namespace) -> None:
         share = (args.number + number) // len(args.rooms)
         drawn = [places[k] for k in rng.permutation(len(places))[:share]]
         if verdict("", "", tests_of(room, None), None) != SURVIVED:
-            raise ValueError(f"the tests of {room} fail without a mutation: mend them first.")
+            raise InputError(f"the tests of {room} fail without a mutation: mend them first.")
         found = []
         for name, index in drawn:
             line, change, source = mutant(modules[name].read_text(), index)

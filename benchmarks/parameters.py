@@ -7,6 +7,7 @@ from torch import nn
 
 from gsmap.checkpoints.building import building
 from gsmap.engine.launch import read_config
+from gsmap.utils.errors import InputError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,7 +39,7 @@ def count_parameters(model: nn.Module, depth: int = 2) -> dict[str, tuple[int, i
         ValueError: If ``depth`` is negative.
     """
     if depth < 0:
-        raise ValueError(f"depth must be >= 0, got {depth}.")
+        raise InputError(f"depth must be >= 0, got {depth}.")
     counts = {}
     for name, module in model.named_modules():
         if name and name.count(".") >= depth:

@@ -8,6 +8,7 @@ from gsmap.apis.export import ExportedDetector
 from gsmap.checkpoints.building import building
 from gsmap.engine.arguments import parse_options
 from gsmap.engine.launch import read_config
+from gsmap.utils.errors import InputError
 
 _IMAGES = (64, 96)  # rows and columns: the state does not depend on them
 
@@ -37,7 +38,7 @@ def state_bytes(config: str, options: list[str]) -> dict[str, int]:
     with building(cfg):
         model = MODELS.build(cfg.model).eval()
     if model.temporal is None:
-        raise ValueError(f"{config} has no memory: give --cfg-options model.temporal=...")
+        raise InputError(f"{config} has no memory: give --cfg-options model.temporal=...")
     exported = ExportedDetector(model)
     inputs = exported.example_inputs(len(cfg.test_dataloader.dataset.cameras), _IMAGES)
     kept = inputs[len(inputs) - len(exported.memory) :]

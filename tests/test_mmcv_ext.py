@@ -27,7 +27,9 @@ def test_a_missing_operator_says_its_name_and_the_remedy(mmcv):
     done = run(LOAD + "nms = ext.nms; print('found'); nms(1, threshold=2)", mmcv)
     assert done.stdout == "found\n"
     last = done.stderr.splitlines()[-1]
-    assert last.startswith("RuntimeError: the operator nms of mmcv is not compiled here:")
+    assert last.startswith(
+        "gsmap.utils.errors.WorkError: the operator nms of mmcv is not compiled here:"
+    )
     assert "GSMAP_MMCV_OPS=1 make setup" in last
 
 

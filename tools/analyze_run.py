@@ -14,6 +14,7 @@ from pathlib import Path
 from comparison.run_curves import plot_runs, plot_series, read_run, summary_table
 
 from gsmap.utils.cli import CommandParser, output_file, run_command
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import write_text
 from gsmap.visualization.figure import save_figure
 
@@ -38,7 +39,7 @@ def main() -> None:
     args = parse_args()
     names = args.names or [None] * len(args.runs)
     if len(names) != len(args.runs):
-        raise ValueError(f"--names gives {len(names)} names for {len(args.runs)} runs.")
+        raise InputError(f"--names gives {len(names)} names for {len(args.runs)} runs.")
     runs = [read_run(path, name) for path, name in zip(args.runs, names, strict=True)]
     table = summary_table(runs)
     print(table)  # before anything is written: a disk may be full

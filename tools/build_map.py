@@ -38,6 +38,7 @@ from gsmap.datasets.elements import elements_of_instances
 from gsmap.evaluation.core.results_json import RESULTS_KEY, SampleFile
 from gsmap.structures.elements import MapElements
 from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.errors import InputError
 from gsmap.utils.extras import import_extra
 from gsmap.utils.files import file_names, write_text
 from gsmap.utils.split_lists import require_results_of
@@ -109,12 +110,12 @@ def check_formats(args: argparse.Namespace, ann: AnnotationFile) -> None:
         import_extra(*EXTRAS[key])
     origins = {name: origin_of(args, ann, name) for name in set(ann.column("map_name"))}
     if args.crs and args.origin:
-        raise ValueError("--crs and --origin both say where the poses lie: give one of them.")
+        raise InputError("--crs and --origin both say where the poses lie: give one of them.")
     if any(isinstance(origin, MapOrigin) for origin in origins.values()):
         require_near(np.array([sample.global_from_frame[:2, 3] for sample in ann]), str(args.ann))
     unknown = sorted(name for name, origin in origins.items() if origin is None)
     if "osm" in args.formats and unknown:
-        raise ValueError(
+        raise InputError(
             f"Lanelet2 needs longitude and latitude, and the origin of map {unknown[0]!r} is not "
             "known: give --origin LAT LON (any place will do; nodes keep local_x and local_y), or "
             "--crs if poses are coordinates of a grid."
@@ -229,7 +230,7 @@ def main(argv: list[str] | None = None) -> str:
     )
     has_poses = ann.meta.options.get("poses", True)
     if not has_poses and args.formats != ["mp4"]:
-        raise ValueError(
+        raise InputError(
             f"the samples of {args.ann} have no poses, so there is no map of the drive: --formats "
             "mp4 shows the single frames."
         )

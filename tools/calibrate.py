@@ -27,6 +27,7 @@ from gsmap.evaluation.analysis.calibration import LAWS, fitted_factors, matched_
 from gsmap.evaluation.core.chamfer_ap import ChamferConfig
 from gsmap.evaluation.core.file_evaluation import SamplePairs
 from gsmap.utils.cli import CommandParser, output_file, run_command
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import atomic_write
 from gsmap.utils.model_facts import CALIBRATION, CHECKPOINT
 from gsmap.utils.shards import digest
@@ -61,7 +62,7 @@ def require_held_out(trained: Mapping[str, Any], ground_truth: Path) -> None:
     if ground_truth.suffix.lower() != ".json":
         meta = AnnotationFile(ground_truth).meta
         if (trained.get("dataset"), trained.get("split")) == (meta.dataset, meta.split):
-            raise ValueError(
+            raise InputError(
                 f"{ground_truth} holds the split {meta.split!r}, which the model was trained on: "
                 "its errors there are smaller than elsewhere; give results of another split."
             )
@@ -85,18 +86,18 @@ def main() -> str:
     with building(cfg):
         adopt_settings(cfg, args.checkpoint, None)
         if cfg.model.map_head.get("temperatures"):
-            raise ValueError(
+            raise InputError(
                 f"{args.checkpoint} is calibrated already: give the checkpoint that it was made of."
             )
         classes = tuple(cfg.model.classes)
         model = MODELS.build(cfg.model)
         if "scales" not in model.map_head.reference.outputs:
-            raise ValueError(f"{args.config} has no Gaussians: give a config of GSMap.")
+            raise InputError(f"{args.config} has no Gaussians: give a config of GSMap.")
         pairs = SamplePairs(args.results, args.ground_truth, classes, True, gaussians=True)
         vertices = matched_vertices(pairs, ChamferConfig(classes))
         made_by = pairs.about.get(CHECKPOINT)  # nothing in earlier files
         if made_by not in (None, digest(find_checkpoint(args.checkpoint))):
-            raise ValueError(
+            raise InputError(
                 f"{args.results} was made with another checkpoint than {args.checkpoint}: give "
                 "this one's predictions (tools/test.py --out)."
             )

@@ -40,6 +40,7 @@ from mmengine.config import DictAction
 from gsmap.engine.arguments import data_root_options
 from gsmap.methods import METHODS
 from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.errors import InputError, WorkError
 from gsmap.utils.files import read_json, write_text
 from gsmap.utils.progress import Progress
 from gsmap.utils.shipped import shipped
@@ -96,7 +97,7 @@ def read_tables(pattern: str = "*") -> list[dict[str, Any]]:
     tables += read_json(shipped("configs/tables.json"))  # of several methods
     chosen = [table for table in tables if fnmatchcase(table["table"], pattern)]
     if not chosen:
-        raise ValueError(
+        raise InputError(
             f"no table is named {pattern!r}: compare.py --list names all {len(tables)}, and a "
             "pattern like 'GSMap*' chooses several."
         )
@@ -204,14 +205,14 @@ def main() -> str:
         return slurm_commands(runs, args.slurm)
     chosen = [run for run in runs if args.only in (None, run.label)]
     if args.only and not chosen:
-        raise ValueError(f"no run is {args.only}; there are {[run.label for run in runs]}.")
+        raise InputError(f"no run is {args.only}; there are {[run.label for run in runs]}.")
     if not args.rescore:
         train(chosen)
     tables = "" if args.only else tabulate(runs, args)
     failed = [run.label for run in chosen if not run.done]
     if failed:
         sys.stdout.write(f"{tables}\n")
-        raise RuntimeError(f"{', '.join(failed)} did not end: the table says why.")
+        raise WorkError(f"{', '.join(failed)} did not end: the table says why.")
     return tables
 
 

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from gsmap.utils.cli import CommandParser, output_file, run_command
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import atomic_write
 
 
@@ -22,7 +23,7 @@ def main() -> str:
     try:
         state, done = convert_state(weights)
     except ValueError as error:
-        raise ValueError(f"{args.source}: {error}") from error
+        raise InputError(f"{args.source}: {error}") from error
     with atomic_write(args.target, "wb") as file:
         torch.save({"state_dict": state, "meta": {"converted": done}}, file)
     return f"{done}, {len(state)} tensors, {args.target}"

@@ -10,6 +10,7 @@ import argparse
 from pathlib import Path
 
 from gsmap.utils.cli import CommandParser, output_file, run_command
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import write_text
 from gsmap.utils.shipped import shipped
 from mapdata.upstream_configs.reader import read_assignments
@@ -39,10 +40,10 @@ def convert(source: Path, target: Path, allow_changes: bool = False) -> str:
     except (
         ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError,
     ) as error:  # fmt: skip
-        raise ValueError(f"{source} cannot be converted: {error}") from error
+        raise InputError(f"{source} cannot be converted: {error}") from error
     of_model = [setting for setting in conversion.unplaced if setting.startswith("model.")]
     if of_model and not allow_changes:
-        raise ValueError(
+        raise InputError(
             f"{source} would become another model: {len(of_model)} of its settings have no "
             f"counterpart, {', '.join(of_model[:3])[:300]}... --allow-changes leaves them out."
         )

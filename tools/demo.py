@@ -21,6 +21,7 @@ from pathlib import Path
 
 from gsmap.datasets.annotations.record import CLASSES
 from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.errors import WorkError
 from gsmap.utils.files import write_text
 from gsmap.utils.parallel import die_with_parent
 from gsmap.utils.shipped import shipped
@@ -144,9 +145,7 @@ class Step:
         missing = [str(product) for product in self.products if not product.exists()]
         if status or missing:
             reason = f"made no {', '.join(missing)}" if not status else f"ended with {status}"
-            raise RuntimeError(
-                f"{position} {self.title} {reason}; run the command above to see why."
-            )
+            raise WorkError(f"{position} {self.title} {reason}; run the command above to see why.")
         write_text(stamp, f"{time.monotonic() - started:.0f} s\n")
         print(f"{position} {self.title}: {time.monotonic() - started:.0f} s", flush=True)
 

@@ -44,6 +44,7 @@ from gsmap.evaluation.core.report import MetricReport, format_table, write_figur
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.cli import CommandParser, output_file, run_command
+from gsmap.utils.errors import InputError
 from gsmap.utils.faults import nearest
 from gsmap.utils.model_facts import LAW_NAMES, law_of
 from gsmap.utils.ray_shards import run_on_ray
@@ -285,7 +286,7 @@ def settings_from(args: argparse.Namespace) -> MetricSettings:
         classes, x_range, y_range = meta.classes, meta.x_range, meta.y_range
     classes = tuple(args.classes or classes)
     for name in set(args.polygon_classes) - {*classes, *AREA_CLASSES}:
-        raise ValueError(f"--polygon-classes: there is no class {name!r}{nearest(name, classes)}")
+        raise InputError(f"--polygon-classes: there is no class {name!r}{nearest(name, classes)}")
     if args.range:
         x_range, y_range = tuple(args.range[::2]), tuple(args.range[1::2])
     thresholds = HARD_CHAMFER_THRESHOLDS if args.hard else args.thresholds
@@ -311,14 +312,14 @@ def evaluator_from(args: argparse.Namespace, settings: MetricSettings) -> MapEva
         import_module(module)
     evaluator = MapEvaluator.named(args.eval, settings, args.gt_points)
     if args.min_score is not None and not any(m.takes_min_score for m in evaluator.metrics):
-        raise ValueError("--min-score is of topology, hdmapnet and bemapnet: leave it out.")
+        raise InputError("--min-score is of topology, hdmapnet and bemapnet: leave it out.")
     if args.pr_curves and not any(metric.has_curves for metric in evaluator.metrics):
-        raise ValueError(
+        raise InputError(
             "--pr-curves draws what counts predictions of all samples: name chamfer or raster."
         )
     of_ap = args.by or args.bootstrap is not None or args.against
     if of_ap and not any(metric.ranks for metric in evaluator.metrics):
-        raise ValueError("--by, --bootstrap and --against are of AP: name chamfer or raster.")
+        raise InputError("--by, --bootstrap and --against are of AP: name chamfer or raster.")
     return evaluator
 
 
@@ -347,7 +348,7 @@ def consistency_report(args: argparse.Namespace) -> MetricReport:
     from gsmap.evaluation.analysis.drive_files import evaluate_drives
 
     if args.ground_truth.suffix.lower() == ".json":
-        raise ValueError(
+        raise InputError(
             f"--consistency needs poses, which {args.ground_truth} has not: give the "
             "annotation file (.arrow)."
         )

@@ -34,6 +34,7 @@ from gsmap.apis.onnx_inferencer import OnnxInferencer
 from gsmap.datasets.elements import elements_of_predictions
 from gsmap.engine.arguments import add_config_options
 from gsmap.utils.cli import CommandParser, output_file, run_command
+from gsmap.utils.errors import InputError
 
 if TYPE_CHECKING:  # slow to import
     from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
@@ -97,7 +98,7 @@ def write_model(inferencer: MapInferencer, args: argparse.Namespace) -> OnnxInfe
     """Export in the precision that is asked for."""
     options = inferencer.cfg.test_dataloader.dataset
     if not options.get("cameras"):
-        raise ValueError(f"{args.config} lists no cameras: set test_dataloader.dataset.cameras.")
+        raise InputError(f"{args.config} lists no cameras: set test_dataloader.dataset.cameras.")
     size = args.size
     if size is None:
         size = open_samples(inferencer, args, args.samples, "test")[0]["inputs"]["img"].shape[-2:]

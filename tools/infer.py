@@ -21,6 +21,7 @@ from gsmap.datasets.source import Source
 from gsmap.engine.arguments import add_config_options
 from gsmap.evaluation.core.results_json import SHARD_KIND as RESULTS
 from gsmap.utils.cli import CommandParser, output_file, run_command
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import own_folder, write_bytes
 from gsmap.utils.model_facts import CALIBRATION, CHECKPOINT
 from gsmap.utils.progress import Progress
@@ -189,7 +190,7 @@ def require_own_samples(path: Path) -> None:
     with suppress(ValueError):  # it is no annotation file at all
         if AnnotationFile(path).meta.command == SAMPLES_BY:
             return
-    raise ValueError(
+    raise InputError(
         f"{path} is there, and not from an earlier run of this command, which writes the samples "
         "of its input to that name: give another --out."
     )
@@ -318,9 +319,9 @@ def main(argv: list[str] | None = None) -> str | None:
             doubts = check_calibration(args, read_input(args, Path(frames)))
         sys.exit(DOUBTFUL if doubts else 0)
     if not args.out and not args.show_dir:
-        raise ValueError("Nothing to do: give --out FILE, --show-dir FOLDER, or both.")
+        raise InputError("Nothing to do: give --out FILE, --show-dir FOLDER, or both.")
     if args.width is not None and args.width < 1:
-        raise ValueError(f"--width must be >= 1 pixel, got {args.width}.")
+        raise InputError(f"--width must be >= 1 pixel, got {args.width}.")
     source = read_input(args)
     if not isinstance(source.samples, AnnotationFile):
         if args.out:
@@ -330,7 +331,7 @@ def main(argv: list[str] | None = None) -> str | None:
 
     inferencer = open_model(args)
     if args.shard.count and inferencer.model.temporal is not None:
-        raise ValueError(
+        raise InputError(
             "--shard cuts drives, which a model with memory needs whole: leave it out."
         )
     dataset = inferencer.dataset(source)
@@ -345,7 +346,7 @@ def main(argv: list[str] | None = None) -> str | None:
         broken = predict(args, inferencer, dataset, chosen, results)
         if chosen and len(broken) == len(chosen):
             noted = "".join(f"; as said: {note}" for note in source.notes[-1:])
-            raise ValueError(f"no frame can be used: {next(iter(broken.values()))}{noted}")
+            raise InputError(f"no frame can be used: {next(iter(broken.values()))}{noted}")
         if results:
             count = results.finish(about_results(args, dataset.metainfo))
             args.shard.seal(args.out, RESULTS, made_from, settings, count)

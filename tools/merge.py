@@ -16,6 +16,7 @@ from gsmap.evaluation.core.report import format_table, write_figures
 from gsmap.evaluation.core.results_json import SHARD_KIND as RESULTS
 from gsmap.evaluation.core.results_json import merge_results
 from gsmap.utils.cli import CommandParser, output_file, run_command
+from gsmap.utils.errors import InputError
 from gsmap.utils.shards import ShardFile, find_shards
 from gsmap.utils.words import counted
 
@@ -52,7 +53,7 @@ def main(argv: list[str] | None = None) -> str:
         shards = find_shards(target)
         kind = shards[0].manifest["kind"]
         if kind not in MERGE:
-            raise ValueError(f"{shards[0].path} holds {kind!r}, of which no whole is made.")
+            raise InputError(f"{shards[0].path} holds {kind!r}, of which no whole is made.")
         count = MERGE[kind](target, shards)
         lines.append(f"{target}: {counted(count, 'sample')} of {counted(len(shards), 'shard')}")
     return "\n".join(lines)

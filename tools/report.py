@@ -12,6 +12,7 @@ from pathlib import Path
 
 from gsmap.evaluation.analysis.calibration import LAWS
 from gsmap.utils.cli import CommandParser, output_file, run_command
+from gsmap.utils.errors import InputError
 from gsmap.visualization.film import write_drive_film
 from gsmap.visualization.page.page import PageOptions, is_own_page, page_data, write_page
 
@@ -91,7 +92,7 @@ def main() -> str:
     paths = [args.results, *([args.compare] if args.compare else [])]
     names = args.names or [f"{path.resolve().parent.name}/{path.stem}" for path in paths]
     if len(names) != len(paths) or len(set(names)) != len(names):
-        raise ValueError(f"--names must give {len(paths)} different names, got {names}.")
+        raise InputError(f"--names must give {len(paths)} different names, got {names}.")
     named = dict(zip(names, paths, strict=True))
     options = PageOptions(
         args.data_root,

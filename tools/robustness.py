@@ -22,6 +22,7 @@ from gsmap.checkpoints.named_models import checkpoint_for
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.engine.arguments import add_config_options
 from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import lock_folder, read_json, write_text
 from gsmap.utils.progress import Progress
 from gsmap.utils.split_lists import require_same_list
@@ -126,7 +127,7 @@ def earlier_figures(path: Path) -> dict[str, list[dict[str, float]]]:
         for kind, rows in figures.items()
     )
     if not good or CLEAN not in figures or not {*figures} <= {CLEAN, *KINDS}:
-        raise ValueError(f"{path} holds no figures of this command: give another --out.")
+        raise InputError(f"{path} holds no figures of this command: give another --out.")
     return figures
 
 
@@ -145,7 +146,7 @@ def kept_figures(
     """
     others = {kind: rows for kind, rows in before.items() if kind not in {CLEAN, *args.kinds}}
     if others and before[CLEAN] != clean:
-        raise ValueError(
+        raise InputError(
             f"{args.out} has figures of {', '.join(others)} of another model or other samples "
             f"(AP {before[CLEAN][0]['mean']:.1f} without corruption, here {clean[0]['mean']:.1f}): "
             "give another --out, or name these --kinds too."
@@ -177,7 +178,7 @@ def main() -> str:
     if not args.allow_other_split:
         require_own_split(checkpoint, model.cfg.test_dataloader.dataset)
     if model.temporal is not None and args.samples:
-        raise ValueError("--samples tears drives apart, which a model with memory needs whole.")
+        raise InputError("--samples tears drives apart, which a model with memory needs whole.")
     MMLogger.get_instance("robustness", log_level="ERROR")  # one table for each run is too much
     cases = [(CLEAN, 1), *((kind, severity) for kind in args.kinds for severity in SEVERITIES)]
     found: dict[str, list[dict[str, float]]] = {}

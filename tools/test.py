@@ -16,6 +16,7 @@ from mmengine.config import Config
 from gsmap.checkpoints.named_models import checkpoint_for
 from gsmap.engine.arguments import add_common_arguments
 from gsmap.utils.cli import CommandParser, output_file, run_command
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import write_text
 from gsmap.utils.interrupt import is_first_rank
 
@@ -83,7 +84,7 @@ def apply_options(cfg: Config, args: argparse.Namespace) -> None:
 def main() -> None:
     args = parse_args()
     if not args.eval and not args.out:
-        raise ValueError("Nothing to do: name a metric after --eval, or a file after --out.")
+        raise InputError("Nothing to do: name a metric after --eval, or a file after --out.")
     from gsmap.checkpoints.building import building
     from gsmap.checkpoints.reading import adopt_settings
     from gsmap.engine.launch import load_config

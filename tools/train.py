@@ -13,6 +13,7 @@ from mmengine.config import Config
 from gsmap.checkpoints.named_models import find_checkpoint
 from gsmap.engine.arguments import add_common_arguments
 from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import lock_folder
 from gsmap.utils.interrupt import is_first_rank
 
@@ -52,7 +53,7 @@ def choose_start(cfg: Config, resume: str | None) -> None:
         cfg.load_from = str(find_checkpoint(cfg.load_from))
         read_weights(cfg.load_from)
         if not cfg.resume and Path(cfg.load_from).resolve().parent == Path(cfg.work_dir).resolve():
-            raise ValueError(
+            raise InputError(
                 f"{cfg.load_from}, from which this run is to start, lies in its work folder, whose "
                 "checkpoints it would replace: give another --work-dir, or --resume."
             )
@@ -83,7 +84,7 @@ def main() -> None:
         cfg.optim_wrapper.type = "CPUAutocastOptimWrapper"
     if args.auto_scale_lr:
         if "base_batch_size" not in cfg.get("auto_scale_lr", {}):
-            raise ValueError(f"{args.config} names no auto_scale_lr.base_batch_size to scale from.")
+            raise InputError(f"{args.config} names no auto_scale_lr.base_batch_size to scale from.")
         cfg.auto_scale_lr.enable = True
     with writes_alone(cfg.work_dir):
         choose_start(cfg, args.resume)

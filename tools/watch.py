@@ -13,6 +13,7 @@ from tensorboard import default, main_lib, program
 from tensorboard.plugins.base_plugin import FlagsError
 
 from gsmap.utils.cli import run_command
+from gsmap.utils.errors import InputError
 
 
 def main() -> None:
@@ -21,7 +22,7 @@ def main() -> None:
     try:
         app.run(board.main, flags_parser=board.configure)
     except FlagsError as error:
-        raise ValueError(str(error)) from error
+        raise InputError(str(error)) from error
 
 
 if __name__ == "__main__":

@@ -54,7 +54,7 @@ def test_no_pickle_runs_anything(reader: str, tmp_path: Path):
     assert outcomes.keys() == attacks.keys()
     del outcomes["huge memo"]  # a list and nothing else, if memory is not taken for its number
     for name, outcome in outcomes.items():
-        assert outcome.startswith("did not run, ValueError: "), f"{name}: {outcome}"
+        assert outcome.startswith("did not run, InputError: "), f"{name}: {outcome}"
         assert "cannot be read as a pickle of plain data" in outcome, f"{name}: {outcome}"
 
 
@@ -73,7 +73,7 @@ def test_no_checkpoint_runs_anything(container: str, tmp_path: Path):
     outcomes = read_all("weights", tmp_path)
     assert outcomes.keys() == attacks.keys()
     for name, outcome in outcomes.items():
-        assert outcome.startswith("did not run, ValueError: "), f"{name}: {outcome}"
+        assert outcome.startswith("did not run, InputError: "), f"{name}: {outcome}"
 
 
 @pytest.fixture
@@ -97,7 +97,7 @@ def test_no_settings_of_a_checkpoint_run_anything(checkpoints: set[str], tmp_pat
     outcomes = read_all("settings", tmp_path)
     assert outcomes.keys() == checkpoints
     for name, outcome in outcomes.items():
-        assert outcome.startswith("did not run, ValueError: "), f"{name}: {outcome}"
+        assert outcome.startswith("did not run, InputError: "), f"{name}: {outcome}"
         assert f"{name}.pkl was not loaded: of the settings in it" in outcome, f"{name}: {outcome}"
 
 
@@ -108,7 +108,7 @@ def test_no_config_of_another_repository_runs_anything_or_hangs(tmp_path: Path):
     outcomes = read_all("config", tmp_path)
     assert outcomes.keys() == attacks.keys()
     for name, outcome in outcomes.items():
-        assert outcome.startswith("did not run, ValueError: "), f"{name}: {outcome}"
+        assert outcome.startswith("did not run, InputError: "), f"{name}: {outcome}"
         assert f"{name}.pkl" in outcome, f"{name}: {outcome}"
         assert not (tmp_path / f"{name}.py").exists()
 

@@ -188,7 +188,7 @@ generate(root=Path({str(root)!r}), scenes=2, seed=0, image_size=(64, 36), sample
 """
     done = run_python("-", input=program)
     assert done.returncode == 1
-    assert "RuntimeError: a worker process died" in done.stderr
+    assert "WorkError: a worker process died" in done.stderr
     assert not list(tmp_path.iterdir())
 
 

@@ -3,6 +3,7 @@
 import errno
 import os
 import signal
+from pathlib import Path
 
 import pyarrow as pa
 import pytest
@@ -14,6 +15,7 @@ from torch.utils.data import DataLoader
 from gsmap.checkpoints.building import building
 from gsmap.checkpoints.reading import refusing
 from gsmap.datasets.errors import naming
+from gsmap.utils.errors import InputError, WorkError
 from gsmap.utils.faults import in_words, is_of_the_machine
 
 PARTS = Registry("part")
@@ -68,6 +70,53 @@ def test_settings_that_nothing_can_be_made_of(settings, text):
     assert said(build).endswith(text)
 
 
+@PARTS.register_module()
+class Spoke:
+    """A part that raises an error."""
+
+    def __init__(self, error: Exception):
+        raise error
+
+
+@pytest.fixture
+def bike(tmp_path, monkeypatch) -> Config:
+    """A config from a file, with an empty model."""
+    monkeypatch.chdir(tmp_path)
+    Path("bike.py").write_text("model = dict()")
+    return Config.fromfile("bike.py")
+
+
+@pytest.mark.parametrize(
+    ("error", "raised", "text"),
+    [
+        (InputError("no radius."), InputError, "bike.py: no radius."),
+        (WorkError("no GPU."), WorkError, "bike.py: no GPU."),
+        (InputError("no file a/b."), InputError, "no file a/b."),
+        (ValueError("no radius."), InputError, "bike.py: Spoke cannot be made from these settings"),
+        (KeyError("radius"), InputError, "bike.py: Spoke cannot be made from these settings: Key"),
+        (FileNotFoundError("no file a/b."), FileNotFoundError, "no file a/b."),
+        (MemoryError(), MemoryError, "out of memory"),
+    ],
+)
+def test_an_error_of_a_part_names_the_config_once(error, raised, text, bike):
+    with pytest.raises(raised) as caught, building(bike), building(bike):
+        PARTS.build({"type": "Spoke", "error": error})
+    assert type(caught.value) is raised
+    assert in_words(caught.value).startswith(text)
+
+
+def test_a_bug_beside_the_parts_stays_a_bug():
+    with pytest.raises(ValueError, match="could not convert") as caught, building(Config()):
+        float("x")
+    assert in_words(caught.value) is None
+
+
+def test_a_setting_that_is_missing(bike):
+    text = r"^bike\.py: a setting is missing: .*wheels"
+    with pytest.raises(InputError, match=text), building(bike):
+        bike.model.wheels.radius_m = 1
+
+
 @pytest.mark.parametrize("kind", [MemoryError, RuntimeError, torch.OutOfMemoryError])
 def test_want_of_memory_says_what_to_lower(kind):
     def work() -> None:
@@ -111,7 +160,8 @@ class Broken(torch.utils.data.Dataset):
 @pytest.mark.parametrize(
     ("error", "text"),
     [
-        (ValueError("sample 'a': no image at b.jpg"), "sample 'a': no image at b.jpg"),
+        (InputError("sample 'a': no image at b.jpg"), "sample 'a': no image at b.jpg"),
+        (ValueError("no check of ours"), None),
         (FileNotFoundError("no file c.jpg"), "no file c.jpg"),
         (None, None),
     ],

@@ -102,7 +102,7 @@ def test_a_program_that_cannot_be_imported_anew_ends_in_words():
     )
     done = run_python("-", input=program)
     assert done.returncode == 1
-    assert "RuntimeError: a worker process died" in done.stderr
+    assert "WorkError: a worker process died" in done.stderr
 
 
 def test_workers_end_with_a_parent_that_is_killed(tmp_path):

@@ -26,6 +26,7 @@ from gsmap.checkpoints.settings import differences, plain
 from gsmap.engine.arguments import parse_options
 from gsmap.engine.checkpoint_hook import VALIDATED
 from gsmap.engine.launch import check_config, read_config
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import read_json
 from gsmap.utils.shards import digest
 from gsmap.utils.shipped import shipped
@@ -64,10 +65,10 @@ def parse_entry(text: str) -> Entry:
     name, given, config = first.rpartition("=")
     name = name if given else Path(config).stem
     if not re.fullmatch(r"[\w.+-]+", name):
-        raise ValueError(f"{text!r}: a name holds letters, digits and . _ + - only, got {name!r}.")
+        raise InputError(f"{text!r}: a name holds letters, digits and . _ + - only, got {name!r}.")
     for option in options:
         if "=" not in option:
-            raise ValueError(f"{text!r}: {option!r} is no override; write KEY=VALUE.")
+            raise InputError(f"{text!r}: {option!r} is no override; write KEY=VALUE.")
     return Entry(name, config, tuple(options))
 
 
@@ -180,7 +181,7 @@ def plan(entries: Sequence[Entry], protocol: Protocol) -> list[Run]:
     """
     names = [entry.name for entry in entries]
     if len(set(names)) < len(names):
-        raise ValueError(f"two configs have one name: {names}; write NAME=CONFIG.")
+        raise InputError(f"two configs have one name: {names}; write NAME=CONFIG.")
     if protocol.init is not None:
         read_weights(protocol.init)
     processes = _processes(protocol)
@@ -197,7 +198,7 @@ def plan(entries: Sequence[Entry], protocol: Protocol) -> list[Run]:
         )
     for one, other in combinations(runs[: len(entries)], 2):
         if not differences(one.settings, other.settings):
-            raise ValueError(
+            raise InputError(
                 f"{one.name} and {other.name} would be the same run: no setting of training "
                 "differs. Leave one out, or check its overrides."
             )
@@ -229,7 +230,7 @@ def _plan_run(entry: Entry, seed: int, protocol: Protocol, processes: int) -> Ru
     epoch = math.ceil(share / cfg.train_dataloader.batch_size)
     epochs = round(protocol.budget / epoch) or 1
     if epochs * epoch != protocol.budget:
-        raise ValueError(
+        raise InputError(
             f"a budget of {protocol.budget} iterations is no whole number of epochs of {entry.name}"
             f" ({epoch} iterations each): give {epochs * epoch}."
         )
@@ -240,7 +241,7 @@ def _plan_run(entry: Entry, seed: int, protocol: Protocol, processes: int) -> Ru
     cfg = read_config(entry.config, parse_options([*words, *own]))
     check_config(cfg)
     if cfg.train_cfg.max_epochs != epochs:
-        raise ValueError(f"{entry.name}: the budget decides train_cfg.max_epochs; leave it out.")
+        raise InputError(f"{entry.name}: the budget decides train_cfg.max_epochs; leave it out.")
     with building(cfg):
         MODELS.build(cfg.model)
     settings = {key: plain(cfg.get(key)) for key in _DECIDING}
@@ -278,14 +279,14 @@ def _refuse(found: Mapping[str, tuple[Any, Any]], what: str, remedy: str) -> Non
     """Raise an error that names settings that differ, if any do."""
     if found:
         shown = "; ".join(f"{key}: {a} and {b}" for key, (a, b) in list(found.items())[:_SHOWN])
-        raise ValueError(f"{what}: {shown}. {remedy[0].upper()}{remedy[1:]}.")
+        raise InputError(f"{what}: {shown}. {remedy[0].upper()}{remedy[1:]}.")
 
 
 def _noted(path: Path) -> dict[str, Any]:
     """Return what a run was started with."""
     found = read_json(path)
     if not isinstance(found, dict) or not isinstance(found.get("processes"), int):
-        raise ValueError(f"{path} is not what a run noted: give another --out, or remove the run.")
+        raise InputError(f"{path} is not what a run noted: give another --out, or remove the run.")
     return found
 
 
@@ -299,6 +300,6 @@ def _check_folder(run: Run) -> None:
             "give another --out, or remove it",
         )
     elif run.folder.is_dir() and any(run.folder.iterdir()):
-        raise ValueError(
+        raise InputError(
             f"{run.folder} holds something else than a run of this comparison: give another --out."
         )

@@ -22,6 +22,7 @@ from gsmap.evaluation.core.file_evaluation import evaluate_files
 from gsmap.evaluation.core.raster_ap import RasterConfig
 from gsmap.evaluation.core.report import MetricReport, flat_metrics
 from gsmap.structures.grid import BEVGrid
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import read_json
 from gsmap.utils.parallel import default_workers
 from gsmap.utils.words import markdown_table
@@ -100,7 +101,7 @@ def read_result(name: str, folder: Path, seed: int | None = None) -> Result:
     if seed is None and log:
         seed = _config(folder).section("randomness").get("seed")
         if not isinstance(seed, int | None):
-            raise ValueError(
+            raise InputError(
                 f"{folder}: the seed in its config must be a number, got {seed!r:.60}."
             )
     return Result(name, seed, folder, state, figures, costs, record, log)
@@ -110,7 +111,7 @@ def _json(path: Path) -> dict[str, Any]:
     """Read a JSON object; empty if there is no such file."""
     content = read_json(path) if path.is_file() else {}
     if not isinstance(content, dict):
-        raise ValueError(f"{path} must hold a JSON object, got {content!r:.60}.")
+        raise InputError(f"{path} must hold a JSON object, got {content!r:.60}.")
     return content
 
 
@@ -122,7 +123,7 @@ def _config(folder: Path) -> Fields:
     """
     noted = sorted(folder.glob("2*/vis_data/config.py"))
     if not noted:
-        raise ValueError(
+        raise InputError(
             f"{folder} does not say what it is a run of: it holds no 2*/vis_data/config.py, which "
             "tools/train.py writes. Copy the whole work folder."
         )
@@ -139,7 +140,7 @@ def check_one_test_set(results: Sequence[Result]) -> None:
     for folder, found in counts[1:]:
         first, expected = counts[0]
         if found != expected:
-            raise ValueError(
+            raise InputError(
                 f"{first} and {folder} were tested on different data: {expected} and {found}."
             )
 
@@ -158,7 +159,7 @@ def evaluator_for(annotations: Path, changes: Mapping[str, Any]) -> MapEvaluator
     unknown = own.keys() - set().union(*known)
     if unknown:
         allowed = sorted(set().union(*known))
-        raise ValueError(f"no metric has the setting {sorted(unknown)}; there are {allowed}.")
+        raise InputError(f"no metric has the setting {sorted(unknown)}; there are {allowed}.")
     chamfer, raster, both = ({k: v for k, v in own.items() if k in part} for part in known)
     return MapEvaluator(ChamferConfig(**chamfer), RasterConfig(**raster), **both)
 
@@ -167,7 +168,7 @@ def rescore(result: Result, changes: Mapping[str, Any]) -> list[MetricReport]:
     """Score a run's ``results.json`` again, under changed rules if any are given."""
     dataset = _config(result.folder).section("test_dataloader.dataset")
     if "ann_file" not in dataset:
-        raise ValueError(f"{result.folder}: its config does not name the data of its test.")
+        raise InputError(f"{result.folder}: its config does not name the data of its test.")
     annotations = Path(str(dataset.get("data_root", "")), str(dataset["ann_file"]))
     evaluator = evaluator_for(annotations, changes)
     predictions = result.folder / "results.json"

@@ -14,6 +14,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from gsmap.evaluation.core.average_precision import precision_recall
 from gsmap.evaluation.core.report import MetricReport
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import read_text
 from gsmap.visualization.plots import finish_panel, finish_shares, panel_grid
 from gsmap.visualization.style import RUN_COLOURS, MapStyle
@@ -57,12 +58,12 @@ def _records(path: Path) -> list[dict[str, float]]:
         try:
             record = json.loads(line)
             if not isinstance(record, dict):
-                raise ValueError("it is no object")
+                raise InputError("it is no object")
             records.append({k: float(v) for k, v in record.items() if isinstance(v, int | float)})
         except (ValueError, OverflowError) as error:
             if number == len(lines):
                 break
-            raise ValueError(f"{path}, line {number} is not JSON: {error}.") from error
+            raise InputError(f"{path}, line {number} is not JSON: {error}.") from error
     return [record for record in records if "step" in record]
 
 
@@ -91,7 +92,7 @@ def read_run(path: str | Path, name: str | None = None) -> RunLog:
         for record in _records(file):
             (train if "loss" in record else val)[record["step"]] = record
     if not (train or val):
-        raise ValueError(f"{files[0]} holds no record of training: give a run's scalars.json.")
+        raise InputError(f"{files[0]} holds no record of training: give a run's scalars.json.")
     ordered = [[part[step] for step in sorted(part)] for part in (train, val)]
     return RunLog(name or path.resolve().name, *ordered)
 
@@ -167,7 +168,7 @@ def plot_runs(runs: Sequence[RunLog]) -> Figure:
         ValueError: If there is no run, or none that logged a loss.
     """
     if not any(run.train for run in runs):
-        raise ValueError("plot_runs needs at least one run that logged a loss.")
+        raise InputError("plot_runs needs at least one run that logged a loss.")
     validated = any(run.val for run in runs)
     figure, axes = panel_grid(2 if validated else 1, 2)
     _draw_training(axes[0, 0], runs, "loss", "training loss")
@@ -187,7 +188,7 @@ def plot_series(runs: Sequence[RunLog], keys: Sequence[str]) -> Figure:
     logged = {key for run in runs for record in run.train for key in record}
     unknown = [key for key in keys if key not in logged]
     if unknown:
-        raise ValueError(f"no run logged {unknown}; there are {sorted(logged - set(_TIMING))}.")
+        raise InputError(f"no run logged {unknown}; there are {sorted(logged - set(_TIMING))}.")
     columns = min(len(keys), 2)
     figure, axes = panel_grid(-(-len(keys) // columns), columns)
     for panel, key in zip(axes.ravel(), keys, strict=False):

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import MapSample
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
+from gsmap.utils.errors import InputError
 
 MIN_LENGTH_M = 2.0
 MIN_AREA_M2 = 1.0
@@ -123,12 +124,12 @@ def read_drive(annotations: AnnotationFile, scene: str, maps: Mapping[str, MapEl
     meta, scenes = annotations.meta, annotations.column("scene")
     samples = [annotations[i] for i, name in enumerate(scenes) if name == scene]
     if not samples:
-        raise ValueError(
+        raise InputError(
             f"{annotations.path} has no scene {scene!r}, but {sorted(set(scenes))[:5]} ..."
         )
     samples = sorted((s for s in samples if s.token in maps), key=lambda s: s.timestamp_ns)
     if not samples:
-        raise ValueError(
+        raise InputError(
             f"no sample of scene {scene!r} has results: give the results of {annotations.path}."
         )
     frames = [

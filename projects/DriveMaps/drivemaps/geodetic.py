@@ -8,6 +8,7 @@ import numpy as np
 
 from gsmap.datasets.annotations.record import AnnotationMeta
 from gsmap.structures.elements import FloatArray
+from gsmap.utils.errors import InputError
 from gsmap.utils.extras import import_extra
 
 _FARTHEST_M = 100_000.0
@@ -32,7 +33,7 @@ class MapOrigin:
 
     def __post_init__(self) -> None:
         if not (abs(self.latitude_deg) < 90.0 and abs(self.longitude_deg) <= 180.0):
-            raise ValueError(
+            raise InputError(
                 "an origin is a latitude within 90 and a longitude within 180 degrees, got "
                 f"{self.latitude_deg} {self.longitude_deg}."
             )
@@ -56,7 +57,7 @@ class MapOrigin:
         x, y = np.asarray(points)[:, :2].T
         degrees = np.stack(self._projection(x + east, y + north, inverse=True), axis=1)
         if not np.isfinite(degrees).all():
-            raise ValueError(
+            raise InputError(
                 f"the map reaches {max(np.abs(x).max(), np.abs(y).max()):.3g} m from the origin of "
                 "its frame, where there is no longitude and latitude: its poses are wrong, or "
                 "--formats geojson without --origin writes metres."
@@ -83,10 +84,10 @@ class MapGrid:
         try:
             found = crs.from_user_input(self.crs)
         except Exception as error:  # pyproj's own is no ValueError
-            raise ValueError(f"{self.crs} is no coordinate reference system: {error}.") from error
+            raise InputError(f"{self.crs} is no coordinate reference system: {error}.") from error
         units = {axis.unit_name for axis in found.axis_info[:2]}
         if not found.is_projected or units != {"metre"}:
-            raise ValueError(
+            raise InputError(
                 f"{self.crs} ({found.name}) is no grid in metres: give that of the poses, such as "
                 "EPSG:32650."
             )
@@ -117,7 +118,7 @@ def require_near(positions: FloatArray, where: str) -> None:
     """
     farthest_m = float(np.abs(np.asarray(positions)[:, :2]).max(initial=0.0))
     if farthest_m > _FARTHEST_M:
-        raise ValueError(
+        raise InputError(
             f"{where}: positions lie up to {farthest_m / 1000:.0f} km from the origin, so they are "
             "no metres from it: if they are coordinates of a grid, give --crs (such as EPSG:32650 "
             "for UTM zone 50) instead of --origin."

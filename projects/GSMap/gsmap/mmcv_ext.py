@@ -15,6 +15,8 @@ from importlib.util import spec_from_file_location
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from gsmap.utils.errors import WorkError
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -99,7 +101,7 @@ def __getattr__(name: str) -> Callable[..., NoReturn]:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
     def missing(*_: Any, **__: Any) -> NoReturn:
-        raise RuntimeError(
+        raise WorkError(
             f"the operator {name} of mmcv is not compiled here: `GSMAP_MMCV_OPS=1 make setup` "
             "replaces mmcv-lite by an mmcv with its operators (docs/install.md)."
         )

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from gsmap.utils.errors import InputError
 from mapdata.bag_images import image_size, trouble_with
 from mapdata.folders.rig import RigCamera
 
@@ -95,7 +96,7 @@ def _matrix(info: Any, name: str) -> np.ndarray:
     """Return K or the first three columns of P; an empty one is 0. (3, 3)"""
     found, columns = _field(info, name), 3 if name == "k" else 4
     if found.size not in (0, 3 * columns):
-        raise ValueError(f"its camera info has {found.size} numbers in {name.upper()}")
+        raise InputError(f"its camera info has {found.size} numbers in {name.upper()}")
     return found.reshape(3, columns)[:, :3] if found.size else np.zeros((3, 3))
 
 
@@ -129,11 +130,11 @@ def camera_of(
     if min(full_px) > 0 and not _is_pinhole(matrix):
         used, empty = ("K", "P") if rectified else ("P", "K")
         if not _is_pinhole(other):
-            raise ValueError(
+            raise InputError(
                 f"{where} has no calibration, K and P have no focal lengths: give --calibration"
             )
         if not straight:
-            raise ValueError(
+            raise InputError(
                 f"{where} has no focal lengths in {empty}, and {used} alone is not enough with its "
                 "distortion: give --calibration"
             )
@@ -150,7 +151,7 @@ def camera_of(
             "pixels: neither is applied"
         )
     else:
-        raise ValueError(
+        raise InputError(
             f"{where} says {full_px} pixels, binning {binning} and a region of interest from "
             f"{offset_px}, so {size_px}, but its images have {found[0]}: record the camera info of "
             "these images, or give --calibration"

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import yaml
 
+from gsmap.utils.errors import InputError
 from mapdata.mcap_bag import MAGIC, McapBag, is_plain_ros2
 from mapdata.ros_bag import RosBag
 
@@ -96,12 +97,12 @@ def _metadata(file: Path) -> str:
             stand for others (aliases and merge keys of YAML), which rosbag2 does not write.
     """
     if file.stat().st_size > _MOST_BYTES:
-        raise ValueError(
+        raise InputError(
             f"{file.name} has more than {_MOST_BYTES} bytes: `ros2 bag convert` writes fewer parts"
         )
     text = file.read_text(encoding="utf-8", errors="replace")
     if "<<" in text or _ALIAS.search(text):
-        raise ValueError(f"{file.name} has aliases of YAML: `ros2 bag reindex` writes it anew")
+        raise InputError(f"{file.name} has aliases of YAML: `ros2 bag reindex` writes it anew")
     return text
 
 
@@ -111,7 +112,7 @@ def _check_parts(parts: Sequence[Path]) -> None:
     numbers = {_number_of(part) for part in parts}
     if len(parts) > 1 and (len(patterns) > 1 or len(numbers) < len(parts)):
         found = ", ".join(part.name for part in parts)
-        raise ValueError(f"it holds several bags ({found}): name one of them")
+        raise InputError(f"it holds several bags ({found}): name one of them")
 
 
 def _notes_on(parts: Sequence[Path]) -> list[str]:

@@ -9,6 +9,7 @@ import numpy as np
 from PIL import Image
 
 from gsmap.datasets.image_files import FORMATS, decode_image
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import write_bytes
 from mapdata.folders.rig import RigCamera
 
@@ -72,7 +73,7 @@ def write_image(message: Any, camera: RigCamera, target: Path, where: str) -> No
         camera.write_image(target, _raw_image(message, camera.size_px))
         return
     if trouble := trouble_with(message):
-        raise ValueError(trouble)
+        raise InputError(trouble)
     content = np.asarray(message.data, np.uint8).tobytes()
     image = decode_image(content, "its message", where, camera.size_px)
     if camera.is_distorted or not content.startswith(b"\xff\xd8"):
@@ -85,9 +86,9 @@ def _raw_image(message: Any, size_px: tuple[int, int]) -> np.ndarray:
     """Return an uncompressed image, BGR. (H, W, 3)"""
     encoding, found = message.encoding, (message.width, message.height)
     if trouble := trouble_with(message):
-        raise ValueError(trouble)
+        raise InputError(trouble)
     if found != size_px:
-        raise ValueError(f"it has {found} pixels, and its camera info says {size_px}")
+        raise InputError(f"it has {found} pixels, and its camera info says {size_px}")
     channels = _CHANNELS.get(encoding, 1)
     rows = np.asarray(message.data, np.uint8).reshape(message.height, message.step)
     image = rows[:, : message.width * channels].reshape(message.height, message.width, channels)
@@ -95,4 +96,4 @@ def _raw_image(message: Any, size_px: tuple[int, int]) -> np.ndarray:
     try:
         return image if code is None else cv2.cvtColor(np.ascontiguousarray(image), code)
     except cv2.error as error:
-        raise ValueError(f"OpenCV cannot convert it from {encoding}: {error.err}") from error
+        raise InputError(f"OpenCV cannot convert it from {encoding}: {error.err}") from error

@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from gsmap.structures.rigid import invert_rigid
+from gsmap.utils.errors import InputError
 from mapdata.folders.rig import PoseTrack
 
 VEHICLE_FRAMES = ("base_footprint", "base_link")
@@ -155,7 +156,7 @@ class FrameTree:
         names = VEHICLE_FRAMES if wanted is None else (wanted,)
         there = [name for name in names if name in self.frames]
         if not there:
-            raise ValueError(
+            raise InputError(
                 f"its transforms have no frame {wanted or ' or '.join(VEHICLE_FRAMES)!s}: name the "
                 f"vehicle's with --vehicle-frame, or give --calibration calibration.yaml; there "
                 f"are {sorted(self.frames) or 'no transforms at all'}"
@@ -217,7 +218,7 @@ class FrameTree:
         while chain[-1] in self._chosen:
             parent = self._chosen[chain[-1]].parent
             if parent in chain:
-                raise ValueError(f"its transforms lead from {parent!r} back to it")
+                raise InputError(f"its transforms lead from {parent!r} back to it")
             chain.append(parent)
         return chain
 

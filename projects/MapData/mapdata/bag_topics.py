@@ -4,6 +4,8 @@ import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 
+from gsmap.utils.errors import InputError
+
 IMAGES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
 INFO = "sensor_msgs/msg/CameraInfo"
 _KINDS = (IMAGES, (INFO,))
@@ -27,7 +29,7 @@ def parse_topics(words: Sequence[str]) -> dict[str, tuple[str, str]]:
     for word in words:
         match = re.fullmatch(r"([^=,/]+)=(/[^=,]+)(?:,(/[^=,]+))?", word)
         if match is None or match[1] in found:
-            raise ValueError(
+            raise InputError(
                 f"--topics takes NAME=/images/topic,/info/topic once for each camera, got {word!r}."
             )
         found[match[1]] = match[2], match[3] or ""
@@ -50,14 +52,14 @@ def chosen_topics(
     """
     lacking = [name for name, (_, info) in topics.items() if needs_info and not info]
     if lacking:
-        raise ValueError(
+        raise InputError(
             f"--topics names no camera info of {', '.join(lacking)}: NAME=IMAGE_TOPIC,INFO_TOPIC, "
             "or give --calibration calibration.yaml"
         )
     pairs = ((t, w) for pair in topics.values() for t, w in zip(pair, _KINDS, strict=True))
     for topic, wanted in pairs:
         if topic and kinds.get(topic) not in wanted:
-            raise ValueError(
+            raise InputError(
                 f"--topics: {topic} is {kinds.get(topic, 'not there')}, and must be "
                 f"{' or '.join(wanted)}; it holds: {listing}"
             )
@@ -85,7 +87,7 @@ def image_topics(kinds: Mapping[str, str]) -> dict[str, str]:
     if len(set(names)) < len(names):
         names = [base.strip("/").replace("/", "_") for base in found]
     if len(set(names)) < len(names):
-        raise ValueError(f"the cameras {sorted(found)} get one name: {_REMEDY}")
+        raise InputError(f"the cameras {sorted(found)} get one name: {_REMEDY}")
     return dict(zip(names, found.values(), strict=True))
 
 
@@ -106,21 +108,21 @@ def camera_topics(kinds: Mapping[str, str], listing: str) -> dict[str, tuple[str
     candidates = {topic: _candidates(topic, infos) for topic in kinds}
     cameras = image_topics({t: kind for t, kind in kinds.items() if candidates[t]})
     if not cameras:
-        raise ValueError(
+        raise InputError(
             "it has no camera with images (sensor_msgs Image or CompressedImage) and a CameraInfo: "
             f"give --calibration calibration.yaml, or --topics; it holds: {listing or 'no topic'}"
         )
     claims = defaultdict(list)
     for name, topic in cameras.items():
         if len(candidates[topic]) > 1:
-            raise ValueError(f"which CameraInfo is that of {topic}, {candidates[topic]}? {_REMEDY}")
+            raise InputError(f"which CameraInfo is that of {topic}, {candidates[topic]}? {_REMEDY}")
         claims[candidates[topic][0]].append(name)
     for info, names in claims.items():
         own = [n for n in names if _words(cameras[n]) == _words(info)]
         if len(own) == 1:
             claims[info] = own
         elif len(names) > 1 or (info.count("/") == 1 and len(claims) > 1):
-            raise ValueError(f"is {info} that of {' or '.join(names)}? {_REMEDY}")
+            raise InputError(f"is {info} that of {' or '.join(names)}? {_REMEDY}")
     return {names[0]: (cameras[names[0]], info) for info, names in claims.items()}
 
 

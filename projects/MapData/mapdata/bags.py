@@ -12,6 +12,7 @@ import numpy as np
 from gsmap.datasets.errors import naming
 from gsmap.datasets.source import Source
 from gsmap.structures.rigid import invert_rigid, rigid
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import file_name
 from mapdata.argoverse2.samples import thin_out
 from mapdata.bag_cameras import ImageTopic, camera_of, is_calibrated, is_same_calibration
@@ -63,7 +64,7 @@ def read_bag(path: Path, options: InputOptions) -> Source:
             damage = damage_in(path)
             if damage is None:
                 raise
-            raise ValueError(damage) from error
+            raise InputError(damage) from error
 
 
 def _messages(bag: Bag, connections: Sequence[Any]) -> Iterator[tuple[Any, int, bytes]]:
@@ -183,7 +184,7 @@ def _topic_of(name: str, place: str, images: Mapping[str, str], kinds: Mapping[s
     """Return the topic of a calibrated camera's images: as its file says, or of its name."""
     topic = place if place in kinds else images.get(name)
     if topic is None:
-        raise ValueError(
+        raise InputError(
             f"camera {name!r} of the calibration has no images: the bag's are {sorted(images)}; "
             "set its `images` to a topic, or give --topics NAME=IMAGE_TOPIC"
         )
@@ -207,7 +208,7 @@ def _matrix(place: Any, turn: Any) -> np.ndarray:
     """Return a pose of a message. (4, 4)"""
     pose = rigid(rotation_of((turn.w, turn.x, turn.y, turn.z)), (place.x, place.y, place.z))
     if not np.isfinite(pose).all():
-        raise ValueError(f"a position is not finite: {pose[:3, 3].tolist()}")
+        raise InputError(f"a position is not finite: {pose[:3, 3].tolist()}")
     return pose
 
 
@@ -286,14 +287,14 @@ def _vehicle(content: _Content, wanted: str | None) -> str:
     except ValueError as error:
         topics = [*content.unreadable, *content.unread]
         unread = f"; {', '.join(topics)} cannot be read: {content.reason(topics)}" if topics else ""
-        raise ValueError(f"{error}{unread}") from error
+        raise InputError(f"{error}{unread}") from error
 
 
 def _require_messages(name: str, topics: tuple[str, str], content: _Content) -> None:
     """Raise a ``ValueError`` unless there are images of a camera, and its info if it has one."""
     topic, info = topics
     if not content.images[topic].times_ns or (info and topic not in content.infos):
-        raise ValueError(
+        raise InputError(
             f"camera {name!r} has no message on {topic} or {info or 'its info'}: choose others "
             f"with --topics, or give --calibration. {content.reason(topics)}".rstrip(" .")
         )
@@ -317,7 +318,7 @@ def _rig(
         trouble = content.images[pair[0]].trouble
         try:
             if trouble and is_any_readable and not by_hand:
-                raise ValueError(f"camera {name!r}: {trouble}")
+                raise InputError(f"camera {name!r}: {trouble}")
             rig[pair[0]], assumed = _camera(name, pair, content, vehicle, ground)
             notes += assumed
         except ValueError as error:
@@ -340,7 +341,7 @@ def _camera(
     frame = images.frame_id or info.header.frame_id.lstrip("/")
     vehicle_from_cam = content.tree.between(vehicle, frame)
     if vehicle_from_cam is None:
-        raise ValueError(
+        raise InputError(
             f"camera {name!r}: no transform leads from its frame {frame!r} to {vehicle!r}: give "
             "--calibration calibration.yaml, or another --vehicle-frame; there are those of "
             f"{sorted(content.tree.edges)}"
@@ -382,7 +383,7 @@ def _usage(
         f"{_span(pose_at.span_ns)}; gaps of more than 1 s are not bridged"
     )
     if not count:
-        raise ValueError(
+        raise InputError(
             f"no image has a pose near its time: {where}; images and transforms need one clock"
         )
     return [f"{count} of {asked} samples used: the others have no pose near them: {where}"]

@@ -13,6 +13,7 @@ from gsmap.datasets.annotations.record import MapSample
 from gsmap.datasets.errors import BrokenSampleError
 from gsmap.datasets.image_files import read_image
 from gsmap.datasets.plausibility import calibration_warnings
+from gsmap.utils.errors import InputError
 from gsmap.utils.faults import is_of_the_machine
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
@@ -29,11 +30,11 @@ def _open(path: Path) -> AnnotationFile:
         reader = pa.ipc.open_file(pa.memory_map(str(path)))
         for number, batch in enumerate(file.batches):
             if not reader.get_batch(number).equals(batch):
-                raise ValueError(f"part {number} is another one")
+                raise InputError(f"part {number} is another one")
     except (pa.ArrowException, OSError, ValueError) as error:
         if is_of_the_machine(error):
             raise
-        raise ValueError(
+        raise InputError(
             f"{path}: the footer, by which other programs read the file, is damaged ({error}); "
             f"{file.remedy}"
         ) from error
@@ -100,7 +101,7 @@ def check_files(paths: Sequence[Path], root: Path | None, workers: int) -> str:
             if problems := list(chain.from_iterable(found)):
                 more = f", and {len(problems) - _SHOWN} more" if len(problems) > _SHOWN else ""
                 shown = "; ".join(problems[:_SHOWN])
-                raise ValueError(f"{path} is right, but: {shown}{more}")
+                raise InputError(f"{path} is right, but: {shown}{more}")
             lines[-1] += ", images and LiDAR files whole"
     return "\n".join(lines)
 

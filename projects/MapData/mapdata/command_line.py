@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from gsmap.datasets.annotations.record import CLASSES, RANGES, AnnotationMeta
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import file_name
 from gsmap.utils.parallel import default_workers
 from gsmap.utils.shards import WHOLE, Shard, add_shard_options
@@ -133,7 +134,7 @@ def parse_rate(text: str) -> float | None:
         return None
     rate = float(text.lower().removesuffix("hz"))
     if not rate > 0:
-        raise ValueError(f"rate must be > 0, got {text}.")
+        raise InputError(f"rate must be > 0, got {text}.")
     return rate
 
 

@@ -23,6 +23,7 @@ from gsmap.datasets.errors import naming
 from gsmap.datasets.image_files import image_size, read_image
 from gsmap.structures.frames import frame_view
 from gsmap.structures.polylines import Points, clip_to_box, is_closed
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import file_name
 from gsmap.utils.shards import WHOLE, Shard
 from mapdata.folders.rig import RigCamera
@@ -112,7 +113,7 @@ def _samples(
         with naming(f"record {name!r}", "correct it"):
             unknown = set(record) - set(_KEYS)
             if unknown:
-                raise ValueError(f"unknown keys {sorted(unknown)}; known are {_KEYS}.")
+                raise InputError(f"unknown keys {sorted(unknown)}; known are {_KEYS}.")
             sample = _sample(record, meta, root)
             check_samples([sample], meta)
             samples += 1
@@ -201,9 +202,9 @@ def _sample(record: Mapping[str, Any], meta: AnnotationMeta, root: Path) -> MapS
 def _in_frame(record: Mapping[str, Any], meta: AnnotationMeta) -> dict[str, Any]:
     """Return a record whose elements are moved from the global frame to its own."""
     if record.get("instances") is not None:
-        raise ValueError(f"give instances, in the frame, or {_GLOBAL}, not both.")
+        raise InputError(f"give instances, in the frame, or {_GLOBAL}, not both.")
     if record.get("global_from_frame") is None:
-        raise ValueError(f"{_GLOBAL} need global_from_frame, the pose of the frame. (4, 4)")
+        raise InputError(f"{_GLOBAL} need global_from_frame, the pose of the frame. (4, 4)")
     pose = np.array(record["global_from_frame"], np.float64)
     if meta.dim == 2:  # as of published data sets: roll, pitch and height have no effect
         yaw = np.arctan2(pose[1, 0], pose[0, 0])
@@ -259,7 +260,7 @@ def _label(label: Any, meta: AnnotationMeta) -> int:
     if not isinstance(label, str):
         return int(label)
     if label not in meta.classes:
-        raise ValueError(f"label {label!r} is not among {meta.classes}.")
+        raise InputError(f"label {label!r} is not among {meta.classes}.")
     return meta.classes.index(label)
 
 
@@ -272,7 +273,7 @@ def _clipped(points: Points, meta: AnnotationMeta) -> list[Points]:
         return list(clip_to_box(points, meta.x_range, meta.y_range))
     polygon = shapely.Polygon(points)
     if not polygon.is_valid:
-        raise ValueError("a ring that leaves the range crosses itself and cannot be cut: mend it.")
+        raise InputError("a ring that leaves the range crosses itself and cannot be cut: mend it.")
     parts = shapely.get_parts(shapely.intersection(polygon, shapely.box(*low, *high)))
     areas = parts[(shapely.get_type_id(parts) == POLYGON) & ~shapely.is_empty(parts)]
     return vertices_of(shapely.get_exterior_ring(areas), meta.dim)

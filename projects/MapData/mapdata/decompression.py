@@ -11,6 +11,7 @@ from io import BytesIO
 from types import ModuleType, SimpleNamespace
 from typing import Any, ClassVar
 
+from gsmap.utils.errors import InputError
 from gsmap.utils.extras import import_extra
 
 FREE_BYTES = 1 << 26
@@ -79,7 +80,7 @@ def _counted(content: bytes, room: int) -> bytes:
     """
     _Bag.unpacked += len(content)
     if len(content) > room:
-        raise ValueError(
+        raise InputError(
             f"what is packed in it becomes more than {TIMES} times as large: if that is meant, "
             "unpack the bag first, such as by `mcap compress --compression none`"
         )

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from gsmap.datasets.source import Source, annotated
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import is_hidden
 from mapdata.argoverse2.log import logs_in
 from mapdata.argoverse2.samples import read_logs
@@ -42,9 +43,9 @@ def open_input(path: str | Path, options: InputOptions | None = None) -> Source:
         raise FileNotFoundError(f"There is no input {path}.")
     may_be_bag = is_bag(path) or (path.is_dir() and bool(parts_in(path)))
     if not may_be_bag and (options.topics or options.calibration):
-        raise ValueError(f"--topics and --calibration belong to a bag, and {path} is none.")
+        raise InputError(f"--topics and --calibration belong to a bag, and {path} is none.")
     if not may_be_bag and options.vehicle_ground_z_m is not None:
-        raise ValueError(
+        raise InputError(
             f"--vehicle-ground-z belongs to a bag, and {path} is none: the height of the road is "
             "ground_z_m of a calibration file, or of an annotation file's AnnotationMeta."
         )
@@ -61,8 +62,8 @@ def open_input(path: str | Path, options: InputOptions | None = None) -> Source:
     if path.suffix in (".yaml", ".yml", ".json"):
         return read_image_folder(path, options.frames_dir, options.trained)
     if advice := suffix_advice(path):
-        raise ValueError(f"{path} cannot be used: {advice}.")
-    raise ValueError(f"{path} is no input: it must be {KINDS}.")
+        raise InputError(f"{path} cannot be used: {advice}.")
+    raise InputError(f"{path} is no input: it must be {KINDS}.")
 
 
 def _open_folder(folder: Path, options: InputOptions) -> Source:
@@ -84,7 +85,7 @@ def _open_folder(folder: Path, options: InputOptions) -> Source:
         return open_input(files[0], options)
     if files:
         names = ", ".join(path.name for path in files)
-        raise ValueError(f"{folder} holds several files ({names}): name one of them.")
+        raise InputError(f"{folder} holds several files ({names}): name one of them.")
     if parts_in(folder):
         return read_bag(folder, options)
     raise FileNotFoundError(f"{folder} holds no input: it must be {KINDS}.")

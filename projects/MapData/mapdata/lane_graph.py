@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 import shapely
 
+from gsmap.utils.errors import InputError
+
 ROUND_DECIMALS = 3  # points closer than a millimetre are one node of the graph
 SIMPLIFY_TOLERANCE_M = 0.2
 MAX_PATHS = 20_000
@@ -47,9 +49,9 @@ class LanePaths:
     def __init__(self, polylines: Sequence[np.ndarray], links: LaneLinks) -> None:
         for i, line in enumerate(polylines):
             if line.ndim != 2 or line.shape[1] != 3 or len(line) < 2:
-                raise ValueError(f"polylines[{i}] must have shape (n >= 2, 3), got {line.shape}.")
+                raise InputError(f"polylines[{i}] must have shape (n >= 2, 3), got {line.shape}.")
             if not np.isfinite(line).all():
-                raise ValueError(f"polylines[{i}] holds NaN or infinity.")
+                raise InputError(f"polylines[{i}] holds NaN or infinity.")
         rounded = np.round(np.concatenate([np.empty((0, 3)), *polylines]), ROUND_DECIMALS)
         self._points, nodes, uses = np.unique(
             rounded, axis=0, return_inverse=True, return_counts=True
@@ -76,7 +78,7 @@ class LanePaths:
             found = chain.from_iterable(_paths_from(source, graph) for source in sources)
             paths = list(islice(found, MAX_PATHS + 1))
             if len(paths) > MAX_PATHS:
-                raise ValueError(
+                raise InputError(
                     f"the lanes of one frame allow more than {MAX_PATHS} paths: the lane graph is "
                     "damaged."
                 )

@@ -8,6 +8,7 @@ import numpy as np
 import shapely
 
 from gsmap.structures.polylines import Points, clip_to_box
+from gsmap.utils.errors import InputError
 
 LINE, POLYGON, COLLECTION = 1, 3, 7  # shapely type ids
 _CHUNK_SEGMENTS = 32
@@ -30,7 +31,7 @@ class LocalPatch:
     def __post_init__(self) -> None:
         pose = np.asarray(self.global_from_frame)
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
-            raise ValueError(f"global_from_frame must be a finite 4 x 4 matrix, got {pose}.")
+            raise InputError(f"global_from_frame must be a finite 4 x 4 matrix, got {pose}.")
 
     @cached_property
     def rotation(self) -> np.ndarray:

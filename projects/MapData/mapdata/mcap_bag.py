@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+from gsmap.utils.errors import InputError
 from gsmap.utils.extras import import_extra
 from mapdata.decompression import begin_bag, import_bounded
 from mapdata.foxglove_messages import ROS_TYPES, foxglove_parser
@@ -156,7 +157,7 @@ def _parser_of(connection: McapConnection, types: RosTypes) -> Parser:
         if encoding == "protobuf" and schema is not None and schema.name in ROS_TYPES:
             return foxglove_parser(schema.name, schema.data)
         if encoding not in ("cdr", "ros1"):
-            raise ValueError(f"its messages are in the encoding {encoding!r}")
+            raise InputError(f"its messages are in the encoding {encoding!r}")
         text = "" if schema is None else schema.data.decode()
         is_idl = schema is not None and schema.encoding in ("ros2idl", "omgidl")
     return types.parser(connection.msgtype, text, is_idl, encoding == "ros1")

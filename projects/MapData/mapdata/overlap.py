@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.utils.cli import output_file
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import write_text
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ def read_places(paths: Sequence[Path]) -> Places:
         file = AnnotationFile(path)
         found = [file.column(name) for name in ("token", "scene", "map_name")]
         if not file.meta.options.get("poses", True) or found[1] == found[2]:
-            raise ValueError(
+            raise InputError(
                 f"{path} does not say where its samples are on common maps: make it from the data "
                 "set itself, not from info files or pictures."
             )
@@ -179,7 +180,7 @@ def run(arguments: argparse.Namespace) -> str:
     """Report what validation shares with training, sample by sample."""
     train, val = read_places([arguments.train]), read_places([arguments.val])
     if not len(val.tokens):
-        raise ValueError(f"{arguments.val} has no sample.")
+        raise InputError(f"{arguments.val} has no sample.")
     distance, nearest = sample_overlap(train, val)
     shared = len({*train.scenes} & {*val.scenes})
     lines = [f"{len(val.tokens)} samples against {len(train.tokens)}; {shared} scenes are in both"]

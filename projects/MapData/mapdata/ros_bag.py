@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+from gsmap.utils.errors import InputError
 from gsmap.utils.extras import import_extra
 from mapdata.decompression import begin_bag, import_bounded
 
@@ -24,11 +25,11 @@ def library_errors() -> Iterator[None]:
     try:
         yield
     except MemoryError as error:
-        raise ValueError("a length in it asks for more memory than there is") from error
+        raise InputError("a length in it asks for more memory than there is") from error
     except Exception as error:
         if isinstance(error, OSError) and error.errno:
             raise
-        raise ValueError(str(error) or type(error).__name__) from error
+        raise InputError(str(error) or type(error).__name__) from error
 
 
 class _AddressedPath(type(Path())):  # type: ignore[misc]
@@ -67,7 +68,7 @@ class RosTypes:
         with library_errors():
             store = self._store_of(msgtype, definition, is_idl)
             if msgtype not in store.fielddefs:
-                raise ValueError(f"the bag does not define its type {msgtype!r}")
+                raise InputError(f"the bag does not define its type {msgtype!r}")
         deserialize = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
         return lambda content: deserialize(content, msgtype)
 
@@ -76,7 +77,7 @@ class RosTypes:
         if not definition:
             return _standard_store()
         if len(definition) > _MOST_LETTERS:
-            raise ValueError(f"its definition has {len(definition)} letters, not {_MOST_LETTERS}")
+            raise InputError(f"its definition has {len(definition)} letters, not {_MOST_LETTERS}")
         types = _types(self._typesys, msgtype, definition, is_idl)
         self._count_fields(types)
         try:
@@ -106,7 +107,7 @@ class RosTypes:
             item, count = of_kind
             values = size_of(*item)
             if not values:
-                raise ValueError("it has an array of values without any field")
+                raise InputError("it has an array of values without any field")
             is_plain = item[0] == nodes.BASE and item[1][0] != "string"
             return 1 if kind == nodes.SEQUENCE or is_plain else values * count
 
@@ -120,7 +121,7 @@ class RosTypes:
                 sizes[name] = values
                 self._fields += len(constants) + values
                 if self._fields > _MOST_FIELDS:
-                    raise ValueError(
+                    raise InputError(
                         f"the types of the bag have more than {_MOST_FIELDS} fields, arrays counted"
                     )
             return sizes[name]

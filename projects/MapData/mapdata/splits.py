@@ -8,6 +8,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import file_name, read_json, read_text
 from gsmap.utils.split_lists import list_identity
 
@@ -44,7 +45,7 @@ class SplitList:
         """
         known = f"{total - len(missing)} of the {total} scenes of the splits are in {where}"
         if self.complete and not allowed:
-            raise ValueError(
+            raise InputError(
                 f"split {self.name!r}: only {known}, {min(missing)!r} is not: add the parts of the "
                 "data set that hold the others (docs/data.md), or take those that are there with "
                 "--allow-missing, for figures that compare with no others."
@@ -71,7 +72,7 @@ def published_split(name: str, dataset: str) -> SplitList:
             scenes = {p: [s for g in groups for s in lists["scenes"][g]] for p, groups in parts}
             return SplitList(name, scenes, complete=True)
     known = ", ".join(split_names(dataset))
-    raise ValueError(f"there is no split {name!r} of {dataset}: name one of {known}.")
+    raise InputError(f"there is no split {name!r} of {dataset}: name one of {known}.")
 
 
 def read_split_file(path: Path) -> SplitList:
@@ -90,12 +91,12 @@ def read_split_file(path: Path) -> SplitList:
     try:
         splits = _lines_of(path) if path.suffix.lower() == ".txt" else read_json(path)
     except ValueError as error:
-        raise ValueError(f"{str(error).rstrip('.')}; a split file is JSON like {_FORM}.") from error
+        raise InputError(f"{str(error).rstrip('.')}; a split file is JSON like {_FORM}.") from error
     if not isinstance(splits, dict) or not all(
         isinstance(scenes, list) and all(isinstance(s, str) for s in scenes)
         for scenes in splits.values()
     ):
-        raise ValueError(f"split file {path} must look like {_FORM}.")
+        raise InputError(f"split file {path} must look like {_FORM}.")
     return SplitList(file_name(path.stem)[:100], splits)
 
 
@@ -103,7 +104,7 @@ def _lines_of(path: Path) -> dict[str, list[str]]:
     """Read the scenes of one split, whose name is a word of the file's name."""
     words = [word for word in re.split(r"[^a-z]+", path.stem.lower()) if word in _PARTS]
     if len(set(words)) != 1:
-        raise ValueError(f"the name of {path} must have one of the words {', '.join(_PARTS)}")
+        raise InputError(f"the name of {path} must have one of the words {', '.join(_PARTS)}")
     lines = (line.strip() for line in read_text(path).splitlines())
     return {words[0]: [line for line in lines if line]}
 
@@ -111,7 +112,7 @@ def _lines_of(path: Path) -> dict[str, list[str]]:
 def asked_split(options: Any, dataset: str) -> SplitList | None:
     """Return the list that ``split_name`` or ``split_file`` of the options name, if any."""
     if options.split_name and options.split_file:
-        raise ValueError("name either --split-name or --split-file.")
+        raise InputError("name either --split-name or --split-file.")
     if options.split_name:
         return published_split(options.split_name, dataset)
     return read_split_file(options.split_file) if options.split_file else None
@@ -141,5 +142,5 @@ def resolve_scenes(
                 missing.append(entry)
             elif split_of.setdefault(known[entry], split) != split:
                 other = split_of[known[entry]]
-                raise ValueError(f"scene {known[entry]} is in both {other} and {split}.")
+                raise InputError(f"scene {known[entry]} is in both {other} and {split}.")
     return split_of, missing

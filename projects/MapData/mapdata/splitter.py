@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsmap.utils.cli import output_file
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import write_text
 from mapdata.overlap import Places, read_places, sample_overlap
 
@@ -63,7 +64,7 @@ def split_scenes(
         ValueError: If a value is out of its range, or nothing is left for training.
     """
     if not (0 < val_share < 1 and 0 <= min_distance_m < np.inf and seed >= 0):
-        raise ValueError(
+        raise InputError(
             "the share of validation must be in (0, 1), the distance and the seed >= 0, got "
             f"{val_share}, {min_distance_m} and {seed}."
         )
@@ -78,7 +79,7 @@ def split_scenes(
         parts["train"] += names[far].tolist()
         parts["val"] += names[chosen].tolist()
     if not parts["train"] or not parts["val"]:
-        raise ValueError(
+        raise InputError(
             f"{len(np.unique(places.scenes))} scenes leave {len(parts['train'])} for training and "
             f"{len(parts['val'])} for validation: give a smaller --min-distance, or another "
             "--val-share."

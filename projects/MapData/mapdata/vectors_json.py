@@ -14,6 +14,7 @@ import numpy as np
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import MapSample
 from gsmap.utils.cli import output_file
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import atomic_write
 from gsmap.utils.words import counted
 
@@ -73,7 +74,7 @@ def _records(file: AnnotationFile) -> Iterator[dict[str, Any]]:
     position: Counter[str] = Counter()
     for sample in file:
         if sample.instances is None:
-            raise ValueError(f"{file.path}: sample {sample.token!r} has no ground truth to export.")
+            raise InputError(f"{file.path}: sample {sample.token!r} has no ground truth to export.")
         # every N-th row was taken and none left out
         row = int(stride[1]) * position[sample.scene] if stride else None
         position[sample.scene] += 1

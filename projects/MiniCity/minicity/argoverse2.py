@@ -8,6 +8,7 @@ from av2.map.lane_segment import LaneMarkType
 from av2.map.map_api import ROI_ISOCONTOUR_M, ArgoverseStaticMap, GroundHeightLayer
 from scipy import ndimage
 
+from gsmap.utils.errors import InputError
 from minicity.scene_map import (
     HeightGrid,
     Marking,
@@ -150,7 +151,7 @@ def height_grid(
     """
     grid_from_city = heights.array_Sim2_city
     if not np.allclose(grid_from_city.R, np.eye(2)):
-        raise ValueError("the ground height grid is turned against the city frame.")
+        raise InputError("the ground height grid is turned against the city frame.")
     cell_m = 1.0 / grid_from_city.s
     corners = grid_from_city.transform_from(np.array(bounds).reshape(2, 2))
     rows, columns = heights.array.shape
@@ -165,7 +166,7 @@ def height_grid(
     shapely.prepare(trusted)
     known = np.isfinite(part) & shapely.contains_xy(trusted, grid_x, y=grid_y)
     if not known.any():
-        raise ValueError(f"no ground height is known on the road inside {bounds}.")
+        raise InputError(f"no ground height is known on the road inside {bounds}.")
     nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
     filled = ndimage.gaussian_filter(part[tuple(nearest)], sigma=HEIGHT_SMOOTHING_M / cell_m)
     return HeightGrid(origin, cell_m, height_m=filled)

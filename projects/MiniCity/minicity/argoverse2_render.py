@@ -17,6 +17,7 @@ from av2.map.map_api import ArgoverseStaticMap, GroundHeightLayer
 from av2.utils.io import read_feather
 
 from gsmap.datasets.image_files import encode_jpeg
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import partial_path
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
@@ -56,11 +57,11 @@ class RenderOptions:
 
     def __post_init__(self) -> None:
         if not 0 < self.scale <= 1:
-            raise ValueError(f"scale must be in (0, 1], got {self.scale}.")
+            raise InputError(f"scale must be in (0, 1], got {self.scale}.")
         if self.rate_hz is not None and not self.rate_hz > 0:
-            raise ValueError(f"rate_hz must be > 0, got {self.rate_hz}.")
+            raise InputError(f"rate_hz must be > 0, got {self.rate_hz}.")
         if self.max_frames is not None and self.max_frames < 1:
-            raise ValueError(f"max_frames must be >= 1, got {self.max_frames}.")
+            raise InputError(f"max_frames must be >= 1, got {self.max_frames}.")
 
 
 def scaled_camera(camera: PinholeCamera, scale: float) -> tuple[np.ndarray, int, int]:
@@ -109,7 +110,7 @@ def _make_photographer(
     try:
         heights = GroundHeightLayer.from_file(log.log_dir / "map")
     except RuntimeError as error:
-        raise ValueError(f"{error} in {log.log_dir / 'map'}") from error
+        raise InputError(f"{error} in {log.log_dir / 'map'}") from error
     scaled_cameras = {name: scaled_camera(camera, scale) for name, camera in cameras.items()}
     widest = max(width for _, width, _ in scaled_cameras.values())
     rng = np.random.default_rng(zlib.crc32(log.log_id.encode()))
@@ -164,7 +165,7 @@ def render_log(log_dir: Path, out_dir: Path, options: RenderOptions) -> int:
         calibrated_log = Argoverse2Log(options.calibration)
     cameras = calibrated_log.calibration
     if len(cameras) < len(RING_CAMERAS):
-        raise ValueError(
+        raise InputError(
             "no calibration of the ring cameras (--calibration-from names another log)"
         )
     times = thin_out(np.array(list(log.poses)), options.rate_hz)

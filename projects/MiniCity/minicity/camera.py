@@ -5,6 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
+from gsmap.utils.errors import InputError
 from minicity.curves import Array
 
 NEAR_M = 0.25
@@ -32,14 +33,14 @@ class Camera:
     def __post_init__(self) -> None:
         """Check the shapes and values of both matrices and the image size."""
         if np.shape(self.intrinsics) != (3, 3) or np.shape(self.cam_from_world) != (4, 4):
-            raise ValueError(
+            raise InputError(
                 "intrinsics must be (3, 3) and cam_from_world (4, 4), got "
                 f"{np.shape(self.intrinsics)} and {np.shape(self.cam_from_world)}."
             )
         if self.width < 1 or self.height < 1:
-            raise ValueError(f"image size must be positive, got {self.width}x{self.height}.")
+            raise InputError(f"image size must be positive, got {self.width}x{self.height}.")
         if not (np.isfinite(self.intrinsics).all() and np.isfinite(self.cam_from_world).all()):
-            raise ValueError("intrinsics and cam_from_world must be finite.")
+            raise InputError("intrinsics and cam_from_world must be finite.")
 
     @cached_property
     def center(self) -> Array:

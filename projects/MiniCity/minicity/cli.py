@@ -3,6 +3,7 @@
 import argparse
 from typing import Any
 
+from gsmap.utils.errors import InputError
 from minicity.config import PRESETS, VERSION, MiniCityConfig
 from minicity.generate import generate
 
@@ -72,10 +73,10 @@ def chosen_config(arguments: argparse.Namespace) -> MiniCityConfig:
     if arguments.preset is not None:
         if values:
             options = ", ".join(f"--{name.replace('_', '-')}" for name in values)
-            raise ValueError(f"--preset sets the size and the seed: leave out {options}.")
+            raise InputError(f"--preset sets the size and the seed: leave out {options}.")
         return PRESETS[arguments.preset]
     if "scenes" not in values:
-        raise ValueError("give --scenes NUMBER, or --preset NAME for a published data set.")
+        raise InputError("give --scenes NUMBER, or --preset NAME for a published data set.")
     if "image_size" in values:
         width, height = values.pop("image_size")
         values["image_width"] = width

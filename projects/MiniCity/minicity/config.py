@@ -5,6 +5,8 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from gsmap.utils.errors import InputError
+
 VERSION = "v1.0-trainval"
 FORMAT = 1
 TRAIN_LOCATIONS = ("singapore-onenorth", "singapore-hollandvillage", "singapore-queenstown")
@@ -41,24 +43,24 @@ class MiniCityConfig:
     def __post_init__(self) -> None:
         """Check the range of every value."""
         if self.scenes < 2:
-            raise ValueError(
+            raise InputError(
                 f"scenes must be at least 2 (one to train, one to test), got {self.scenes}."
             )
         if self.seed < 0:
-            raise ValueError(f"seed must be >= 0, got {self.seed}.")
+            raise InputError(f"seed must be >= 0, got {self.seed}.")
         if not (64 <= self.image_width <= 3200 and 36 <= self.image_height <= 1800):
-            raise ValueError(
+            raise InputError(
                 "image size must lie between 64x36 and 3200x1800, got "
                 f"{self.image_width}x{self.image_height}."
             )
         if not 1 <= self.samples_per_scene <= 40:
-            raise ValueError(f"samples_per_scene must be in 1..40, got {self.samples_per_scene}.")
+            raise InputError(f"samples_per_scene must be in 1..40, got {self.samples_per_scene}.")
         if not 0 <= self.sweeps_per_sample <= 9:
-            raise ValueError(f"sweeps_per_sample must be in 0..9, got {self.sweeps_per_sample}.")
+            raise InputError(f"sweeps_per_sample must be in 0..9, got {self.sweeps_per_sample}.")
         if self.val_scenes is not None and not 1 <= self.val_scenes < self.scenes:
-            raise ValueError(f"val_scenes must be in 1..{self.scenes - 1}, got {self.val_scenes}.")
+            raise InputError(f"val_scenes must be in 1..{self.scenes - 1}, got {self.val_scenes}.")
         if self.num_val > MAX_VAL_SCENES or self.num_train > MAX_TRAIN_SCENES:
-            raise ValueError(
+            raise InputError(
                 f"the official nuScenes split names at most {MAX_TRAIN_SCENES} training and "
                 f"{MAX_VAL_SCENES} validation scenes, got {self.num_train} and {self.num_val}: "
                 "ask for fewer scenes."

@@ -14,6 +14,7 @@ from matplotlib.path import Path as Outline
 from shapely import get_parts
 from shapely.geometry import MultiPolygon, Polygon
 
+from gsmap.utils.errors import InputError
 from minicity.config import VERSION
 
 LAYERS = ["drivable_area", "road_segment", "lane", "ped_crossing", "walkway"]
@@ -52,7 +53,7 @@ def run(arguments: argparse.Namespace) -> str:
     repair_descartes()
     nusc = NuScenes(VERSION, arguments.root, verbose=False)
     if not 0 <= arguments.sample < len(nusc.sample):
-        raise ValueError(f"--sample must lie in 0..{len(nusc.sample) - 1}, got {arguments.sample}.")
+        raise InputError(f"--sample must lie in 0..{len(nusc.sample) - 1}, got {arguments.sample}.")
     out: Path = arguments.out
     out.mkdir(parents=True, exist_ok=True)
     sample = nusc.sample[arguments.sample]

@@ -14,6 +14,7 @@ from typing import Any
 
 import cv2
 
+from gsmap.utils.errors import InputError, WorkError
 from gsmap.utils.files import SUFFIX, require_no_link, try_lock
 from gsmap.utils.parallel import default_workers, ordered_map
 from gsmap.utils.progress import Progress
@@ -110,7 +111,7 @@ def generate(
         val_scenes=val_scenes,
     )
     if workers is not None and workers < 0:
-        raise ValueError(f"workers must be >= 0, got {workers}.")
+        raise InputError(f"workers must be >= 0, got {workers}.")
     root = Path(os.path.abspath(root))
     if is_complete(root, config):
         LOGGER.info("%s is complete already: nothing to do.", root)
@@ -143,12 +144,12 @@ def is_complete(root: Path, config: MiniCityConfig) -> bool:
             if present.get(key) != requested.get(key):
                 parts.append(f"{key} is {present.get(key)}, asked for {requested.get(key)}")
         differences = ", ".join(parts)
-        raise ValueError(
+        raise InputError(
             f"{root} holds another MiniCity data set ({differences}): "
             "choose another --root or remove that folder."
         )
     if root.exists() and (not root.is_dir() or any(root.iterdir())):
-        raise ValueError(
+        raise InputError(
             f"{root} exists and is not a complete MiniCity data set: "
             "choose another --root or remove it."
         )
@@ -166,7 +167,7 @@ def _partial_folder(root: Path) -> Iterator[Path]:
     try:
         locked = try_lock(handle)
         if not locked and (locked is False or any(partial.iterdir())):
-            raise RuntimeError(
+            raise WorkError(
                 f"another process is generating into {partial}: wait for its end, or, if there is "
                 "none and this disk has no locks, remove that folder."
             )

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsmap.utils.errors import InputError
 from minicity.camera import NEAR_M, Camera, clip_near
 from minicity.curves import Array
 from minicity.ground import render_flat_ground, render_uneven_ground
@@ -62,11 +63,11 @@ class SceneRenderer:
         shadows: list[Array] | None = None,
     ) -> None:
         if not (bounds[2] > bounds[0] and bounds[3] > bounds[1]):
-            raise ValueError(
+            raise InputError(
                 f"bounds must be (xmin, ymin, xmax, ymax) with a positive area, got {bounds}."
             )
         if resolution_m <= 0:
-            raise ValueError(f"resolution_m must be positive, got {resolution_m}.")
+            raise InputError(f"resolution_m must be positive, got {resolution_m}.")
         self.lighting = lighting
         self.height: HeightGrid | None = scene_map.height
         self.ground_z_m = scene_map.ground_z_m

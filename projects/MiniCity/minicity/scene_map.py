@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from shapely.geometry import Polygon
 
+from gsmap.utils.errors import InputError
 from minicity.curves import Array, arc_lengths, strip, subline
 
 MATERIALS = {
@@ -68,7 +69,7 @@ class HeightGrid:
     def __post_init__(self) -> None:
         """Reject holes, which would be rendered as cliffs."""
         if self.height_m.ndim != 2 or not np.isfinite(self.height_m).all():
-            raise ValueError(
+            raise InputError(
                 f"height_m must be a finite (rows, columns) array, got shape "
                 f"{self.height_m.shape} with "
                 f"{int((~np.isfinite(self.height_m)).sum())} non-finite cells: fill them first."

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsmap.utils.errors import InputError
 from minicity.camera import NEAR_M, Camera
 from minicity.curves import Array
 from minicity.scene_map import HeightGrid
@@ -137,7 +138,7 @@ def make_terrain(camera: Camera, grid: HeightGrid) -> Terrain:
     """
     last = camera.width - 1
     if last < 1:
-        raise ValueError(f"the picture must be at least 2 pixels wide, got {camera.width}.")
+        raise InputError(f"the picture must be at least 2 pixels wide, got {camera.width}.")
     columns = np.linspace(0.0, last, num=min(last, COLUMNS_PER_PICTURE) + 1)
     distances = np.geomspace(NEAREST_M, FARTHEST_M, num=RINGS)
     middle = np.stack([columns, np.full_like(columns, 0.65 * camera.height), np.ones_like(columns)])

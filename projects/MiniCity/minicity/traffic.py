@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gsmap.utils.errors import WorkError
 from minicity.curves import Array, arc_lengths, resample, tangents
 from minicity.meshes import Color
 from minicity.roads import Lane, Road
@@ -139,7 +140,7 @@ def plan_ego(town: Town, scene: int, duration_s: float, rng: np.random.Generator
                 swing_rad=float(rng.uniform(low=0, high=6.28)),
                 shift_m=float(rng.normal(loc=0, scale=0.2)),
             )
-    raise RuntimeError(
+    raise WorkError(
         f"town {town.name} has no drive of {duration_s} s: please report this with the seed."
     )
 

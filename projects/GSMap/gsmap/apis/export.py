@@ -24,6 +24,7 @@ from gsmap.apis.onnx_inferencer import (
 from gsmap.structures.calibration import NUM_CAN_BUS, OF_ONE_FRAME
 from gsmap.structures.elements import MapElements
 from gsmap.structures.past import Past
+from gsmap.utils.errors import GsmapError, InputError
 from gsmap.utils.extras import import_extra
 from gsmap.utils.files import write_bytes
 
@@ -43,18 +44,18 @@ class ExportedDetector(nn.Module):
     def __init__(self, model: Any) -> None:
         super().__init__()
         if model.lidar_encoder is not None:
-            raise ValueError(
+            raise InputError(
                 "only models of cameras can be exported: voxels of LiDAR have no ONNX operator. "
                 "Give a config without lidar_encoder."
             )
         head = model.map_head
         if head.not_exported:
-            raise ValueError(
+            raise InputError(
                 f"{type(head).__name__} cannot be exported: {head.not_exported}. Run the model "
                 "with tools/infer.py."
             )
         if model.temporal is not None and model.temporal.elements is not None:
-            raise ValueError(
+            raise InputError(
                 "temporal.elements works behind the network and has no ONNX operators: set "
                 "model.temporal.elements=None (temporal=None without other memory)."
             )
@@ -177,7 +178,7 @@ def export_onnx(
                 verbose=False,
             )
     except torch.onnx.errors.OnnxExporterError as error:
-        raise ValueError(_reason(error)) from error
+        raise InputError(_reason(error)) from error
     assert program is not None  # it is None only where torch writes the file itself
     proto = program.model_proto
     for part in (proto.graph, *proto.graph.node):  # stack traces of the machine that exported
@@ -398,7 +399,7 @@ def _reason(error: BaseException) -> str:
     """Message of the first cause of a failed export."""
     while error.__cause__ is not None:
         error = error.__cause__
-    if type(error) is ValueError:  # the model's own word, for instance of a number of cameras
+    if isinstance(error, GsmapError):  # the model's own word, for instance of a number of cameras
         return str(error)
     return (
         f"the model cannot be written in ONNX's operators ({error!s:.300}): say how in "

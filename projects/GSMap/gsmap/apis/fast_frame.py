@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from gsmap.structures.calibration import calibration_arrays
 from gsmap.structures.grid import padded_size
 from gsmap.structures.tensors import tensor_versions, uploaded
+from gsmap.utils.errors import InputError, WorkError
 
 if TYPE_CHECKING:
     from mmdet3d.structures import Det3DDataSample
@@ -65,7 +66,7 @@ class StaticFrame(nn.Module):
     def __init__(self, model: Any) -> None:
         super().__init__()
         if reason := reason_against(model):
-            raise ValueError(f"this model has no static form: {reason}.")
+            raise InputError(f"this model has no static form: {reason}.")
         self.model = model
         self.names: tuple[str, ...] = model.bev_encoder.calibration
         self.layout: dict[str, tuple[torch.Size, torch.dtype]] = {}
@@ -229,7 +230,7 @@ class FastFrames:
                 with torch.cuda.graph(graph, capture_error_mode="thread_local"):
                     output = self.frame(*buffers)
             except RuntimeError as error:
-                raise RuntimeError(
+                raise WorkError(
                     f"a frame could not be captured as a CUDA graph ({error!s:.300}): run it "
                     f"without ({SWITCH}=False, --no-{SWITCH.replace('_', '-')})."
                 ) from error

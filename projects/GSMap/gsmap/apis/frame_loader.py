@@ -12,6 +12,7 @@ from mmengine.dataset import pseudo_collate
 from torch.utils.data import Dataset
 
 from gsmap.structures.calibration import OUT_OF_SIGHT
+from gsmap.utils.errors import InputError
 
 if TYPE_CHECKING:
     from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
@@ -59,7 +60,7 @@ class FrameDataset(Dataset):
         if not wanted or not absent:
             return self.dataset[row]
         if not self.blank_cameras or len(absent) == len(wanted):
-            raise ValueError(
+            raise InputError(
                 f"sample {sample.token!r} lacks the cameras {absent}, which the model expects; it "
                 f"has {sorted(present)}. With --allow-missing-cameras (allow_missing_cameras=True) "
                 "absent ones are left blank, as long as one is there."

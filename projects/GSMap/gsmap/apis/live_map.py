@@ -15,6 +15,7 @@ from gsmap.datasets.source import Source, ground_from_frame
 from gsmap.structures.elements import MapElements
 from gsmap.structures.rigid import invert_rigid
 from gsmap.structures.streams import Frame, MapStream
+from gsmap.utils.errors import InputError
 
 _LOGGER = logging.getLogger(__name__)
 _ALONE = Frame("in memory", "", 0, np.eye(4))
@@ -119,12 +120,12 @@ class LiveMap:
                 frame does not follow the stream's last.
         """
         if (at is None) != (stream is None):
-            raise ValueError(
+            raise InputError(
                 "a frame that continues a stream needs both at=Frame(...) and stream=..., got "
                 f"at={at} and stream={stream}."
             )
         if can_bus is not None and not np.isfinite(can_bus).all():
-            raise ValueError(f"can_bus must be finite, got {can_bus}.")
+            raise InputError(f"can_bus must be finite, got {can_bus}.")
         pixels = bgr_by_name(images)
         sizes = {name: image.shape for name, image in pixels.items()}
         if sizes != self._sizes:
@@ -153,7 +154,7 @@ class LiveMap:
                 self._said.add(line)
         foreign = set(pixels) - set(self._config.get("cameras") or pixels)
         if foreign and foreign != set(pixels):
-            raise ValueError(
+            raise InputError(
                 f"the model has the cameras {list(self._config.cameras)}, but not "
                 f"{sorted(foreign)}: name all cameras as it does, or none."
             )

@@ -17,6 +17,7 @@ from gsmap.datasets.annotations.record import RANGES
 from gsmap.datasets.source import Mount
 from gsmap.engine.launch import read_config
 from gsmap.structures.rigid import is_rigid
+from gsmap.utils.errors import InputError
 from gsmap.utils.model_facts import MOUNT, RIG
 
 _LOGGER = logging.getLogger(__name__)
@@ -122,9 +123,9 @@ def _mount_of(cfg: Config, read: Checkpoint | None, path: object) -> Mount:
         height = None if height is None else float(height)
         bounded = place is None or (place.shape == (4, 4) and abs(place).max() < _FARTHEST_M)
         if not bounded or not (place is None or is_rigid(place)) or abs(height or 0.0) > 10:
-            raise ValueError("no place on a vehicle")
+            raise InputError("no place on a vehicle")
     except (TypeError, ValueError) as error:
-        raise ValueError(
+        raise InputError(
             f"{path} was not loaded: where its frame lies in the vehicle makes no sense ({error})."
         ) from error
     return Mount(frame, height, place)

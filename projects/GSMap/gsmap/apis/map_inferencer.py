@@ -35,6 +35,7 @@ from gsmap.datasets.memory import Cameras
 from gsmap.datasets.source import Mount, Source, annotated, reframed
 from gsmap.evaluation.core.results_json import vectors_of
 from gsmap.structures.elements import MapElements
+from gsmap.utils.errors import InputError
 from gsmap.utils.parallel import result_of, signals_later
 
 if TYPE_CHECKING:  # slow to import, and of no use before there is a model
@@ -71,7 +72,7 @@ def select_samples(
         position = {token: index for index, token in enumerate(tokens)}
         unknown = [token for token in wanted if token not in position]
         if unknown:
-            raise ValueError(f"No sample has the token {unknown[0]!r}; there are {len(tokens)}.")
+            raise InputError(f"No sample has the token {unknown[0]!r}; there are {len(tokens)}.")
         chosen = [position[token] for token in wanted]
     return [chosen[i] for i in spread_evenly(len(chosen), max_num)]
 
@@ -81,7 +82,7 @@ def spread_evenly(count: int, max_num: int | None = None) -> list[int]:
     if max_num is None or max_num >= count:
         return list(range(count))
     if max_num < 1:
-        raise ValueError(f"max_num must be >= 1, got {max_num}.")
+        raise InputError(f"max_num must be >= 1, got {max_num}.")
     return np.linspace(0, count - 1, max_num).round().astype(int).tolist()
 
 
@@ -152,13 +153,13 @@ class MapInferencer:
         """Replayer of frames on a GPU, or None if ``test_step`` runs them."""
         if device.type != "cuda":
             if cuda_graphs:
-                raise ValueError(f"cuda_graphs=True needs a GPU, got {device}: leave it out.")
+                raise InputError(f"cuda_graphs=True needs a GPU, got {device}: leave it out.")
             return None
         if self.amp and model.img_backbone is not None:
             model.halve_backbone()
         reason = reason_against(model)
         if cuda_graphs and reason:
-            raise ValueError(f"cuda_graphs=True does not serve this model: {reason}. Leave it out.")
+            raise InputError(f"cuda_graphs=True does not serve this model: {reason}. Leave it out.")
         if reason or not (CAPTURE_BY_DEFAULT if cuda_graphs is None else cuda_graphs):
             return None
         return FastFrames(StaticFrame(model), device)
@@ -345,7 +346,7 @@ class MapInferencer:
             for number, (batch, broken) in enumerate(batches):
                 for frame in broken:
                     if on_broken is None:
-                        raise ValueError(frame.reason)
+                        raise InputError(frame.reason)
                     on_broken(frame)
                 if batch is not None:
                     turn = number % len(pools)
@@ -367,9 +368,9 @@ class MapInferencer:
     def _memory(self) -> Any:
         """Return the model's memory; ValueError if it has none, or there are several devices."""
         if self.model.temporal is None:
-            raise ValueError("the model has no memory (temporal): leave the stream out.")
+            raise InputError("the model has no memory (temporal): leave the stream out.")
         if len(self.devices) > 1:
-            raise ValueError("a model with memory runs on one device: name a single one.")
+            raise InputError("a model with memory runs on one device: name a single one.")
         return self.model.temporal
 
     @torch.no_grad()

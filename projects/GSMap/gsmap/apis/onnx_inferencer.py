@@ -14,6 +14,7 @@ from gsmap.structures.elements import MapElements
 from gsmap.structures.polylines import shortest_orders
 from gsmap.structures.rigid import is_rigid
 from gsmap.structures.streams import Frame, MapStream, Scenes, StreamState
+from gsmap.utils.errors import InputError
 from gsmap.utils.extras import import_extra
 
 METADATA_KEY = "gsmap"
@@ -72,7 +73,7 @@ class OnnxInferencer:
                 str(path), options, providers=list(providers)
             )
         except Exception as error:  # onnxruntime's errors have no common class of their own
-            raise ValueError(
+            raise InputError(
                 f"{path} cannot be run by ONNX Runtime {onnxruntime.__version__} "
                 f"({error!s:.300}): export it again, or install a newer onnxruntime."
             ) from error
@@ -80,21 +81,21 @@ class OnnxInferencer:
             found = self.session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
             self.metadata: dict[str, Any] = json.loads(found or "{}")
             if self.metadata["format"] != FORMAT:
-                raise ValueError("another format")
+                raise InputError("another format")
             _check_metadata(self.metadata)
             self._outputs = [value.name for value in self.session.get_outputs()]
             images, *others = self.session.get_inputs()
             shape = [len(self.metadata["cameras"]), 3, *self.metadata["image_size"]]
             if images.shape != shape or not set(self._outputs) >= _OUTPUTS:
-                raise ValueError("its graph is not the one that its metadata tell of")
+                raise InputError("its graph is not the one that its metadata tell of")
             memory = [value for value in others if value.name.startswith(MEMORY)]
             self._empty = {
                 value.name: np.zeros(value.shape, _PRECISIONS[value.type]) for value in memory
             }
             if self.has_memory != bool(memory):
-                raise ValueError("its graph and its metadata do not agree on a memory")
+                raise InputError("its graph and its metadata do not agree on a memory")
         except (ValueError, KeyError, TypeError, RecursionError) as error:
-            raise ValueError(
+            raise InputError(
                 f"{path} does not say that tools/export.py of this version wrote it ({error!r}): "
                 "export the model again."
             ) from error
@@ -115,7 +116,7 @@ class OnnxInferencer:
     def new_stream(self) -> MapStream:
         """Return the empty memory of one drive, for calls; ValueError if the file has no memory."""
         if not self.has_memory:
-            raise ValueError(f"{self.path.name} has no memory: leave the stream out.")
+            raise InputError(f"{self.path.name} has no memory: leave the stream out.")
         return MapStream(self.metadata["max_gap_s"])
 
     def new_scenes(self) -> Scenes:
@@ -176,8 +177,8 @@ class OnnxInferencer:
         told = self.metadata.get("can_bus") == NO_SIGNALS or meta.get("can_bus") is not None
         if "can_bus" in self._calibration and not told:
             if self.metadata.get("can_bus") == POSE_ONLY_RULE:
-                raise ValueError(f"{self.path.name} needs can_bus, {POSE_ONLY_RULE}.")
-            raise ValueError(
+                raise InputError(f"{self.path.name} needs can_bus, {POSE_ONLY_RULE}.")
+            raise InputError(
                 f"{self.path.name} needs can_bus, {CAN_BUS_RULE}. From poses: motion_signals of "
                 "gsmap.structures.vehicle_signals; zeros for a model that was trained without."
             )
@@ -186,7 +187,7 @@ class OnnxInferencer:
         inputs = calibration_arrays(meta, self._calibration)
         for name, array in inputs.items():
             if name != "can_bus" and array.shape != (len(self.cameras), 4, 4):
-                raise ValueError(
+                raise InputError(
                     f"{name} of {self.path.name} needs one 4 x 4 matrix for each of its "
                     f"{len(self.cameras)} cameras {', '.join(self.cameras)}, got shape "
                     f"{array.shape}."
@@ -201,7 +202,7 @@ class OnnxInferencer:
         """State after the previous frame, and the motion since then."""
         if stream is None or not self.has_memory:
             self.new_stream()  # says so if there is no memory
-            raise ValueError(
+            raise InputError(
                 f"{self.path.name} remembers the frames of a drive: give the call its stream, "
                 "which new_stream() starts."
             )
@@ -234,14 +235,14 @@ class OnnxInferencer:
     def _check_images(self, images: Sequence[NDArray[Any]] | NDArray[Any]) -> None:
         """Raise ValueError if the number or the form of the images is not that of the cameras."""
         if len(images) != len(self.cameras):
-            raise ValueError(
+            raise InputError(
                 f"{self.path.name} takes {len(self.cameras)} cameras, {', '.join(self.cameras)}, "
                 f"got {len(images)} images: give one of each, or export for other cameras."
             )
         rows, columns = self.image_size
         for camera, image in zip(self.cameras, images, strict=True):
             if np.shape(image) != (rows, columns, 3):
-                raise ValueError(
+                raise InputError(
                     f"{self.path.name} takes images of {rows} x {columns} (rows x columns, three "
                     f"channels), that of {camera} has shape {np.shape(image)}: scale it and "
                     f"lidar2img alike, or export with --size."
@@ -256,7 +257,7 @@ class OnnxInferencer:
         try:
             values = self.session.run(self._outputs, inputs)
         except Exception as error:  # onnxruntime's errors have no common class of their own
-            raise ValueError(
+            raise InputError(
                 f"{self.path} cannot be run ({error!s:.300}): if the inputs are those of its "
                 "cameras, the file is damaged; export it again."
             ) from error
@@ -271,7 +272,7 @@ class OnnxInferencer:
         try:
             return self._kept(outputs)
         except (ValueError, TypeError, IndexError) as error:
-            raise ValueError(
+            raise InputError(
                 f"{self.path} gave no map elements ({error}): if the images are whole, the file "
                 "is damaged; export it again."
             ) from error
@@ -292,7 +293,7 @@ class OnnxInferencer:
             if not name.startswith(f"new_{MEMORY}")
         }
         if not np.isin(kept["labels"], range(len(self.classes))).all():
-            raise ValueError(f"a label is none of the {len(self.classes)} classes")
+            raise InputError(f"a label is none of the {len(self.classes)} classes")
         lines = np.isin(kept["labels"], self.metadata.get("unfold_classes", []))
         if lines.any():
             orders = shortest_orders(kept["points"][lines])
@@ -315,20 +316,20 @@ def _check_metadata(metadata: Mapping[str, Any]) -> None:
     for name in ("classes", "cameras"):
         names = metadata[name]
         if not (isinstance(names, list) and names and all(isinstance(n, str) for n in names)):
-            raise ValueError(f"{name} must be names, got {names!r:.80}")
+            raise InputError(f"{name} must be names, got {names!r:.80}")
     for name in ("x_range", "y_range"):
         low, high = metadata[name]
         if not -np.inf < low < high < np.inf:
-            raise ValueError(f"{name} must be (low, high), got {metadata[name]!r:.80}")
+            raise InputError(f"{name} must be (low, high), got {metadata[name]!r:.80}")
     for name in ("margin_m", "score_threshold"):
         if metadata[name] is not None and not np.isfinite(metadata[name]):
-            raise ValueError(f"{name} must be a number, got {metadata[name]!r:.80}")
+            raise InputError(f"{name} must be a number, got {metadata[name]!r:.80}")
     _check_poses(metadata)
     unfold = metadata.get("unfold_classes", [])
     if not (isinstance(unfold, list) and all(type(label) is int for label in unfold)):
-        raise ValueError(f"unfold_classes must be class indices, got {unfold!r:.80}")
+        raise InputError(f"unfold_classes must be class indices, got {unfold!r:.80}")
     if not 0 < metadata.get("max_gap_s", 1.0) < np.inf:
-        raise ValueError(f"max_gap_s must be seconds > 0, got {metadata['max_gap_s']!r:.80}")
+        raise InputError(f"max_gap_s must be seconds > 0, got {metadata['max_gap_s']!r:.80}")
 
 
 def _check_poses(metadata: Mapping[str, Any]) -> None:
@@ -336,4 +337,4 @@ def _check_poses(metadata: Mapping[str, Any]) -> None:
     for name in ("ground_from_frame", "ego_from_frame"):
         matrix = np.asarray(metadata.get(name, np.eye(4)), np.float64)
         if matrix.shape != (4, 4) or not is_rigid(matrix):
-            raise ValueError(f"{name} must be a pose, got {metadata[name]!r:.80}")
+            raise InputError(f"{name} must be a pose, got {metadata[name]!r:.80}")

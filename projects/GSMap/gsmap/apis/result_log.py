@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from gsmap.evaluation.core.results_json import write_results
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import lock, naming_file, open_to_append
 
 _SUFFIX = ".unfinished"
@@ -96,7 +97,7 @@ class ResultLog:
 
     def _require(self, good: bool, number: int) -> None:
         if not good:
-            raise ValueError(
+            raise InputError(
                 f"{self.path}, line {number}, is no frame of this run: the file is damaged, or "
                 "another program's. Take it away to begin again, or give another --out."
             )

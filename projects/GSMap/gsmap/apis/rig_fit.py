@@ -20,6 +20,7 @@ from gsmap.checkpoints.settings import plain
 from gsmap.datasets.annotations.record import MapSample
 from gsmap.engine.run_log import innermost
 from gsmap.structures.frames import FRAME_VIEWS, viewing_azimuth
+from gsmap.utils.errors import InputError
 from gsmap.utils.shipped import shipped
 
 if TYPE_CHECKING:
@@ -80,7 +81,7 @@ def similar_cameras(
     """
     unknown = [name for name in trained if name not in AZIMUTHS_DEG]
     if unknown:
-        raise ValueError(
+        raise InputError(
             f"the model is for the cameras {list(trained)}, the input has {list(names)}: name them "
             "as the model does."
         )

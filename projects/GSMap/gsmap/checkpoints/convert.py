@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from gsmap.checkpoints.key_map import find_key_map, is_upstream
+from gsmap.utils.errors import InputError
 
 _TRAINING = "map_head.aux_heads."  # begins what serves training alone
 
@@ -26,7 +27,7 @@ def ours_from_upstream(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     names = {key: key_map.to_ours(key) for key in state}
     unknown = [key for key, name in names.items() if name is None and not key_map.is_unused(key)]
     if unknown:
-        raise ValueError(f"keys that no {key_map.name} model has: {listed(unknown)}.")
+        raise InputError(f"keys that no {key_map.name} model has: {listed(unknown)}.")
     return {name: state[key] for key, name in names.items() if name is not None}
 
 
@@ -42,7 +43,7 @@ def upstream_from_ours(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     names = {key: key_map.to_upstream(key) for key in state}
     unknown = [key for key, name in names.items() if name is None and not key.startswith(_TRAINING)]
     if unknown:
-        raise ValueError(
+        raise InputError(
             f"keys that upstream's {key_map.name} does not have: {listed(unknown)}. Without "
             "them the model would find something else: it stays in our format."
         )

@@ -8,6 +8,7 @@ from importlib.util import find_spec
 
 from gsmap.checkpoints.key_rules import KeyMap
 from gsmap.methods import METHODS
+from gsmap.utils.errors import InputError
 
 
 @cache
@@ -40,4 +41,4 @@ def find_key_map(keys: Iterable[str]) -> KeyMap:
     for key_map in key_maps():
         if key_map.is_marked(keys, upstream):
             return key_map
-    raise ValueError("the checkpoint holds no weights.")
+    raise InputError("the checkpoint holds no weights.")

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from mmengine.logging import print_log
 
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import read_json
 from gsmap.utils.shards import digest
 from gsmap.utils.shipped import shipped
@@ -109,7 +110,7 @@ def find_checkpoint(checkpoint: str | Path) -> Path:
     if not model.sha256:
         _say_unverified(model.name)
     elif digest(model.file) != model.sha256:
-        raise ValueError(
+        raise InputError(
             f"{model.file} is damaged or another file: its sha256 is not that of {model.name} in "
             "registry.json; fetch it again, or give another file by its path."
         )
@@ -136,7 +137,7 @@ def checkpoint_for(config: str | Path, checkpoint: str | Path | None) -> Path:
     """
     is_config = str(config) in named_configs() or Path(config).is_file()
     if checkpoint is None and is_config and str(config) not in named_models():
-        raise ValueError(f"give a checkpoint after {config}: only a model's name stands for both.")
+        raise InputError(f"give a checkpoint after {config}: only a model's name stands for both.")
     return find_checkpoint(config if checkpoint is None else checkpoint)
 
 

@@ -25,6 +25,7 @@ from torch import Tensor
 from gsmap.checkpoints.efficientnet_keys import efficientnet_rules, unused_classifier
 from gsmap.checkpoints.key_rules import KeyMap
 from gsmap.checkpoints.reading import load_tensors, refusing
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import atomic_write, file_name
 from gsmap.utils.shards import digest
 
@@ -62,9 +63,9 @@ def load_published(
             checkpoint = load_tensors(path, map_location)
     except ValueError as error:
         if path != cache_file(address):
-            raise ValueError(f"{error} The file is {path}.") from error
+            raise InputError(f"{error} The file is {path}.") from error
         path.unlink(missing_ok=True)
-        raise ValueError(f"{error} The fetched file, {path}, was removed.") from error
+        raise InputError(f"{error} The fetched file, {path}, was removed.") from error
     return in_our_names(checkpoint)
 
 
@@ -92,7 +93,7 @@ def load_from_torchvision(name: str, map_location: Any = "cpu") -> Any:
     addresses = json.loads(table.read_text())
     address = addresses.get(name.partition("://")[2])
     if address is None:
-        raise ValueError(f"{name} is not known: give the address of the weights, or a path.")
+        raise InputError(f"{name} is not known: give the address of the weights, or a path.")
     return load_published(address, map_location=map_location)
 
 

@@ -32,6 +32,7 @@ from gsmap.checkpoints.settings import (
     scale_steps,
 )
 from gsmap.checkpoints.unwrapping import UnfitError, Unwrapped, unwrap
+from gsmap.utils.errors import InputError
 from gsmap.utils.faults import in_words, is_of_the_machine
 from gsmap.utils.files import fetch_advice
 from gsmap.utils.model_facts import calibration_of
@@ -88,16 +89,16 @@ def refusing(path: object) -> Iterator[None]:
     try:
         yield
     except UnfitError as error:
-        raise ValueError(f"{path} {error}.") from error
+        raise InputError(f"{path} {error}.") from error
     except pickle.UnpicklingError as error:
         reason = str(error).split(". ")[0]
         otherwise = f"it is broken, or holds more than tensors and plain data ({reason}); {_REMEDY}"
-        raise ValueError(f"{path} was not loaded: {_advice(path, otherwise)}.") from error
+        raise InputError(f"{path} was not loaded: {_advice(path, otherwise)}.") from error
     except _DAMAGE as error:
         if is_of_the_machine(error) and not _asks_for_more(error, Path(str(path))):
             raise
         advice = _advice(path, "fetch it again, or use an earlier epoch's")
-        raise ValueError(
+        raise InputError(
             f"{path} is not a whole checkpoint ({type(error).__name__}: {error}); {advice}."
         ) from error
 
@@ -137,7 +138,7 @@ def load_tensors(path: str | Path, map_location: Any = "cpu") -> Any:
             for part in archive.infolist():
                 if part.compress_type != zipfile.ZIP_STORED:
                     name = f"{part.filename!r:.60}"
-                    raise ValueError(f"{name} in it is packed, as torch packs nothing")
+                    raise InputError(f"{name} in it is packed, as torch packs nothing")
     return torch.load(path, map_location=map_location, weights_only=True)
 
 
@@ -176,7 +177,7 @@ def read_checked(path: str | Path) -> Checkpoint:
         )
         broken = [key for key, value in unwrapped.state.items() if not value.isfinite().all()]
     if broken:
-        raise ValueError(
+        raise InputError(
             f"{path} holds NaN or infinite weights ({listed(broken)}): the training that wrote it "
             "had failed; use an earlier epoch's."
         )
@@ -293,7 +294,7 @@ def _model_of(
             MODELS.build(own.model)
     except Exception as error:  # a stranger's settings may end in whatever they like
         reason = (in_words(error) or f"{type(error).__name__}: {error}").rstrip(".")
-        raise ValueError(
+        raise InputError(
             f"{path} was not loaded: of the settings in it, {reason}. Give the config that it was "
             f"trained with, or, {_REMEDY}"
         ) from error
@@ -330,10 +331,10 @@ def load_weights(model: nn.Module, path: str | Path, read: Checkpoint | None = N
     try:
         result = model.load_state_dict(state, strict=False)
     except (ValueError, RuntimeError) as error:
-        raise ValueError(f"{path} does not belong to this config: {error}") from error
+        raise InputError(f"{path} does not belong to this config: {error}") from error
     missing = [key for key in result.missing_keys if not key.endswith("num_batches_tracked")]
     if missing or result.unexpected_keys:
-        raise ValueError(
+        raise InputError(
             f"{path} does not belong to this config: it lacks {listed(missing)} and has "
             f"{listed(result.unexpected_keys)} too many. Give the config that it was trained with "
             "(a copy lies beside it in the work folder)."

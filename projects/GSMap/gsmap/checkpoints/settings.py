@@ -8,6 +8,8 @@ from typing import Any
 from mmdet3d.registry import MODELS, TASK_UTILS
 from mmengine.config import Config, ConfigDict
 
+from gsmap.utils.errors import InputError
+
 MODEL_SETTINGS = "model_settings"  # key of a checkpoint's meta: JSON, as a config's text is code
 # settings of a training alone; those of its start may load files
 STARTS = {
@@ -76,20 +78,20 @@ def checked(settings: Any, config: dict[str, Any]) -> dict[str, Any]:
         ValueError: If they hold anything else; the message names the setting.
     """
     if not isinstance(settings, dict):
-        raise ValueError(f"model must be a dictionary, got {settings!r:.60}")
+        raise InputError(f"model must be a dictionary, got {settings!r:.60}")
     return _checked(settings, "model", _words(config))
 
 
 def _checked(value: Any, name: str, known: set[str]) -> Any:
     """Return a setting if all in it is allowed; ``known`` are the config's keys and texts."""
     if name.count(".") > _DEEPEST:
-        raise ValueError(f"{name[:60]}... is nested too deep")
+        raise InputError(f"{name[:60]}... is nested too deep")
     if isinstance(value, list):
         return [_checked(inner, f"{name}.{i}", known) for i, inner in enumerate(value)]
     if isinstance(value, dict):
         for key in value:
             if not _KEY.fullmatch(key) and (key not in known or key.startswith("_")):
-                raise ValueError(f"{name} has the key {key!r:.60}, which is no name of a setting")
+                raise InputError(f"{name} has the key {key!r:.60}, which is no name of a setting")
         pairs = ((key, inner) for key, inner in value.items() if key not in STARTS)
         return {key: _checked(inner, f"{name}.{key}", known) for key, inner in pairs}
     if name.endswith(".type"):
@@ -97,9 +99,9 @@ def _checked(value: Any, name: str, known: set[str]) -> Any:
             value = _RENAMED.get(value, value)
         _check_type(value, name, known)
     elif isinstance(value, str) and not (_TEXT.fullmatch(value) or value in known):
-        raise ValueError(f"{name} is {value!r:.60}, no plain word and not the config's")
+        raise InputError(f"{name} is {value!r:.60}, no plain word and not the config's")
     elif isinstance(value, (int, float)) and not abs(value) <= _LARGEST:  # NaN neither
-        raise ValueError(f"{name} is {value!r:.60}, not within {_LARGEST}")
+        raise InputError(f"{name} is {value!r:.60}, not within {_LARGEST}")
     return value
 
 
@@ -108,7 +110,7 @@ def _check_type(kind: Any, name: str, known: set[str]) -> None:
     made = _registered(kind) if isinstance(kind, str) else None
     own = str(getattr(made, "__module__", "")).startswith(("gsmap.", "torch.nn."))
     if made is None or not (own or kind in known):
-        raise ValueError(f"{name} is {kind!r:.60}, no part of this project and not of the config")
+        raise InputError(f"{name} is {kind!r:.60}, no part of this project and not of the config")
 
 
 def _registered(kind: str) -> Any:

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from gsmap.checkpoints.convert import listed, ours_from_upstream
 from gsmap.checkpoints.key_map import is_upstream
+from gsmap.utils.errors import InputError
 
 
 class AddsWeights:
@@ -81,12 +82,12 @@ def adapt_state(
     }
     text = "; ".join(f"{what}: {listed(keys)}" for what, keys in problems.items() if keys)
     if text:
-        raise ValueError(
+        raise InputError(
             f"the checkpoint does not fit the model; {text}. Load it with the config it was "
             "trained with; docs/migration.md lists the architectures that load."
         )
     if untrained and not allow_untrained:
-        raise ValueError(
+        raise InputError(
             "the checkpoint was never trained with parts of the config's model: "
             f"{listed(untrained)}. Give the config that it was trained with, or use them as they "
             "start: --cfg-options model.allow_untrained=True."

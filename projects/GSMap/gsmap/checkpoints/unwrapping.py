@@ -7,6 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gsmap.utils.errors import InputError
+
 WRAPPERS = ("state_dict", "model_state_dict", "model_state", "model", "network", "net", "weights")
 _DEEPEST = 3  # wrappers within one another
 _OUTER = ("model.", "network.", "net.")  # before all keys, of modules that hold a model
@@ -17,7 +19,7 @@ _AVERAGED = "ema_"
 _SHOWN = 8  # keys in a message
 
 
-class UnfitError(ValueError):
+class UnfitError(InputError):
     """A checkpoint holds no weights that can be used; the message follows its name."""
 
 

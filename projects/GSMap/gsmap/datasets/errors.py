@@ -6,10 +6,11 @@ from contextlib import contextmanager
 import pyarrow as pa
 import shapely
 
+from gsmap.utils.errors import InputError
 from gsmap.utils.faults import is_of_the_machine
 
 
-class BrokenSampleError(ValueError):
+class BrokenSampleError(InputError):
     """A sample cannot be used because one of its files is missing, damaged or empty.
 
     The data set raises it on, or skips and counts the sample, as its option ``broken_samples``
@@ -43,4 +44,4 @@ def naming(what: object, remedy: str) -> Iterator[None]:
         elif not isinstance(error, (ValueError, OSError)) and type(error) is not Exception:
             reason = f"{type(error).__name__}: {error}"
         advice = "" if reason.rstrip(".").endswith(remedy) else f"; {remedy}"
-        raise ValueError(f"{what} cannot be used: {reason.rstrip('.')}{advice}.") from error
+        raise InputError(f"{what} cannot be used: {reason.rstrip('.')}{advice}.") from error

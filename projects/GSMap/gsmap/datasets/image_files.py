@@ -12,6 +12,7 @@ import simplejpeg
 from PIL import BmpImagePlugin, Image, JpegImagePlugin, PngImagePlugin, WebPImagePlugin
 
 from gsmap.datasets.errors import BrokenSampleError
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import fetch_advice
 
 _PLUGINS = (JpegImagePlugin, PngImagePlugin, WebPImagePlugin, BmpImagePlugin)  # no other is opened
@@ -51,11 +52,11 @@ def image_size(file: Path, where: str) -> tuple[int, int]:
                 _require_moderate(image.size)
                 return image.size
         except _UnfitError as error:
-            raise ValueError(f"{where}: {file} cannot be used: {error}.") from error
+            raise InputError(f"{where}: {file} cannot be used: {error}.") from error
         except _DAMAGE as error:
             if getattr(error, "errno", None):
                 raise
-            raise ValueError(_no_image(where, file, start)) from error
+            raise InputError(_no_image(where, file, start)) from error
 
 
 def read_image(

@@ -8,6 +8,7 @@ import numpy as np
 from gsmap.datasets.annotations.file import check_samples
 from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord, MapSample
 from gsmap.datasets.source import Mount, Source, sample_in_vehicle
+from gsmap.utils.errors import InputError, InputTypeError
 
 VEHICLE = "vehicle"  # frame: x ahead, y left, on the road below the rear axle
 Cameras = Mapping[str, np.ndarray] | Sequence[np.ndarray] | np.ndarray
@@ -51,7 +52,7 @@ def source_in_memory(
     names = list(images)
     for what, values in rig.items():
         if set(values) != set(names) or not names:
-            raise ValueError(
+            raise InputError(
                 f"{what} must have the cameras of images, {names}, got {list(values)}."
             )
     cameras = [
@@ -85,7 +86,7 @@ def _by_name(values: Cameras) -> dict[str, np.ndarray]:
 def _bgr(name: str, image: np.ndarray) -> np.ndarray:
     """Check an image, and return it in BGR. (H, W, 3)"""
     if image.dtype != np.uint8:
-        raise TypeError(f"the image of {name!r} must be uint8, RGB, got {image.dtype}.")
+        raise InputTypeError(f"the image of {name!r} must be uint8, RGB, got {image.dtype}.")
     if image.ndim != 3 or image.shape[2] != 3 or not image.size:
-        raise ValueError(f"the image of {name!r} must have shape (H, W, 3), got {image.shape}.")
+        raise InputError(f"the image of {name!r} must have shape (H, W, 3), got {image.shape}.")
     return cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2BGR)

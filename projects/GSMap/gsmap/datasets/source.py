@@ -10,6 +10,7 @@ from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import MapSample
 from gsmap.structures.frames import frame_view
 from gsmap.structures.rigid import invert_rigid, rigid
+from gsmap.utils.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ def annotated(path: str | Path, data_root: Path | None = None) -> Source:
         ValueError: If it is no annotation file, or damaged.
     """
     if Path(path).suffix != ".arrow":
-        raise ValueError(
+        raise InputError(
             f"{path} is no annotation file (.arrow): open other recordings with "
             "mapdata.inputs.open_input and give what it returns."
         )

@@ -10,6 +10,7 @@ from mmengine.registry import DATA_SAMPLERS
 from torch.utils.data import Sampler
 
 from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
+from gsmap.utils.errors import InputError, InputTypeError
 
 
 def scenes_of(dataset: VectorizedMapDataset) -> list[list[int]]:
@@ -19,7 +20,7 @@ def scenes_of(dataset: VectorizedMapDataset) -> list[list[int]]:
         TypeError: If the data set does not know its scenes, as a wrapped one.
     """
     if not isinstance(dataset, VectorizedMapDataset):
-        raise TypeError(
+        raise InputTypeError(
             f"streams need a VectorizedMapDataset, got {type(dataset).__name__}: a wrapper mixes "
             "the samples of its scenes."
         )
@@ -97,7 +98,7 @@ class StreamTrainSampler(Sampler[int]):
         seed: int | None = 0,
     ) -> None:
         if slots < 1 or pieces < 1 or single_frame_iters < 0:
-            raise ValueError(
+            raise InputError(
                 "slots and pieces must be >= 1 and single_frame_iters >= 0, got "
                 f"{slots}, {pieces}, {single_frame_iters}."
             )

@@ -18,6 +18,7 @@ from gsmap.structures.calibration import NUM_CAN_BUS, without_history
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.rigid import invert_rigid, rigid
 from gsmap.structures.streams import Frame
+from gsmap.utils.errors import InputError, WorkError
 from gsmap.utils.model_facts import MOUNT, RIG
 from gsmap.utils.split_lists import SPLIT_LIST
 
@@ -98,13 +99,13 @@ class VectorizedMapDataset(BaseDataset):
         serialize_data: bool = True,
     ) -> None:
         if broken_samples not in _BROKEN:
-            raise ValueError(f"broken_samples must be one of {_BROKEN}, got {broken_samples!r}.")
+            raise InputError(f"broken_samples must be one of {_BROKEN}, got {broken_samples!r}.")
         if dim not in (None, 2, 3):
-            raise ValueError(f"dim must be 2, 3 or None, got {dim!r}.")
+            raise InputError(f"dim must be 2, 3 or None, got {dim!r}.")
         if broken_samples == "skip" and test_mode:
-            raise ValueError("broken_samples='skip' is for training: a test must see every sample.")
+            raise InputError("broken_samples='skip' is for training: a test must see every sample.")
         if indices is not None and not indices:
-            raise ValueError(f"indices must leave at least one sample, got {indices!r}.")
+            raise InputError(f"indices must leave at least one sample, got {indices!r}.")
         extent = None if grid is None else BEVGrid(**grid)
         self.cameras = None if cameras is None else tuple(cameras)
         self.broken_samples = broken_samples
@@ -191,7 +192,7 @@ class VectorizedMapDataset(BaseDataset):
         of_file = self.annotations.meta.ground_z_m
         of_config = self._ground_z_m
         if of_file is not None and of_config is not None and abs(of_file - of_config) > 1e-6:
-            raise ValueError(
+            raise InputError(
                 f"{self.ann_file} has the road at z = {of_file:g} m of its frame, the config at "
                 f"{of_config:g} m (ground_z_m): set both to one height."
             )
@@ -203,7 +204,7 @@ class VectorizedMapDataset(BaseDataset):
         if self._filter_empty_gt:
             counts = self.annotations.instance_counts()[rows]
             if (counts < 0).any():
-                raise ValueError(
+                raise InputError(
                     f"{(counts < 0).sum()} samples of {self.ann_file} have no ground truth, so it "
                     "cannot be trained on."
                 )
@@ -212,7 +213,7 @@ class VectorizedMapDataset(BaseDataset):
                 print_log(text, "current")
             rows = rows[counts > 0]
         if not len(rows):
-            raise ValueError(f"{self.ann_file} has no sample to use (of {len(self.annotations)}).")
+            raise InputError(f"{self.ann_file} has no sample to use (of {len(self.annotations)}).")
         donors = rows
         if self._shuffle_images_seed is not None:  # no sample keeps its own
             order = np.random.default_rng(self._shuffle_images_seed).permutation(len(rows))
@@ -391,7 +392,7 @@ class VectorizedMapDataset(BaseDataset):
                 raise
             self._broken_in_a_row += 1
             if self._broken_in_a_row > self.max_refetch:
-                raise RuntimeError(
+                raise WorkError(
                     f"{self._broken_in_a_row} samples in a row are broken; the latest: {error}"
                 ) from error
             token = self.sample(idx).token

@@ -22,6 +22,7 @@ from gsmap.engine.figures import finish_checks
 from gsmap.engine.optimizers import fit_optimizer_state
 from gsmap.engine.resuming import check_resumable
 from gsmap.engine.run_log import innermost
+from gsmap.utils.errors import InputError, NotFiniteError
 from gsmap.utils.files import read_text, take_from_link, write_bytes, write_text
 from gsmap.utils.model_facts import CALIBRATION, CHECKPOINT, calibration_of
 from gsmap.utils.shards import digest
@@ -130,7 +131,7 @@ class AtomicCheckpointHook(CheckpointHook):
         state = checkpoint["state_dict"]
         broken = [key for key, value in state.items() if not bool(value.isfinite().all())]
         if broken:
-            raise FloatingPointError(
+            raise NotFiniteError(
                 f"weights are NaN or infinite ({listed(broken)}), so they are not saved."
             )
         settings = plain(runner.cfg.model.to_dict())
@@ -197,7 +198,7 @@ class AtomicCheckpointHook(CheckpointHook):
         """
         for name in getattr(self, "key_indicators", ()):
             if metrics and name not in metrics:
-                raise ValueError(
+                raise InputError(
                     f"default_hooks.checkpoint.save_best names {name!r}, which the validation does "
                     f"not measure; it has {', '.join(n for n in metrics if n.endswith('/mAP'))}."
                 )

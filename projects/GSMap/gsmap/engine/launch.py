@@ -6,10 +6,8 @@ import inspect
 import logging
 import os
 import re
-import traceback
 import zipfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from datetime import timedelta
 from functools import cache
 from pathlib import Path
@@ -22,14 +20,15 @@ from mmengine.logging import print_log
 from mmengine.registry import Registry, init_default_scope
 from mmengine.utils import import_modules_from_strings
 
+from gsmap.checkpoints.building import reading_config
 from gsmap.checkpoints.named_models import find_config
 from gsmap.checkpoints.settings import pipeline_steps, scale_steps
 from gsmap.engine.rank_watch import TIMEOUT_S
 from gsmap.engine.targets import check_targets, class_of_type, share_settings
+from gsmap.utils.errors import InputError
 from gsmap.utils.faults import nearest, registered
 from gsmap.utils.files import DAMAGED_ZIP
 from gsmap.utils.parallel import LAUNCHER, die_with_parent
-from gsmap.utils.shipped import shipped
 
 # mmengine accepts a misspelt top-level key in silence: only these mean something.
 _COPIED = ("backend_args", "classes", "data_root", "grid", "vis_backends")  # read by no runner
@@ -67,19 +66,19 @@ def read_config(config: str | Path | Config, cfg_options: dict | None = None) ->
         cfg = Config(config.to_dict())
     else:
         path = find_config(config)
-        with _naming(path):
+        with reading_config(path):
             cfg = Config.fromfile(path, import_custom_modules=False)
     options = dict(cfg_options or {})
     factor = options.pop("image_scale", None)
     for name in options:
         _check_effect(cfg, name)
-    with _naming(f"--cfg-options of {cfg.filename or 'a config'}"):
+    with reading_config(f"--cfg-options of {cfg.filename or 'a config'}"):
         cfg.merge_from_dict(options)
     if factor is not None:
         _scale_images(cfg, factor)
     _check_keys(cfg)
     _fit_loaders(cfg)
-    with _naming(f"custom_imports of {cfg.filename or 'a config'}"):
+    with reading_config(f"custom_imports of {cfg.filename or 'a config'}"):
         import_modules_from_strings(["gsmap.registered"])
         import_modules_from_strings(**cfg.get("custom_imports", {"imports": []}))
     init_default_scope(cfg.get("default_scope", "mmdet3d"))
@@ -95,7 +94,7 @@ def _scale_images(cfg: Config, factor: float) -> None:
     """
     steps = scale_steps(cfg, "train", "val", "test")
     if not steps:
-        raise ValueError(f"--image-scale: no pipeline of {cfg.filename} has ScaleImages.")
+        raise InputError(f"--image-scale: no pipeline of {cfg.filename} has ScaleImages.")
     for step in steps:
         step.update(scale=factor, size=None)
 
@@ -124,41 +123,11 @@ def _fit_loaders(cfg: Config) -> None:
             if step.type == "LoadCameraImages":
                 step.on_device = True
             elif step.type == "MultiViewWrapper":
-                raise ValueError(
+                raise InputError(
                     f"{cfg.filename}: images_on_device does not go with {step.type}, which reads "
                     "pixels on the host: take DistortImages in its place, or leave out "
                     "images_on_device."
                 )
-
-
-@contextmanager
-def _naming(what: object) -> Iterator[None]:
-    """Name the config in any error that it raises while it runs, for a config is Python.
-
-    Args:
-        what: Path of the config, or words for the part of it that runs.
-
-    Raises:
-        ValueError: If the block raises an exception.
-    """
-    try:
-        yield
-    except Exception as error:
-        file = str(Path(str(what)).absolute())
-        place = ""
-        for frame in traceback.extract_tb(error.__traceback__):
-            if frame.filename == file:
-                place = f", line {frame.lineno},"  # the innermost one counts
-        reason: BaseException = error
-        if isinstance(error, ImportError) and error.__context__ is not None:
-            reason = error.__context__  # mmengine's own does not say why an import failed
-        if "load gsmap config" in str(reason):  # the scopes that it knows are fixed
-            reason = ValueError(
-                f"'gsmap::' is not read in _base_; write a path below {shipped('configs')} instead"
-            )
-        raise ValueError(
-            f"{what}{place} cannot be used: {type(reason).__name__}: {reason}."
-        ) from error
 
 
 def load_config(args: argparse.Namespace) -> Config:
@@ -203,7 +172,7 @@ def rank_timeout_s(cfg: Config) -> float:
     """
     timeout_s = cfg.get("env_cfg", {}).get("dist_cfg", {}).get("timeout", TIMEOUT_S)
     if not isinstance(timeout_s, int | float) or not timeout_s > 0:
-        raise ValueError(
+        raise InputError(
             f"{cfg.filename}: env_cfg.dist_cfg.timeout must be seconds > 0, got {timeout_s!r:.60}."
         )
     return timeout_s
@@ -276,7 +245,7 @@ def _check_schedule(cfg: Config) -> None:
     for scheduler in cfg.get("param_scheduler") or []:
         last = scheduler.get("T_max")
         if last is not None and scheduler.get("by_epoch", True) and last != end:
-            raise ValueError(
+            raise InputError(
                 f"{cfg.filename}: training lasts {end} epochs but the cosine schedule {last}: set "
                 "both train_cfg.max_epochs and param_scheduler's T_max (a schedule is one base "
                 "file)."
@@ -287,7 +256,7 @@ def _check_registered(cfg: Config, what: str, registry: Registry, kind: Any) -> 
     """Refuse a name of a class that a registry does not have."""
     if isinstance(kind, str) and registry.get(kind) is None:
         close = nearest(kind, registered(registry)) or "."
-        raise ValueError(f"{cfg.filename}: there is no {what} of type {kind!r}{close}")
+        raise InputError(f"{cfg.filename}: there is no {what} of type {kind!r}{close}")
 
 
 def _check_effect(cfg: Config, name: str) -> None:
@@ -305,7 +274,7 @@ def _check_effect(cfg: Config, name: str) -> None:
         settings = {k: v for k, v in cfg.items() if k not in _COPIED and not k.startswith("_")}
         copies = list(_places(settings, name=last, value=value, path=""))
     remedy = f"give {', '.join(copies)}, or edit" if copies else "edit"
-    raise ValueError(
+    raise InputError(
         f"--cfg-options {name} changes nothing: the other settings have copies of it, made when "
         f"the config was read. Instead {remedy} {cfg.filename or 'the config'}."
     )
@@ -327,11 +296,11 @@ def _check_keys(cfg: Config) -> None:
     for key, value in cfg.items():
         known = key in _known_keys()
         if known and key.endswith(_SECTIONS) and not isinstance(value, dict | None):
-            raise ValueError(f"{cfg.filename}: {key} must be dict(...), got {value!r:.60}.")
+            raise InputError(f"{cfg.filename}: {key} must be dict(...), got {value!r:.60}.")
         if known or key.startswith("_"):
             continue
         hint = nearest(key, _known_keys()) or "; names of a config's own values start with '_'."
-        raise ValueError(f"{cfg.filename}: unknown top-level key {key!r}{hint}")
+        raise InputError(f"{cfg.filename}: unknown top-level key {key!r}{hint}")
 
 
 def _check_streams(cfg: Config) -> None:
@@ -349,7 +318,7 @@ def _check_streams(cfg: Config) -> None:
         found = class_of_type(kind, DATA_SAMPLERS) or object
         bases = {base.__name__ for base in found.__mro__}
         if loader and wanted not in bases:
-            raise ValueError(
+            raise InputError(
                 f"{cfg.filename}: {part}_dataloader.sampler is {kind!r}, which tears scenes apart "
                 "(several ranks take turns with their frames), so model.temporal would remember "
                 f"other frames than the last: set its type to '{wanted}', or model.temporal=None."
@@ -357,7 +326,7 @@ def _check_streams(cfg: Config) -> None:
         slots = sampler.get("slots")
         size = loader.get("batch_size")
         if part == "train" and slots != size:
-            raise ValueError(
+            raise InputError(
                 f"{cfg.filename}: train_dataloader.batch_size is {size} and sampler.slots is "
                 f"{slots}: a place of the batch is a stream, so set both to one number."
             )

@@ -10,6 +10,7 @@ from mmengine.registry import OPTIM_WRAPPER_CONSTRUCTORS, OPTIM_WRAPPERS, OPTIMI
 from torch import Tensor, nn
 
 from gsmap.engine.figures import keep_figures
+from gsmap.utils.errors import InputError
 
 _KERNELS = ("fused", "foreach")  # settings of a group that say how a step is computed
 _LISTS = ("base_values", "_last_value")  # of a scheduler's state, one value a group
@@ -157,7 +158,7 @@ def _merged(groups: Sequence[dict], members: Sequence[Sequence[int]]) -> list[di
     for numbers in members:
         settings = [{k: v for k, v in groups[n].items() if k != "params"} for n in numbers]
         if any(each != settings[0] for each in settings):
-            raise ValueError(
+            raise InputError(
                 "the checkpoint's parameter groups differ in settings that are equal in the "
                 "config: resume with the config that it was trained with, or start anew from it "
                 "(load_from=...)."

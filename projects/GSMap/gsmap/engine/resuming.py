@@ -7,6 +7,8 @@ from typing import Any
 from mmengine.optim import _ParamScheduler
 from mmengine.runner import EpochBasedTrainLoop, Runner
 
+from gsmap.utils.errors import InputError
+
 _PARTS = ("meta", "message_hub", "optimizer")
 _HUB = ("log_scalars", "runtime_info", "resumed_keys")
 _SEEDS = 2**32
@@ -14,7 +16,7 @@ _SEEDS = 2**32
 
 def refusal(path: object, reason: str) -> ValueError:
     """Return the error that says why a checkpoint cannot be resumed from, and what to do."""
-    return ValueError(
+    return InputError(
         f"{path} cannot be resumed from: {reason}. --resume takes a checkpoint that a training "
         f"with this config wrote; to start from its weights alone give --cfg-options "
         f"load_from={path}."

@@ -21,6 +21,7 @@ from gsmap.engine.cpu_autocast import CPUAutocastOptimWrapper
 from gsmap.engine.launch import newest_checkpoint, rank_timeout_s
 from gsmap.engine.rank_watch import RankWatch
 from gsmap.engine.resuming import refusing_state
+from gsmap.utils.errors import NotFiniteError
 from gsmap.utils.files import naming_file, write_text
 from gsmap.utils.words import counted
 
@@ -73,7 +74,7 @@ class MapRunner(Runner):
             with naming_file(Path(self.work_dir)), self._watched():
                 return super().train()
         except FloatingPointError as error:
-            raise FloatingPointError(f"{error} {_what_to_lower(self)}") from error
+            raise NotFiniteError(f"{error} {_what_to_lower(self)}") from error
 
     def test(self) -> dict:
         """Test."""

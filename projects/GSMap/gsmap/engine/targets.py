@@ -9,6 +9,7 @@ from mmdet3d.registry import MODELS, TRANSFORMS
 from mmengine.config import Config
 from mmengine.registry import Registry
 
+from gsmap.utils.errors import InputError
 from gsmap.utils.targets import NeedsTargets
 
 
@@ -36,7 +37,7 @@ def _check_agreement(cfg: Config, steps: list[Any]) -> None:
         for step in _steps_of(steps, _needs(head.get("type")).transforms):
             for name in wanted.keys() & step.keys():
                 if _plain(step[name]) != _plain(wanted[name]):
-                    raise ValueError(
+                    raise InputError(
                         f"{cfg.filename}: {name} of {step['type']} is {step[name]}, but that of "
                         f"{head['type']} makes it {wanted[name]}: leave it out of the transform, "
                         "which takes it from the head."
@@ -122,7 +123,7 @@ def check_targets(cfg: Config) -> None:
         bases = {base.__name__ for kind in made for base in inspect.getmro(kind or object)}
         for name, kind in needed_targets(cfg).items():
             if name not in bases:
-                raise ValueError(
+                raise InputError(
                     f"{cfg.filename}: {kind} needs the targets of {name}: add it to the pipeline "
                     "of train_dataloader.dataset."
                 )

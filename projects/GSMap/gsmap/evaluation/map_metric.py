@@ -17,6 +17,7 @@ from gsmap.evaluation.core.metric import MetricSettings, metric_class, metric_na
 from gsmap.evaluation.core.report import flat_metrics, format_table
 from gsmap.evaluation.core.results_json import vectors_of, write_results
 from gsmap.structures.grid import BEVGrid
+from gsmap.utils.errors import InputError
 from gsmap.utils.model_facts import CALIBRATION, CHECKPOINT
 from gsmap.utils.split_lists import SPLIT_LIST, TRAINED_ON
 
@@ -52,7 +53,7 @@ class MapMetric(BaseMetric):
     ) -> None:
         super().__init__(**kwargs)
         if not eval and out_file is None:
-            raise ValueError(f"eval must name metrics of {metric_names()}, got none.")
+            raise InputError(f"eval must name metrics of {metric_names()}, got none.")
         for name in eval:
             metric_class(name)
         self.eval = tuple(eval)
@@ -62,7 +63,7 @@ class MapMetric(BaseMetric):
     def _meta(self, key: str) -> Any:
         """Return an entry of the data set's metainfo."""
         if key not in (self.dataset_meta or {}):
-            raise ValueError(f"MapMetric needs a data set whose metainfo has {key}.")
+            raise InputError(f"MapMetric needs a data set whose metainfo has {key}.")
         return self.dataset_meta[key]
 
     @cached_property
@@ -92,12 +93,12 @@ class MapMetric(BaseMetric):
             try:
                 predictions = elements_of_predictions(sample["pred_instances_3d"])
             except ValueError as error:
-                raise ValueError(f"predictions of sample {token}: {error}") from error
+                raise InputError(f"predictions of sample {token}: {error}") from error
             record: dict[str, Any] = {"token": token}
             if self.evaluator is not None:
                 info = sample.get("eval_ann_info")
                 if info is None:
-                    raise ValueError(
+                    raise InputError(
                         f"sample {token} has no ground truth (eval_ann_info): it cannot be scored. "
                         "Use an annotation file with instances, or eval=[] with an out_file."
                     )

@@ -22,6 +22,7 @@ from gsmap.models.loss_check import LossCheck
 from gsmap.models.streams.memory import Remembering, StreamMemory
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32
+from gsmap.utils.errors import InputError
 
 Inputs = dict[str, Any]
 Samples = Sequence[Det3DDataSample]
@@ -94,14 +95,14 @@ class MapDetector(Base3DDetector):
         self.half_backbone: HalfBackbone | None = None  # in place of both, for inference
         self.allow_untrained = allow_untrained
         if autocast not in (None, "bfloat16"):
-            raise ValueError(f"autocast must be None or 'bfloat16', got {autocast!r}.")
+            raise InputError(f"autocast must be None or 'bfloat16', got {autocast!r}.")
         self.autocast, self.compiled = autocast, compiled
         self.img_neck = MODELS.build(img_neck) if img_neck else None
         self.img_augment = MODELS.build(img_augment) if img_augment else None
         if not (bev_encoder or lidar_encoder):
-            raise ValueError("a model needs a bev_encoder (cameras), a lidar_encoder or both.")
+            raise InputError("a model needs a bev_encoder (cameras), a lidar_encoder or both.")
         if bool(bev_fuser) != bool(bev_encoder and lidar_encoder):
-            raise ValueError("bev_fuser belongs to a model of cameras and LiDAR, and to no other.")
+            raise InputError("bev_fuser belongs to a model of cameras and LiDAR, and to no other.")
         self.grid = BEVGrid(**grid)
         shared = {"grid": self.grid}
         self.bev_encoder = MODELS.build({**shared, **bev_encoder}) if bev_encoder else None
@@ -125,7 +126,7 @@ class MapDetector(Base3DDetector):
     def extract_img_feats(self, imgs: Tensor) -> list[Tensor]:
         """Run backbone and neck on all cameras. (B, V, 3, H, W) -> list of (B, V, C, h, w)"""
         if self.img_backbone is None:
-            raise ValueError("the model has no img_backbone, so it takes no images.")
+            raise InputError("the model has no img_backbone, so it takes no images.")
         images = imgs.flatten(0, 1)
         if self.training and self.img_augment is not None:
             images = self.img_augment(images)

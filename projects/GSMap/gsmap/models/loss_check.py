@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from gsmap.structures.tensors import LateValues
+from gsmap.utils.errors import NotFiniteError
 
 
 class LossCheck:
@@ -49,7 +50,7 @@ class LossCheck:
         (finite, names, tokens), self._open = self._open, None
         bad = [name for name, good in zip(names, finite.read().tolist(), strict=True) if not good]
         if bad:
-            raise FloatingPointError(
+            raise NotFiniteError(
                 f"losses {bad} are not finite; samples {tokens}: look at their images and ground "
                 "truth, then at the learning rate and at the loss scale of mixed precision."
             )

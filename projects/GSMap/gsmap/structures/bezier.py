@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsmap.structures.polylines import Points, resample
+from gsmap.utils.errors import InputError
 
 MAX_DEGREE = 5
 SAMPLES = 100  # points of a piece that a fit looks at, both ends included
@@ -36,7 +37,7 @@ def bernstein(degree: int, num_points: int = SAMPLES) -> Float:
         ValueError: If the degree is another.
     """
     if not 1 <= degree <= MAX_DEGREE:
-        raise ValueError(f"the degree of a Bezier curve must be 1 to {MAX_DEGREE}, got {degree}.")
+        raise InputError(f"the degree of a Bezier curve must be 1 to {MAX_DEGREE}, got {degree}.")
     t, k = np.linspace(0, 1, num_points)[:, None], np.arange(degree + 1)
     numbers: Float = np.array([comb(degree, each) for each in k.tolist()], np.float64)
     return numbers * t**k * (1 - t) ** (degree - k)
@@ -59,7 +60,7 @@ def curve_points(controls: Points, degree: int, num_points: int = SAMPLES) -> Fl
     controls = np.asarray(controls, dtype=np.float64)
     weights = bernstein(degree, num_points)
     if controls.ndim != 2 or len(controls) < degree + 1 or (len(controls) - 1) % degree:
-        raise ValueError(
+        raise InputError(
             f"pieces of degree {degree} have {degree} control points each and one at the end, got "
             f"points of shape {controls.shape}."
         )
@@ -160,9 +161,9 @@ def fit_joints(
     """
     points = np.asarray(points, dtype=np.float64)
     if max_error_m <= 0:
-        raise ValueError(f"max_error_m must be more than 0, got {max_error_m}.")
+        raise InputError(f"max_error_m must be more than 0, got {max_error_m}.")
     if len(points) < 2:
-        raise ValueError(f"a line has two points or more, got {len(points)}.")
+        raise InputError(f"a line has two points or more, got {len(points)}.")
     fits = _fits(degree, max_error_m, deviation)
     last, work = len(points) - 1, _WORK * len(points)
     joints = [0]

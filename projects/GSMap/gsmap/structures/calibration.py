@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gsmap.utils.errors import InputError
+
 NUM_CAN_BUS = 18
 OF_ONE_FRAME = slice(3, 17)  # of ``can_bus``; the rest are changes since an earlier frame
 
@@ -22,7 +24,7 @@ def without_history(can_bus: NDArray[np.floating[Any]]) -> NDArray[np.floating[A
     (18,) -> (18,); ValueError if there is another number.
     """
     if can_bus.shape != (NUM_CAN_BUS,):
-        raise ValueError(f"can_bus must hold {NUM_CAN_BUS} values, got shape {can_bus.shape}.")
+        raise InputError(f"can_bus must hold {NUM_CAN_BUS} values, got shape {can_bus.shape}.")
     return np.pad(can_bus[OF_ONE_FRAME], (OF_ONE_FRAME.start, NUM_CAN_BUS - OF_ONE_FRAME.stop))
 
 
@@ -49,7 +51,7 @@ def calibration_arrays(
         if meta.get(key) is None:
             if key == "can_bus":
                 return np.zeros(NUM_CAN_BUS)
-            raise ValueError(
+            raise InputError(
                 f"sample {meta.get('token')!r} has no {key!r} in its metainfo: pack it in the "
                 "pipeline; lidar2ego is a record's ego_from_frame (docs/custom_data.md)."
             )

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from gsmap.utils.errors import InputError
+
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
@@ -21,7 +23,7 @@ def annotated(results: Mapping[str, Any], transform: object) -> Sequence[Any]:
     """
     elements: Sequence[Any] | None = results["map_instances"]
     if elements is None:
-        raise ValueError(
+        raise InputError(
             f"sample {results['token']!r} has no ground truth: leave {type(transform).__name__} "
             "out of this pipeline."
         )
@@ -86,19 +88,19 @@ class MapElements:
         values = {"labels": labels, "scores": scores, "scales": scales, "rotations": rotations}
         for name, given in values.items():
             if given is not None and len(given) != len(polylines):
-                raise ValueError(
+                raise InputError(
                     f"{name} must have one entry for each of the {len(polylines)} polylines, "
                     f"got {len(given)}."
                 )
         try:
             points = _joined(polylines)
         except (TypeError, IndexError, ValueError) as error:
-            raise ValueError(f"polylines must be lists of (x, y) or (x, y, z): {error}") from error
+            raise InputError(f"polylines must be lists of (x, y) or (x, y, z): {error}") from error
         offsets = np.cumsum([0, *map(len, polylines)])
         _require(np.isfinite(points).all(axis=1), offsets, "point that is not finite")
         if scores is not None and not ((scores >= 0) & (scores <= 1)).all():  # NaN is not
             index = ((scores >= 0) & (scores <= 1)).argmin()
-            raise ValueError(f"element {index} has the score {scores[index]}, not in [0, 1].")
+            raise InputError(f"element {index} has the score {scores[index]}, not in [0, 1].")
         scales = _per_vertex(scales, "scales", (len(points), 2))
         rotations = _per_vertex(rotations, "rotations", (len(points),))
         if scales is not None:
@@ -143,7 +145,7 @@ class MapElements:
         if found == dim:
             return self
         if found < dim and len(self.points):
-            raise ValueError(f"points must have {dim} coordinates, got {found}.")
+            raise InputError(f"points must have {dim} coordinates, got {found}.")
         points = self.points[:, :dim] if len(self.points) else np.empty((0, dim))
         return replace(self, points=np.ascontiguousarray(points))
 
@@ -180,7 +182,7 @@ def _require(right: BoolArray, offsets: IntArray, fault: str) -> None:
     """Raise ValueError with the first element of which a vertex is not right. (M,), (N + 1,)"""
     if not right.all():
         index = np.searchsorted(offsets, right.argmin(), side="right") - 1
-        raise ValueError(f"element {index} has a {fault}.")
+        raise InputError(f"element {index} has a {fault}.")
 
 
 def _joined(polylines: PerElement) -> FloatArray:
@@ -192,7 +194,7 @@ def _joined(polylines: PerElement) -> FloatArray:
     rows = list(chain.from_iterable(filled)) if not arrays else []
     dims = {p.shape[1] for p in filled} if arrays else set(map(len, rows))
     if not dims <= {2, 3}:
-        raise ValueError(f"points have {sorted(dims)} coordinates")
+        raise InputError(f"points have {sorted(dims)} coordinates")
     if arrays:
         return np.concatenate([p[:, : min(dims)] for p in filled], dtype=np.float64)
     return np.array(rows if len(dims) == 1 else [row[:2] for row in rows], dtype=np.float64)
@@ -206,5 +208,5 @@ def _per_vertex(values: Any, name: str, shape: tuple[int, ...]) -> FloatArray | 
         return np.empty(shape)
     joined = np.concatenate([np.asarray(v, dtype=np.float64) for v in values])
     if joined.shape != shape:
-        raise ValueError(f"{name} must hold {shape} values in all, got {joined.shape}.")
+        raise InputError(f"{name} must hold {shape} values in all, got {joined.shape}.")
     return joined

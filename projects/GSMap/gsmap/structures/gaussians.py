@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32, constant, kept
+from gsmap.utils.errors import InputError
 
 ACTIVATIONS = ("sigmoid", "softplus", "exp")
 _ROUND = 1e-6  # relative difference of both variances, below which a Gaussian has no direction
@@ -66,12 +67,12 @@ class GaussianSpace:
     def __post_init__(self) -> None:
         object.__setattr__(self, "init_scales_m", tuple(float(s) for s in self.init_scales_m))
         if not all(0 < self.min_scale_m < s < self.max_scale_m for s in self.init_scales_m):
-            raise ValueError(
+            raise InputError(
                 "0 < min_scale_m < init_scales_m < max_scale_m must hold, got "
                 f"{self.min_scale_m}, {self.init_scales_m}, {self.max_scale_m}."
             )
         if self.activation not in ACTIVATIONS:
-            raise ValueError(f"activation must be one of {ACTIVATIONS}, got {self.activation!r}.")
+            raise InputError(f"activation must be one of {ACTIVATIONS}, got {self.activation!r}.")
         first = torch.tensor(self.init_scales_m, dtype=torch.float64)
         object.__setattr__(self, "_start", tuple(self._before_activation(first).tolist()))
 
@@ -92,7 +93,7 @@ class GaussianSpace:
         their activation; ValueError if there are fewer than five. (..., 5 or more) -> (...)
         """
         if reference.shape[-1] < 5:
-            raise ValueError(
+            raise InputError(
                 f"reference must have shape (..., 5) or more, got {tuple(reference.shape)}."
             )
         reference = at_least_float32(reference)

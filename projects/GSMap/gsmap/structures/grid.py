@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from gsmap.utils.errors import InputError
+
 if TYPE_CHECKING:  # what scores files and knows no tensors starts without torch
     import torch
     from torch import Tensor
@@ -42,15 +44,15 @@ class BEVGrid:
         for name in ("x_range", "y_range"):
             low, high = (float(v) for v in getattr(self, name))
             if not low < high:
-                raise ValueError(f"{name} must be (low, high) with low < high, got {(low, high)}.")
+                raise InputError(f"{name} must be (low, high) with low < high, got {(low, high)}.")
             object.__setattr__(self, name, (low, high))  # a config's lists, made hashable
         if self.height < 1 or self.width < 1:
-            raise ValueError(f"height and width must be >= 1, got {self.height} x {self.width}.")
+            raise InputError(f"height and width must be >= 1, got {self.height} x {self.width}.")
         if self.forward is None:
             wide = self.extent_m[0] > self.extent_m[1]
             object.__setattr__(self, "forward", "x" if wide else "y")
         elif self.forward not in ("x", "y"):
-            raise ValueError(f"forward must be 'x' or 'y', got {self.forward!r}.")
+            raise InputError(f"forward must be 'x' or 'y', got {self.forward!r}.")
 
     @property
     def extent_m(self) -> tuple[float, float]:
@@ -75,7 +77,7 @@ class BEVGrid:
         counts = [extent / size for extent, size in zip(self.extent_m, sizes, strict=True)]
         width, height = (round(count) for count in counts)
         if min(width, height) < 1 or max(abs(counts[0] - width), abs(counts[1] - height)) > 1e-3:
-            raise ValueError(
+            raise InputError(
                 f"pixels of {sizes[0]:g} x {sizes[1]:g} m do not divide the map of "
                 f"{self.extent_m[0]:g} x {self.extent_m[1]:g} m."
             )
@@ -141,7 +143,7 @@ def _chosen(points: Array, order: list[int]) -> Array:
 def _affine(points: Array, scale: tuple[float, float], shift: tuple[float, float]) -> Array:
     """Return ``points * scale + shift`` on (x, y); further entries (z) are kept. (..., >= 2)"""
     if points.shape[-1] < 2:
-        raise ValueError(f"points must end in (x, y), got shape {tuple(points.shape)}.")
+        raise InputError(f"points must end in (x, y), got shape {tuple(points.shape)}.")
     if isinstance(points, np.ndarray):
         xy = points[..., :2] * np.asarray(scale) + np.asarray(shift)
         return np.concatenate([xy, points[..., 2:]], -1).astype(points.dtype, copy=False)

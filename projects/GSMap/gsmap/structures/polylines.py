@@ -7,6 +7,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from gsmap.utils.errors import InputError
+
 Points = NDArray[np.floating[Any]]
 
 PADDING = -10000.0
@@ -16,9 +18,9 @@ PADDING = -10000.0
 def _check_polyline(points: Points, num_points: int = 2) -> Points:
     points = np.asarray(points)
     if points.ndim != 2 or len(points) < 2 or points.shape[1] < 2:
-        raise ValueError(f"points must have shape (n >= 2, 2 or 3), got {points.shape}.")
+        raise InputError(f"points must have shape (n >= 2, 2 or 3), got {points.shape}.")
     if num_points < 2:
-        raise ValueError(f"num_points must be >= 2, got {num_points}.")
+        raise InputError(f"num_points must be >= 2, got {num_points}.")
     return points.astype(np.float64, copy=False)
 
 

@@ -6,6 +6,8 @@ import numpy as np
 import numpy.typing as npt
 from numpy.typing import NDArray
 
+from gsmap.utils.errors import InputError
+
 
 def rigid(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> NDArray[np.float64]:
     """Return a rotation (3, 3) and a translation (3,) as one transform. (4, 4)"""
@@ -22,7 +24,7 @@ def invert_rigid(transform: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
     """
     matrices = np.asarray(transform, np.float64)
     if matrices.shape[-2:] != (4, 4):
-        raise ValueError(f"transform must have shape (..., 4, 4), got {matrices.shape}.")
+        raise InputError(f"transform must have shape (..., 4, 4), got {matrices.shape}.")
     inverse = np.zeros_like(matrices)
     rotation = matrices[..., :3, :3].swapaxes(-1, -2)
     inverse[..., :3, :3] = rotation

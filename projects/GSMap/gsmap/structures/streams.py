@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsmap.structures.rigid import invert_rigid, is_rigid
+from gsmap.utils.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class Frame:
     def __post_init__(self) -> None:
         pose = np.asarray(self.pose)
         if pose.shape != (4, 4) or not is_rigid(pose):
-            raise ValueError(
+            raise InputError(
                 f"lidar2global of sample {self.token!r} must be a finite rigid motion (4, 4) from "
                 "its annotation frame to the world, a rotation with 0, 0, 0, 1 below: got "
                 f"{pose.tolist()!r:.200}."
@@ -44,7 +45,7 @@ class Frame:
         """Read a sample's metainfo; ValueError if a field is missing, or the pose is none."""
         missing = [k for k in ("scene", "timestamp_ns", "lidar2global") if meta.get(k) is None]
         if missing:
-            raise ValueError(
+            raise InputError(
                 f"sample {meta.get('token')!r} has no {missing} in its metainfo, which a model "
                 "with memory needs: give each sample its scene, time and pose."
             )
@@ -125,7 +126,7 @@ class Scenes:
         if self.owner is None or self.owner == str(owner):  # a copy has the name alone
             self.owner = owner
         if self.owner is not owner:
-            raise ValueError(
+            raise InputError(
                 f"this stream is of {self.owner}, and {owner} cannot read what that remembers: "
                 "start a new stream for each model (new_stream)."
             )
@@ -144,7 +145,7 @@ class Scenes:
         batch: dict[str, Frame] = {}
         for frame in frames:
             if frame.scene in batch:
-                raise ValueError(
+                raise InputError(
                     f"frames {batch[frame.scene]} and {frame} of one scene are in one batch: one "
                     "needs what the other leaves; set batch_size=1 or use StreamBatches."
                 )
@@ -159,7 +160,7 @@ class Scenes:
         seconds = frame.seconds_after(state.frame)
         if seconds <= 0:
             what = "comes twice" if seconds == 0 else "comes too late"
-            raise ValueError(
+            raise InputError(
                 f"frame {frame} {what}: its stream is at {state.frame} already. Hand a stream its "
                 "frames once each and in order, or start a new stream."
             )
@@ -193,7 +194,7 @@ class MapStream(Scenes):
         reached = self.last or next(iter(frames), None)
         for frame in frames:
             if reached is not None and frame.scene != reached.scene:
-                raise ValueError(
+                raise InputError(
                     f"frame {frame} is of another scene than {reached}, where the stream is: "
                     "start a new stream for each scene."
                 )

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch._subclasses import FakeTensor
 
+from gsmap.utils.errors import InputError
+
 _ALIGNMENT = 64  # bytes, more than any type or kernel wants
 _LARGE = 2**20  # bytes that a copy of its own is worth
 _MOST_CONSTANTS = 4096  # of a process; further ones are made anew each time
@@ -174,7 +176,7 @@ def check_same_shape(**both: Tensor) -> None:
     """Raise ValueError if two tensors differ in shape; their names are those in the message."""
     (of, first), (name, second) = both.items()
     if first.shape != second.shape:
-        raise ValueError(
+        raise InputError(
             f"{name} must have shape {tuple(first.shape)} of {of}, got {tuple(second.shape)}."
         )
 
@@ -183,7 +185,7 @@ def num_depth_bins(depth_range: tuple[float, float, float]) -> int:
     """Return the number of bins of ``(low, high, step)``; ValueError if there is none."""
     low, high, step = depth_range
     if step <= 0 or high - low < step:
-        raise ValueError(
+        raise InputError(
             f"depth_range must be (low, high, step) with one bin or more, got {depth_range}."
         )
     return int((high - low) / step)

@@ -3,6 +3,8 @@
 import importlib
 from types import ModuleType
 
+from gsmap.utils.errors import WorkError
+
 
 def import_extra(module: str, extra: str) -> ModuleType:
     """Import a module that comes with an extra of this package (``pip install -e .[EXTRA]``).
@@ -13,6 +15,6 @@ def import_extra(module: str, extra: str) -> ModuleType:
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
-        raise RuntimeError(
+        raise WorkError(
             f"{module} is not installed: `pip install -e .[{extra}]` brings it."
         ) from error

@@ -21,6 +21,7 @@ from functools import partial
 from pathlib import Path
 from typing import IO, Any, Literal
 
+from gsmap.utils.errors import InputError, WorkError
 from gsmap.utils.inputs import forget_output, require_no_input
 
 try:
@@ -204,7 +205,7 @@ def open_to_append(path: Path) -> io.FileIO:
         if _is_plain(os.fstat(file.fileno())):
             return file
         file.close()
-    raise ValueError(
+    raise InputError(
         f"{path} is a link, a pipe or a folder, and no file of this program: take it away, or "
         "write elsewhere."
     )
@@ -225,7 +226,7 @@ def require_no_link(path: Path, below: Path | None = None) -> None:
         if folder == top:
             return
         if folder.is_symlink():
-            raise ValueError(
+            raise InputError(
                 f"{folder} is a link, and what is written there would go elsewhere: take it away, "
                 "or write elsewhere."
             )
@@ -273,7 +274,7 @@ def read_text(path: str | Path) -> str:
     except UnicodeDecodeError as error:
         wide = error.object.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
         reason = "it is UTF-16" if wide else str(error)
-        raise ValueError(f"{path} cannot be read: {reason}; save it as UTF-8.") from error
+        raise InputError(f"{path} cannot be read: {reason}; save it as UTF-8.") from error
 
 
 def read_json(path: str | Path) -> Any:
@@ -281,9 +282,9 @@ def read_json(path: str | Path) -> Any:
     try:
         return json.loads(read_text(path))
     except json.JSONDecodeError as error:
-        raise ValueError(f"{path} cannot be read: {error}.") from error
+        raise InputError(f"{path} cannot be read: {error}.") from error
     except RecursionError:
-        raise ValueError(f"{path} cannot be read: it is nested too deep.") from None
+        raise InputError(f"{path} cannot be read: it is nested too deep.") from None
 
 
 def write_bytes(path: str | Path, content: bytes) -> None:
@@ -342,7 +343,7 @@ def lock(file: IO[Any] | int, held: str) -> None:
         RuntimeError: If another process has locked it, with the text ``held``.
     """
     if (locked := try_lock(file)) is False:
-        raise RuntimeError(held)
+        raise WorkError(held)
     if locked is None:
         text = "files cannot be locked here: take care that one process works at a time."
         logging.getLogger("gsmap").warning(text)
@@ -366,7 +367,7 @@ def lock_folder(folder: Path, name: str, advice: str) -> IO[str]:
     file.seek(0)
     holder = file.read(200)
     if not _HOLDER.fullmatch(holder):
-        raise ValueError(f"{folder / name} is another program's file: write elsewhere.")
+        raise InputError(f"{folder / name} is another program's file: write elsewhere.")
     lock(file, f"{folder} is in use by {holder or 'another process'}: {advice}.")
     file.truncate(0)
     file.write(f"process {os.getpid()} on {platform.node()} since {time.strftime('%F %T')}")

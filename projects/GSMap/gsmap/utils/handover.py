@@ -3,6 +3,8 @@
 from multiprocessing import queues
 from typing import Any
 
+from gsmap.utils.errors import InputError
+
 _REMEDY = (
     "make room in /dev/shm, raise the limits of open files and of file sizes (ulimit -n, ulimit "
     "-f), or read in the command's own process: num_workers=0, persistent_workers=False, "
@@ -28,7 +30,7 @@ def _send_error(queue: "queues.Queue[Any]", error: Exception, item: Any) -> None
         _otherwise(error, item)
         return
     try:
-        raise ValueError(
+        raise InputError(
             f"a worker could not hand over what it read ({error}): {_REMEDY}."
         ) from error
     except ValueError:

@@ -8,11 +8,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar
 
+from gsmap.utils.errors import InputError, WorkError
+
 _Identity = tuple[int, int, int]  # device and number of a file, and when it was last changed
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 
 
-class InputReplacedError(RuntimeError):
+class InputReplacedError(WorkError):
     """A command would write over a file that it reads."""
 
 
@@ -57,7 +59,7 @@ def declare_files(inputs: Iterable[Path], outputs: Sequence[tuple[Path, str]]) -
         if path.is_file() or not path.exists():  # a device may take several
             first = places.setdefault(os.path.realpath(path), option)
             if first != option:
-                raise ValueError(f"{first} and {option} both name {path}: give two names.")
+                raise InputError(f"{first} and {option} both name {path}: give two names.")
     there = {i: f"{option} {path}" for path, option in outputs if (i := _identity(path))}
     for path in inputs:
         _require_other(path, there)

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
 
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import fetch_advice
 
 Place = tuple[int, int]
@@ -40,11 +41,11 @@ def items_of(
         try:
             yield from _Text(file).items(key, beside or {})
         except _FormError as error:
-            raise ValueError(f"{path} holds {error} and no list{under}: {advice}.") from error
+            raise InputError(f"{path} holds {error} and no list{under}: {advice}.") from error
         except (ValueError, RecursionError) as error:
             file.seek(0)
             advice = fetch_advice(file.read(100), advice)
-            raise ValueError(
+            raise InputError(
                 f"{path} is empty or holds no complete list{under} ({error!r:.80}): {advice}."
             ) from error
 
@@ -150,4 +151,4 @@ class _Text:
         return bool(block)
 
     def _error(self, what: str) -> ValueError:
-        return ValueError(f"{what} at byte {self._byte}")
+        return InputError(f"{what} at byte {self._byte}")

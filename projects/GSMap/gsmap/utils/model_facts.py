@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
+from gsmap.utils.errors import InputError
+
 CHECKPOINT = "checkpoint"  # key in results: the SHA-256 of the file of its weights
 CALIBRATION = "calibration"  # key in checkpoints and results: how the sigmas were fitted to errors
 MOUNT = "mount"  # key of metainfo: from the annotation frame to the ground below the rear axle
@@ -25,7 +27,7 @@ def calibration_of(meta: Mapping[str, Any]) -> dict[str, Any]:
     words: Mapping[str, Any] = said if isinstance(said, Mapping) else {}
     law, sigmas = words.get("law"), words.get("sigmas")
     if law not in LAW_NAMES or not isinstance(sigmas, int | float) or not 0 < sigmas <= 3:
-        raise ValueError(
+        raise InputError(
             f"{CALIBRATION} must name a law of {LAW_NAMES} and sigmas in (0, 3], got {said!r:.60}."
         )
     return {"law": law, "sigmas": sigmas}

@@ -18,7 +18,7 @@ from queue import Empty, SimpleQueue
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
-from gsmap.utils.faults import in_words
+from gsmap.utils.errors import InputError, WorkError
 from gsmap.utils.terminal import print_safely
 
 Task = TypeVar("Task")
@@ -114,9 +114,6 @@ def _work(task: Any) -> Any:
         if _Worker.stopping:
             raise SystemExit(128 + signal.SIGTERM)
         return _Worker.function(task)
-    except Exception as error:
-        error.words = in_words(error)  # type: ignore[attr-defined] # the traceback stays here
-        raise
     finally:
         _Worker.busy = False
 
@@ -144,7 +141,7 @@ def ordered_map(
         RuntimeError: If a worker dies or a result takes too long; the others are stopped.
     """
     if workers < 1:
-        raise ValueError(f"workers must be >= 1, got {workers}.")
+        raise InputError(f"workers must be >= 1, got {workers}.")
     if workers == 1:
         yield from map(function, tasks)
         return
@@ -161,13 +158,13 @@ def ordered_map(
             for process in list((pool._processes or {}).values()):
                 process.kill() if isinstance(error, TimeoutError) else process.terminate()
             if isinstance(error, BrokenProcessPool):
-                raise RuntimeError(
+                raise WorkError(
                     "a worker process died: most likely for want of memory (run again with fewer "
                     "--workers), or because the program that called this cannot be imported anew "
                     "(put the call under if __name__ == '__main__')."
                 ) from error
             if isinstance(error, TimeoutError):
-                raise RuntimeError(
+                raise WorkError(
                     f"a task took more than {timeout_s:g} s; run again with --workers 1 to see "
                     "where it stands."
                 ) from error

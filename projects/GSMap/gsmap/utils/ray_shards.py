@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+from gsmap.utils.errors import InputError, WorkError
 from gsmap.utils.extras import import_extra
 from gsmap.utils.parallel import die_with_parent
 from gsmap.utils.shards import without_options
@@ -45,14 +46,14 @@ def run_on_ray(
         RuntimeError: If Ray is not installed, or shards fail; the others are made.
     """
     if arguments.shards < 1 or arguments.shard.count:
-        raise ValueError("--executor needs --shards N of at least 1, and no --shard I/N.")
+        raise InputError("--executor needs --shards N of at least 1, and no --shard I/N.")
     ray = import_extra("ray", "ray")
     if not ray.is_initialized():
         ray.init(log_to_driver=False, include_dashboard=False)
     run = _Run(ray, _plain(words), arguments.shards, dict(arguments.per_shard), patience_s)
     failures = run.all()
     if failures:
-        raise RuntimeError(f"{len(failures)} of {arguments.shards} shards failed: {failures[0]}")
+        raise WorkError(f"{len(failures)} of {arguments.shards} shards failed: {failures[0]}")
     middle, longest = statistics.median(run.seconds), max(run.seconds)
     return (
         f"{arguments.shards} shards made, {middle:.1f} s each (median), at most {longest:.1f} s, "

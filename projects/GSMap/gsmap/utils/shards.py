@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from gsmap import __version__
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import write_text
 
 Items = TypeVar("Items", bound=Sequence[Any])
@@ -171,15 +172,15 @@ def read_shard(path: Path) -> ShardFile:
         wrong = [name for name, kind in _TYPES.items() if type(manifest[name]) is not kind]
         shard = Shard(manifest["shard"], manifest["of"])
         if wrong or not 0 <= shard.index < shard.count <= _MOST or manifest["samples"] < 0:
-            raise ValueError(f"{wrong or ['shard', 'of', 'samples']} cannot be")
+            raise InputError(f"{wrong or ['shard', 'of', 'samples']} cannot be")
         right = shard.path_of(path.with_name(manifest["target"]))
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise ValueError(f"{beside} is damaged ({error!r}): make that shard again.") from error
+        raise InputError(f"{beside} is damaged ({error!r}): make that shard again.") from error
     same_size = path.is_file() and path.stat().st_size == manifest["bytes"]
     if not same_size or digest(path) != manifest["sha256"]:
-        raise ValueError(f"{path} is missing, or not what its manifest tells of: make it again.")
+        raise InputError(f"{path} is missing, or not what its manifest tells of: make it again.")
     if path != right:
-        raise ValueError(
+        raise InputError(
             f"{path} is another shard by its manifest: {shard.index} of {shard.count} of "
             f"{manifest['target']}; take it away, and make the right one."
         )
@@ -202,7 +203,7 @@ def find_shards(target: Path) -> list[ShardFile]:
     for other in found[1:]:
         names = _differences(first.manifest, other.manifest)
         if names:
-            raise ValueError(
+            raise InputError(
                 f"{first.path} and {other.path} are shards of different work, by {names}: make "
                 "those anew that are not of this."
             )

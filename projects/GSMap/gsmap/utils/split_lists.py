@@ -6,6 +6,8 @@ import re
 from collections.abc import Collection, Mapping
 from typing import Any
 
+from gsmap.utils.errors import InputError
+
 SPLIT_LIST = "split_list"  # key in annotation files, checkpoints and results
 TRAINED_ON = "trained_on"  # key in results: the model's list, where it is of the same data set
 _FORM = re.compile(r"[\w.+=-]{1,100}(@[0-9a-f]{16})?")
@@ -22,7 +24,7 @@ def checked_identity(text: Any) -> str:
     if text in (None, ""):
         return ""
     if not isinstance(text, str) or not _FORM.fullmatch(text):
-        raise ValueError(f"{SPLIT_LIST} must be a name with a digest, got {text!r:.60}.")
+        raise InputError(f"{SPLIT_LIST} must be a name with a digest, got {text!r:.60}.")
     return text
 
 
@@ -40,7 +42,7 @@ def require_same_list(model: Any, data: Any, subject: str, remedy: str) -> None:
     """
     first, second = checked_identity(model), checked_identity(data)
     if first and second and first != second:
-        raise ValueError(
+        raise InputError(
             f"{subject} was trained on the split {first}, and the data to score is of {second}, "
             "whose places may be among those of the training: take data of the same split, or "
             f"allow it with {remedy}."

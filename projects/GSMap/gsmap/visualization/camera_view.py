@@ -18,6 +18,7 @@ from gsmap.datasets.errors import BrokenSampleError
 from gsmap.datasets.image_files import read_image
 from gsmap.structures.elements import MapElements
 from gsmap.structures.frames import FrameView, viewing_azimuth
+from gsmap.utils.errors import InputError
 from gsmap.visualization.camera_projection import project_polygon, project_segments, subdivided
 from gsmap.visualization.style import MapStyle
 
@@ -46,7 +47,7 @@ class CameraView:
     def __post_init__(self) -> None:
         kind, shape = self.image.dtype, self.image.shape
         if len(shape) != 3 or shape[2] != 3 or kind != np.uint8:
-            raise ValueError(
+            raise InputError(
                 f"image of camera {self.name} must be RGB uint8 (h, w, 3), got {kind} {shape}."
             )
 

@@ -19,6 +19,7 @@ from gsmap.datasets.image_files import decode_image, encode_jpeg
 from gsmap.structures.elements import MapElements
 from gsmap.structures.frames import FrameView
 from gsmap.structures.grid import BEVGrid
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import file_name, write_bytes
 from gsmap.visualization.bev_view import BEVPanel, display_extent, draw_bev
 from gsmap.visualization.camera_view import CameraView, arrange_cameras, draw_camera
@@ -164,7 +165,7 @@ def compose_figure(
         ValueError: If there is nothing to draw.
     """
     if not cameras and not panels:
-        raise ValueError("compose_figure needs at least one camera or one panel.")
+        raise InputError("compose_figure needs at least one camera or one panel.")
     rows = arrange_cameras(cameras, view)
     aspects = [[c.size_px[0] / c.size_px[1] for c in row] for row in rows]
     left, right, low, high = display_extent(grid, view)
@@ -223,7 +224,7 @@ def save_figure(figure: Figure, path: str | Path) -> Path:
     path = Path(path)
     kind = path.suffix.lower().lstrip(".").replace("jpeg", "jpg")
     if kind not in FORMATS:
-        raise ValueError(
+        raise InputError(
             f"Cannot write a picture to {path}: the name must end in one of {FORMATS}."
         )
     content = BytesIO()

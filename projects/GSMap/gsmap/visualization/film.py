@@ -11,6 +11,7 @@ from gsmap.evaluation.analysis.consistency import DriveFrame
 from gsmap.evaluation.analysis.drive_files import drive_frames
 from gsmap.structures.frames import frame_view
 from gsmap.structures.grid import BEVGrid
+from gsmap.utils.errors import InputError
 from gsmap.utils.extras import import_extra
 from gsmap.utils.files import atomic_write
 from gsmap.utils.words import counted
@@ -86,7 +87,7 @@ def write_drive_film(
     scenes = list(dict.fromkeys(file.column("scene")))
     scene = scenes[0] if scene is None else scene
     if scene not in scenes:
-        raise ValueError(
+        raise InputError(
             f"{annotations} has no scene {scene!r}: give one of its {len(scenes)}, such as "
             f"{scenes[0]!r}."
         )

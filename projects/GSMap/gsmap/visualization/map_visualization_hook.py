@@ -9,6 +9,7 @@ from mmdet3d.registry import HOOKS
 from mmengine.hooks import Hook
 from mmengine.runner import Runner
 
+from gsmap.utils.errors import InputError, InputTypeError
 from gsmap.utils.files import file_name
 from gsmap.visualization.figure import sample_name, save_figure
 from gsmap.visualization.map_visualizer import MapVisualizer
@@ -23,7 +24,7 @@ def _points(data_batch: Any, index: int) -> np.ndarray | None:
 def _visualizer(runner: Runner) -> MapVisualizer:
     """Return the runner's visualizer, which must be ours."""
     if not isinstance(runner.visualizer, MapVisualizer):
-        raise TypeError(
+        raise InputTypeError(
             "MapVisualizationHook needs visualizer=dict(type='MapVisualizer') in the config, "
             f"got {type(runner.visualizer).__name__}."
         )
@@ -56,7 +57,7 @@ class MapVisualizationHook(Hook):
 
     def __post_init__(self) -> None:
         if self.interval < 1:
-            raise ValueError(f"interval must be >= 1, got {self.interval}.")
+            raise InputError(f"interval must be >= 1, got {self.interval}.")
 
     def after_val_iter(
         self, runner: Runner, batch_idx: int, data_batch: Any = None, outputs: Any = None

@@ -18,6 +18,7 @@ from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.structures.elements import MapElements
 from gsmap.structures.frames import FRAME_VIEWS, FrameView, frame_view
 from gsmap.structures.grid import BEVGrid
+from gsmap.utils.errors import InputError
 from gsmap.visualization.bev_view import BEVPanel
 from gsmap.visualization.camera_view import CameraView
 from gsmap.visualization.figure import compose_figure, figure_to_rgb, sample_title
@@ -36,7 +37,7 @@ def images_from_inputs(images: torch.Tensor) -> list[np.ndarray]:
         ValueError: If the shape is wrong.
     """
     if images.ndim != 4 or images.shape[1] != 3:
-        raise ValueError(f"images must have shape (V, 3, H, W), got {tuple(images.shape)}.")
+        raise InputError(f"images must have shape (V, 3, H, W), got {tuple(images.shape)}.")
     pixels = images.flip(1).permute(0, 2, 3, 1).float().round().clamp(0, 255).to(torch.uint8)
     return list(pixels.cpu().numpy())
 
@@ -104,7 +105,7 @@ class MapVisualizer(Visualizer):
         super().__init__(name=name, **kwargs)
         unknown = set(panels) - set(PANELS)
         if unknown:
-            raise ValueError(f"panels must be among {PANELS}, got {sorted(unknown)}.")
+            raise InputError(f"panels must be among {PANELS}, got {sorted(unknown)}.")
         self.ground_z_m = ground_z_m
         self.score_thr = score_thr
         self.panels = tuple(panels)
@@ -130,7 +131,7 @@ class MapVisualizer(Visualizer):
         """Return orientation and ground plane for a sample with this meta data."""
         frame = (self.dataset_meta or {}).get("frame", "lidar")
         if frame not in FRAME_VIEWS:
-            raise ValueError(
+            raise InputError(
                 f"No view is known for frame {frame!r}, only for {sorted(FRAME_VIEWS)}; "
                 "add one to gsmap.structures.frames.FRAME_VIEWS."
             )
@@ -164,7 +165,7 @@ class MapVisualizer(Visualizer):
             where = f"sample {metainfo.get('token')!r}"
             found = [None if p is None else read_image(p, where)[..., ::-1] for p in paths or ()]
         if len(found) != len(projections):
-            raise ValueError(
+            raise InputError(
                 f"A sample has {len(found)} images, but {len(projections)} projections."
             )
         triples = zip(names, found, projections, strict=True)

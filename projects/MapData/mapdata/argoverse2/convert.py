@@ -11,6 +11,7 @@ import shapely
 from gsmap.datasets.annotations.file import AnnotationWriter
 from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta
 from gsmap.datasets.errors import naming
+from gsmap.utils.errors import InputError, WorkError
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
 from gsmap.utils.split_lists import SPLIT_LIST
@@ -81,7 +82,7 @@ def convert_argoverse2(options: Argoverse2Options) -> ConversionSummary:
             named = ((s.timestamp_ns, s.lidar.path) for s in result.samples if s.lidar is not None)
             offsets_ns += [abs(int(Path(path).stem) - time_ns) for time_ns, path in named]
         if not len(writer) and not options.shard.count:
-            raise RuntimeError(f"no sample is left for {target}:\n{summary.text()}")
+            raise WorkError(f"no sample is left for {target}:\n{summary.text()}")
     note = f"LiDAR sweep named by {len(offsets_ns)} of {len(writer)} samples"
     away = f", at most {max(offsets_ns) / 1e6:.0f} ms away" if offsets_ns else ""
     summary.notes += [note + away, f"written to {writer.path}"]
@@ -93,7 +94,7 @@ def _listed_logs(
 ) -> list[Path]:
     """Return the logs of a list, wherever they are: published lists mix the official folders."""
     if options.split not in wanted.scenes:
-        raise ValueError(
+        raise InputError(
             f"split {wanted.name!r} has no part {options.split!r}: name one of "
             f"{', '.join(wanted.scenes)} with --split."
         )

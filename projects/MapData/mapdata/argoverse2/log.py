@@ -13,6 +13,7 @@ from pyarrow import feather
 
 from gsmap.datasets.errors import naming
 from gsmap.structures.rigid import rigid
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import SUFFIX as PARTIAL
 from gsmap.utils.inputs import heed_input
 
@@ -70,7 +71,7 @@ class Argoverse2Log:
             good = np.abs(np.linalg.norm(quaternions, axis=1) - 1) < 1e-3
             good &= np.isfinite(translations).all(1)
             if not good.all() or len(table) == 0:
-                raise ValueError(f"it holds {int((~good).sum())} bad of {len(table)} poses")
+                raise InputError(f"it holds {int((~good).sum())} bad of {len(table)} poses")
             times = table["timestamp_ns"].to_numpy(np.int64).tolist()
         return dict(zip(times, map(rigid, quat_to_mat(quaternions), translations), strict=True))
 

@@ -14,6 +14,7 @@ from av2.map.map_api import ArgoverseStaticMap
 
 from gsmap.datasets.annotations.record import RANGES
 from gsmap.datasets.errors import naming
+from gsmap.utils.errors import InputError
 from mapdata.argoverse2.map_file import read_map_file
 from mapdata.argoverse2.rules import (
     clip_lines,
@@ -33,10 +34,10 @@ NO_LANE, OUTSIDE = -2, -1  # no neighbour; one that is not in the map
 def check_rules(classes: Collection[str], compat: str) -> None:
     """Raise a ``ValueError`` unless the classes and the rules are known."""
     if compat not in COMPAT_MODES:
-        raise ValueError(f"compat must be one of {COMPAT_MODES}, got {compat!r}.")
+        raise InputError(f"compat must be one of {COMPAT_MODES}, got {compat!r}.")
     unknown = set(classes) - set(MAP_CLASSES)
     if unknown:
-        raise ValueError(f"classes must be among {MAP_CLASSES}, got {sorted(unknown)}.")
+        raise InputError(f"classes must be among {MAP_CLASSES}, got {sorted(unknown)}.")
 
 
 def find_map(log_dir: Path) -> Path:
@@ -45,7 +46,7 @@ def find_map(log_dir: Path) -> Path:
     if not found:
         raise FileNotFoundError(f"no map/log_map_archive_*.json in {log_dir}: download it again.")
     if len(found) > 1:
-        raise ValueError(f"{len(found)} maps in {log_dir / 'map'}, expected one: {found}.")
+        raise InputError(f"{len(found)} maps in {log_dir / 'map'}, expected one: {found}.")
     return found[0]
 
 

@@ -13,6 +13,7 @@ from av2.map.map_api import ArgoverseStaticMap
 from av2.map.pedestrian_crossing import PedestrianCrossing
 
 from gsmap.datasets.errors import naming
+from gsmap.utils.errors import InputError
 
 # by key of the file: how messages name an element, its class, and the least points of its lines
 _LAYERS: dict[str, tuple[str, Callable[[Any], Any], dict[str, int]]] = {
@@ -58,7 +59,7 @@ def read_map_file(path: Path) -> tuple[ArgoverseStaticMap, dict[str, list[str]]]
                     reason = str(error)
                     left_out[reason].append(str(number))
             if records and not layers[key]:
-                raise ValueError(f"none of its {len(records)} {key} can be used: {reason}")
+                raise InputError(f"none of its {len(records)} {key} can be used: {reason}")
     static_map = ArgoverseStaticMap(
         log_id=path.stem.split("log_map_archive_")[1],
         vector_drivable_areas=layers["drivable_areas"],
@@ -76,6 +77,6 @@ def _check_lines(record: Any, lines: dict[str, int]) -> None:
     for key, least in lines.items():
         points = record[key]
         if len(points) < least:
-            raise ValueError(f"its {key} has {len(points)} points, and needs {least}")
+            raise InputError(f"its {key} has {len(points)} points, and needs {least}")
         if not math.isfinite(sum([point[axis] for point in points for axis in "xyz"])):
-            raise ValueError(f"its {key} holds NaN or infinity")
+            raise InputError(f"its {key} holds NaN or infinity")

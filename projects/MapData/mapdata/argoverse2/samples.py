@@ -18,6 +18,7 @@ from gsmap.datasets.annotations.record import (
     SweepRecord,
 )
 from gsmap.datasets.errors import naming
+from gsmap.utils.errors import InputError
 from mapdata.argoverse2.log import (
     MAX_CAMERA_OFFSET_NS,
     MAX_LIDAR_OFFSET_NS,
@@ -56,20 +57,20 @@ class Argoverse2Options(FileOptions):
 
     def __post_init__(self) -> None:
         if self.at not in ("auto", "lidar", "cameras") and self.pose_stride is None:
-            raise ValueError(f"at must be auto, lidar, cameras or poses:N, got {self.at!r}.")
+            raise InputError(f"at must be auto, lidar, cameras or poses:N, got {self.at!r}.")
         if self.rate_hz == "published":  # type: ignore[comparison-overlap]
             object.__setattr__(self, "rate_hz", 10.0 if self.split == "train" else 2.5)
         if self.rate_hz is not None and not self.rate_hz > 0:
-            raise ValueError(f"rate_hz must be > 0, got {self.rate_hz}.")
+            raise InputError(f"rate_hz must be > 0, got {self.rate_hz}.")
         if self.thin_over not in THIN_OVER:
-            raise ValueError(f"thin_over must be one of {THIN_OVER}, got {self.thin_over!r}.")
+            raise InputError(f"thin_over must be one of {THIN_OVER}, got {self.thin_over!r}.")
         if self.thin_over == "split" and (self.rate_hz is None or self.pose_stride is not None):
-            raise ValueError(
+            raise InputError(
                 "thin_over='split' keeps every N-th sample of all logs: give a rate, and times of "
                 "sensors (--at)."
             )
         if self.dim not in (2, 3):
-            raise ValueError(f"dim must be 2 or 3, got {self.dim}.")
+            raise InputError(f"dim must be 2 or 3, got {self.dim}.")
         check_rules(self.classes, self.compat)
 
     @property
@@ -190,7 +191,7 @@ def read_logs(
         samples += result.samples
         left_out.update({f"{log_dir.name}: {why}": n for why, n in result.left_out.items()})
     if not samples:
-        raise ValueError(f"no sample can be read from {root}: {'; '.join(left_out) or 'no log'}.")
+        raise InputError(f"no sample can be read from {root}: {'; '.join(left_out) or 'no log'}.")
     return samples, left_out
 
 
@@ -201,12 +202,12 @@ def sample_times(log: Argoverse2Log, options: Argoverse2Options) -> np.ndarray:
     missing = [name for name in RING_CAMERAS if name not in log.calibration]
     if missing:
         which = ", ".join(missing) if log.calibration else "the ring cameras"
-        raise ValueError(f"no calibration of {which} ({_NEEDS_NONE})")
+        raise InputError(f"no calibration of {which} ({_NEEDS_NONE})")
     times, kind = log.lidar_timestamps_ns, "LiDAR sweeps"
     if options.at == "cameras" or (options.at == "auto" and len(times) == 0):
         times, kind = log.image_timestamps_ns[RING_CAMERAS[0]], f"images of {RING_CAMERAS[0]}"
     if len(times) == 0:
-        raise ValueError(f"no {kind} ({_NEEDS_NONE})")
+        raise InputError(f"no {kind} ({_NEEDS_NONE})")
     return times if options.thin_over == "split" else thin_out(times, options.rate_hz)
 
 

@@ -19,6 +19,7 @@ from gsmap.datasets.errors import BrokenSampleError, naming
 from gsmap.datasets.image_files import image_size, read_image
 from gsmap.datasets.source import Source
 from gsmap.structures.rigid import invert_rigid, is_rigid, rigid
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import file_name, is_hidden, read_text
 from gsmap.utils.words import counted
 from mapdata.folders.names import in_order, times_of_names
@@ -79,7 +80,7 @@ def read_image_folder(
         rate_hz = float(content["rate_hz"]) if "rate_hz" in content else None
         tolerance_ns = round(float(content.get("max_time_difference_ms", 50.0)) * 1e6)
         if not 0 < (_RATE_HZ if rate_hz is None else rate_hz) < np.inf or tolerance_ns < 0:
-            raise ValueError("rate_hz must be > 0, and max_time_difference_ms >= 0")
+            raise InputError("rate_hz must be > 0, and max_time_difference_ms >= 0")
         frames, time_of, assumed = _frames(images, rate_hz, tolerance_ns, file)
         notes += [note for note in (assumed, *_notes_on(frames, images, tolerance_ns)) if note]
         poses = None
@@ -119,7 +120,7 @@ def read_rig(file: Path, ground: np.ndarray) -> tuple[list[tuple[RigCamera, str]
             with naming(f"{file}, camera {name!r}", "see docs/inference.md"):
                 _require_keys(camera, _CAMERA_KEYS, "a camera")
                 if "size_px" not in camera:
-                    raise ValueError("beside a bag it needs size_px: [width, height]")
+                    raise InputError("beside a bag it needs size_px: [width, height]")
                 rig.append((_camera(str(name), camera, ground, ()), str(camera.get("images", ""))))
         return rig, ground
 
@@ -141,7 +142,7 @@ def _require_once(names: Sequence[Any]) -> None:
     """Refuse names that come twice: the first one's values would be lost."""
     twice = sorted(str(name) for name, count in Counter(names).items() if count > 1)
     if twice:
-        raise ValueError(f"{', '.join(twice)} is there twice: remove or rename one")
+        raise InputError(f"{', '.join(twice)} is there twice: remove or rename one")
 
 
 def _mapping_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -153,7 +154,7 @@ def _mapping_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def _content(file: Path) -> Any:
     """Read a calibration file's values."""
     if file.stat().st_size > _MOST_BYTES:
-        raise ValueError(f"it has more than {_MOST_BYTES} bytes, which no calibration takes")
+        raise InputError(f"it has more than {_MOST_BYTES} bytes, which no calibration takes")
     text = read_text(file)
     try:
         if file.suffix == ".json":
@@ -161,13 +162,13 @@ def _content(file: Path) -> Any:
         else:
             content = yaml.load(text, _Loader)
     except yaml.YAMLError as error:
-        raise ValueError(f"it is no YAML: {error}") from error
+        raise InputError(f"it is no YAML: {error}") from error
     values = [content]
     for value in values:  # aliases of YAML stand for any number of them
         values += value.values() if isinstance(value, dict) else ()
         values += value if isinstance(value, list) else ()
         if len(values) > _MOST_VALUES:
-            raise ValueError(f"it holds more than {_MOST_VALUES} values")
+            raise InputError(f"it holds more than {_MOST_VALUES} values")
     return content
 
 
@@ -176,7 +177,7 @@ def _calibration(file: Path) -> dict[str, Any]:
     content = _content(file)
     _require_keys(content, _KEYS, "a calibration file")
     if not isinstance(content.get("cameras"), dict) or not content["cameras"]:
-        raise ValueError("`cameras` must map names to cameras, at least one")
+        raise InputError("`cameras` must map names to cameras, at least one")
     return dict(content)
 
 
@@ -191,10 +192,10 @@ def _digest(file: Path, frames: Sequence[RigFrame], target: bytes) -> str:
 
 def _require_keys(value: Any, known: set[str], what: str) -> None:
     if not isinstance(value, Mapping):
-        raise ValueError(f"{what} must be a mapping, got {value!r:.60}")
+        raise InputError(f"{what} must be a mapping, got {value!r:.60}")
     if set(value) - known:
         unknown = sorted(map(str, set(value) - known))
-        raise ValueError(f"unknown keys {unknown}; {what} may have {sorted(known)}")
+        raise InputError(f"unknown keys {unknown}; {what} may have {sorted(known)}")
 
 
 def _images_of(folder: Path, name: str, camera: Mapping[str, Any]) -> tuple[list[Path], list[str]]:
@@ -215,7 +216,7 @@ def _images_of(folder: Path, name: str, camera: Mapping[str, Any]) -> tuple[list
             f"pattern, from the calibration file's folder (by default the camera's name).{holds}"
         )
     if len({path.stem for path in paths}) < len(paths):
-        raise ValueError(f"two of its images at {place} have one name: rename one")
+        raise InputError(f"two of its images at {place} have one name: rename one")
     unread = counted(len(files) - len(paths), "file")
     return paths, [f"camera {name!r}: {unread} with {others} not read"] if others else []
 
@@ -225,14 +226,14 @@ def _moderate(pattern: str) -> str:
     parts = Path(pattern).parts
     kept = [p for p, after in zip(parts, (*parts[1:], ""), strict=True) if (p, after) != _ANY_TWICE]
     if kept.count("**") > _MOST_ANY:
-        raise ValueError(f"`images` has more than {_MOST_ANY} `**`: name the folders")
+        raise InputError(f"`images` has more than {_MOST_ANY} `**`: name the folders")
     return str(Path(*kept))
 
 
 def _below(folder: Path, name: str, what: str) -> Path:
     """Return a file or folder that a calibration file names."""
     if Path(name).is_absolute() or ".." in Path(name).parts:
-        raise ValueError(f"{what} must lie below the calibration file's folder, got {name!r}")
+        raise InputError(f"{what} must lie below the calibration file's folder, got {name!r}")
     return folder / name
 
 
@@ -245,7 +246,7 @@ def _camera(
         fx, fy, cx, cy = given
         given = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     if given.shape != (3, 3):
-        raise ValueError(f"intrinsics must be [fx, fy, cx, cy] or 3 x 3, got {given.shape}")
+        raise InputError(f"intrinsics must be [fx, fy, cx, cy] or 3 x 3, got {given.shape}")
     width, height = camera.get("size_px") or _size_of(images, f"camera {name!r}")
     return RigCamera(
         name,
@@ -269,19 +270,19 @@ def _mounting(camera: Mapping[str, Any]) -> np.ndarray:
     """Return where a camera stands and looks in the vehicle. (4, 4)"""
     ways = {"vehicle_from_camera", "quaternion_wxyz", "yaw_pitch_roll_deg"} & set(camera)
     if len(ways) != 1:
-        raise ValueError(
+        raise InputError(
             "say its place by vehicle_from_camera (4 x 4), or by position_m with either "
             f"quaternion_wxyz or yaw_pitch_roll_deg; got {sorted(ways) or 'none of them'}"
         )
     if "vehicle_from_camera" in camera:
         pose = np.array(camera["vehicle_from_camera"], np.float64)
         if pose.shape == (4, 4) and np.linalg.det(pose[:3, :3]) < 0:
-            raise ValueError(
+            raise InputError(
                 "vehicle_from_camera mirrors (its rotation's determinant is below 0): two axes are "
                 "swapped, or one has the wrong sign"
             )
         if pose.shape != (4, 4) or not is_rigid(pose):
-            raise ValueError("vehicle_from_camera must be a rotation with a translation, 4 x 4")
+            raise InputError("vehicle_from_camera must be a rotation with a translation, 4 x 4")
         return pose
     if "quaternion_wxyz" in camera:
         rotation = rotation_of(camera["quaternion_wxyz"])
@@ -344,7 +345,7 @@ def _require_rate(times_ns: Sequence[int], rate_hz: float | None) -> None:
         return
     step_s = float(np.median(np.diff(times_ns))) / 1e9
     if not 0.5 < step_s * rate_hz < 2:
-        raise ValueError(
+        raise InputError(
             f"the names of the images read as Unix times ({span_of(times_ns)}), one every "
             f"{step_s:g} s, and rate_hz says {rate_hz:g} a second: leave rate_hz out if they are "
             "times, else rename the images (0001.jpg, 0002.jpg, ...)"
@@ -383,7 +384,7 @@ def _with_poses(
         f"{span_of(poses.times_ns.tolist())}"
     )
     if not used:
-        raise ValueError(f"no image has a pose near its time: {spans}")
+        raise InputError(f"no image has a pose near its time: {spans}")
     note = (
         f"{len(used)} of {counted(len(frames), 'sample')} used: {missing} have no pose within "
         f"0.1 s, nor poses around them less than 1 s apart ({spans})"

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from gsmap.datasets.errors import naming
 from gsmap.structures.rigid import rigid
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import read_text
 from mapdata.folders.rig import PoseTrack
 
@@ -49,15 +50,15 @@ def read_poses(path: Path, time_of: Mapping[str, int], ground: np.ndarray) -> Po
                     continue
                 values.append(_pose_of(row))
             except ValueError as error:
-                raise ValueError(f"line {number}: {error}") from error
+                raise InputError(f"line {number}: {error}") from error
             times.append(time_ns)
         if not times and foreign:
-            raise ValueError(
+            raise InputError(
                 f"none of its {len(foreign)} frames is the name of an image: it has "
                 f"{foreign[0]!r:.60}, images are {next(iter(time_of), '')!r:.60}"
             )
         if not times:
-            raise ValueError("it holds no pose")
+            raise InputError("it holds no pose")
         rows = np.array(values, np.float64)
         turns = Rotation.from_quat(rows[:, [4, 5, 6, 3]]).as_matrix()
         poses = [rigid(turn, row[:3]) @ ground for turn, row in zip(turns, rows, strict=True)]
@@ -69,7 +70,7 @@ def _rows(text: str) -> Iterator[tuple[int, dict[str, str]]]:
     lines = text.splitlines()
     start = next((n for n, line in enumerate(lines) if line.strip()), None)
     if start is None:
-        raise ValueError("it is empty")
+        raise InputError("it is empty")
     separator = max(_SEPARATORS, key=lines[start].count)
     table = csv.reader(lines[start:], delimiter=separator, skipinitialspace=True)
     try:
@@ -80,13 +81,13 @@ def _rows(text: str) -> Iterator[tuple[int, dict[str, str]]]:
                 continue
             number = start + table.line_num
             if len(row) < len(names):
-                raise ValueError(f"line {number}: it has {len(row)} of {len(names)} columns")
+                raise InputError(f"line {number}: it has {len(row)} of {len(names)} columns")
             cells = [value.strip() for value in row]
             if separator != ",":
                 cells = [value.replace(",", ".") for value in cells]
             yield number, dict(zip(names, cells, strict=False))
     except csv.Error as error:
-        raise ValueError(f"it is no CSV: {error}") from error
+        raise InputError(f"it is no CSV: {error}") from error
 
 
 def _require_columns(names: Collection[str]) -> None:
@@ -95,7 +96,7 @@ def _require_columns(names: Collection[str]) -> None:
     if _TIME not in names and _FRAME not in names:
         missing.insert(0, f"{_TIME} or {_FRAME}")
     if missing:
-        raise ValueError(
+        raise InputError(
             f"its first line must name the columns {_TIME} or {_FRAME}, {', '.join(_VALUES)}; it "
             f"lacks {', '.join(missing)} and has {list(names)[:_SHOWN]!r:.200}"
         )
@@ -110,10 +111,10 @@ def _time_of(row: Mapping[str, str], time_of: Mapping[str, int]) -> int | None:
     if match := _NUMBER.fullmatch(text):
         return int(match[1])
     if re.fullmatch(r"\d([.,]\d+)?[eE]\+?\d+", text):
-        raise ValueError(
+        raise InputError(
             f"{_TIME} is {text!r:.40}, rounded as spreadsheets write long numbers: keep its digits"
         )
-    raise ValueError(f"{_TIME} is {text!r:.40}, no whole number of nanoseconds")
+    raise InputError(f"{_TIME} is {text!r:.40}, no whole number of nanoseconds")
 
 
 def _pose_of(row: Mapping[str, str]) -> list[float]:
@@ -125,7 +126,7 @@ def _pose_of(row: Mapping[str, str]) -> list[float]:
         except ValueError:
             values.append(math.nan)
         if not math.isfinite(values[-1]):
-            raise ValueError(f"{name} is {row[name]!r:.40}, no finite number")
+            raise InputError(f"{name} is {row[name]!r:.40}, no finite number")
     if not abs(math.hypot(*values[3:]) - 1) < _LENGTH_TOLERANCE:
-        raise ValueError(f"a quaternion must have length 1, got {values[3:]}")
+        raise InputError(f"a quaternion must have length 1, got {values[3:]}")
     return values

@@ -14,6 +14,7 @@ from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord, MapS
 from gsmap.datasets.image_files import encode_jpeg
 from gsmap.datasets.source import sample_in_vehicle
 from gsmap.structures.rigid import invert_rigid
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import write_bytes
 from mapdata.argoverse2.log import closest_ns
 
@@ -63,14 +64,14 @@ class RigCamera:
 
     def __post_init__(self) -> None:
         if min(self.size_px) < 1:
-            raise ValueError(f"camera {self.name!r} has images of {self.size_px} pixels, not > 0.")
+            raise InputError(f"camera {self.name!r} has images of {self.size_px} pixels, not > 0.")
         if self.is_distorted:
             self._check_distortion()
 
     def _check_distortion(self) -> None:
         where = f"camera {self.name!r}"
         if self.model not in _COUNTS:
-            raise ValueError(
+            raise InputError(
                 f"{where} has the distortion model {self.model!r}; known are "
                 f"{list(filter(None, _COUNTS))}: rectify its images first."
             )
@@ -78,13 +79,13 @@ class RigCamera:
         if self.model in FISHEYE_MODELS and not np.any(numbers[4:]):
             self.distortion = numbers = numbers[:4]  # some drivers add zeros
         if numbers.shape not in [(count,) for count in counts] or not np.isfinite(numbers).all():
-            raise ValueError(
+            raise InputError(
                 f"{where} has the distortion {numbers.tolist()!r:.80}; the model "
                 f"{self.model or 'plumb_bob'} takes {' or '.join(map(str, counts))} numbers, all "
                 "finite."
             )
         if not self._share_seen() > _LEAST_SEEN:
-            raise ValueError(
+            raise InputError(
                 f"{where} sees next to nothing without its distortion {numbers.tolist()!r:.80}: "
                 "intrinsics must be in pixels of these images, and the distortion of the model "
                 f"{self.model or 'plumb_bob'}."
@@ -141,7 +142,7 @@ def rotation_of(wxyz: Iterable[Any]) -> np.ndarray:
     """Return the rotation of a quaternion, which must have length 1. (3, 3)"""
     w, x, y, z = (float(value) for value in wxyz)
     if not abs(np.linalg.norm([w, x, y, z]) - 1) < 1e-2:
-        raise ValueError(f"a quaternion must have length 1, got {[w, x, y, z]}")
+        raise InputError(f"a quaternion must have length 1, got {[w, x, y, z]}")
     return Rotation.from_quat([x, y, z, w]).as_matrix()
 
 
@@ -167,7 +168,7 @@ class PoseTrack:
     ) -> None:
         times, matrices = np.array(list(times_ns), np.int64), np.array(list(poses), np.float64)
         if not len(times) or not np.isfinite(matrices).all():
-            raise ValueError("poses must be finite, at least one.")
+            raise InputError("poses must be finite, at least one.")
         self.times_ns, first = np.unique(times, return_index=True)
         self.poses, self.gap_ns, self.holds = matrices[first], gap_ns, holds
 

@@ -28,6 +28,7 @@ from gsmap.datasets.errors import naming
 from gsmap.datasets.image_files import image_size
 from gsmap.structures.vehicle_signals import pose_signals
 from gsmap.utils.cli import output_file
+from gsmap.utils.errors import InputError
 from gsmap.utils.progress import Progress
 from gsmap.utils.shards import WHOLE, Shard, add_shard_options, digest
 from mapdata.command_line import add_range_options
@@ -60,7 +61,7 @@ def _relative(path: str, root: Path) -> str:
             return Path(*parts[first:]).as_posix()
     if not Path(path).is_absolute():
         return Path(*parts).as_posix()
-    raise ValueError(f"path {path!r} does not lie under {root}: give the right --data-root.")
+    raise InputError(f"path {path!r} does not lie under {root}: give the right --data-root.")
 
 
 def _instances(info: Mapping[str, Any], meta: AnnotationMeta) -> list[MapInstance] | None:
@@ -174,7 +175,7 @@ def _entries(content: Any, path: Path) -> tuple[list[Mapping[str, Any]], str]:
     first = entries[0] if isinstance(entries, list) and entries else None
     if isinstance(first, Mapping) and "e2g_translation" in first and not first.keys() >= _MAPTRV2:
         missing = ", ".join(sorted(_MAPTRV2 - first.keys()))
-        raise ValueError(
+        raise InputError(
             f"{path} is an info file of StreamMapNet or MapTracker, or of another form than "
             f"MapTRv2's: its samples lack {missing}. Convert the data set itself with "
             "tools/create_data.py nuscenes or av2."
@@ -183,9 +184,9 @@ def _entries(content: Any, path: Path) -> tuple[list[Mapping[str, Any]], str]:
         entries = content.get(key) if isinstance(content, Mapping) else None
         if isinstance(entries, list):
             if not entries:
-                raise ValueError(f"{path} holds no sample.")
+                raise InputError(f"{path} holds no sample.")
             return entries, frame
-    raise ValueError(
+    raise InputError(
         f"{path} is no info file of MapTR or MapTRv2: it holds neither a list `infos` (nuScenes) "
         "nor a list `samples` (Argoverse 2)."
     )
@@ -231,7 +232,7 @@ def _check_range(sample: MapSample, meta: AnnotationMeta) -> None:
     outside = ((points < low - _BEYOND_M) | (points > high + _BEYOND_M)).any(1)
     if outside.any():
         x, y = points[outside][0]
-        raise ValueError(
+        raise InputError(
             f"sample {sample.token!r} has a vertex at ({x:.1f}, {y:.1f}), outside x "
             f"{meta.x_range} and y {meta.y_range}: give the range that the info file was made "
             "for with --x-range and --y-range."

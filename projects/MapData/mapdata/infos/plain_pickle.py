@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from gsmap.utils.errors import InputError
 from gsmap.utils.numpy_pickle import CHECKED, CheckedArray, CheckedDtype
 
 _STAND_INS: dict[str, Callable[..., Any]] = {
@@ -146,7 +147,7 @@ def load_plain_pickle(path: str | Path) -> Any:
         if _count(value, {}) > _VALUES_PER_BYTE * file.tell():
             raise pickle.UnpicklingError("it repeats its own parts beyond any use")
     except _DAMAGE as error:
-        raise ValueError(
+        raise InputError(
             f"{path} cannot be read as a pickle of plain data: {error}. Nothing of it was run: "
             "fetch it again, or save it anew with lists, dicts and numpy arrays only."
         ) from error

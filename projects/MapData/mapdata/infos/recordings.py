@@ -10,6 +10,7 @@ from gsmap.datasets.annotations.file import check_samples
 from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord, LidarRecord, MapSample
 from gsmap.datasets.errors import naming
 from gsmap.datasets.image_files import image_size
+from gsmap.utils.errors import InputError
 from mapdata.infos.plain_pickle import load_plain_pickle
 from mapdata.unix_times import in_nanoseconds
 
@@ -40,7 +41,7 @@ def read_info_file(
     root = Path(path.parent if data_root is None else data_root)
     content = load_plain_pickle(path)
     if not isinstance(content, Mapping) or not isinstance(content.get("data_list"), list):
-        raise ValueError(
+        raise InputError(
             f"{path} is not an info file of mmdet3d's format v2 (no data_list); those of MapTR and "
             "MapTRv2 convert with tools/create_data.py infos, older ones of mmdet3d with its "
             "tools/dataset_converters/update_infos_to_v2.py."
@@ -62,7 +63,7 @@ def _matrix(values: Any, size: int, what: str) -> np.ndarray:
     if size == 3 and matrix.shape in ((3, 4), (4, 4)):
         matrix = matrix[:3, :3]
     if matrix.shape != (size, size):
-        raise ValueError(f"{what} must be {size} x {size}, got {matrix.shape}.")
+        raise InputError(f"{what} must be {size} x {size}, got {matrix.shape}.")
     return matrix
 
 
@@ -114,7 +115,7 @@ def _cameras(
             if not allow_missing:
                 raise
     if not cameras:
-        raise ValueError(f"{where} has no camera with an image and a calibration.")
+        raise InputError(f"{where} has no camera with an image and a calibration.")
     return cameras
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from gsmap.datasets.errors import naming
 from gsmap.structures.vehicle_signals import pose_signals
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import read_json
 
 _NUSCENES_SCENE = re.compile(r"scene-(\d{4})")
@@ -49,7 +50,7 @@ def read_messages(dataroot: Path, scene: str) -> Messages:
         rows = [[*m["accel"], *m["rotation_rate"], *m["vel"]] for m in messages]
         measured = np.array(rows, np.float64).reshape(-1, 9)
         if not np.isfinite(measured).all():
-            raise ValueError("a number is not finite")
+            raise InputError("a number is not finite")
     order = np.argsort(times_us, kind="stable")
     return times_us[order], measured[order]
 

@@ -17,6 +17,7 @@ import shapely
 from gsmap.datasets.annotations.file import AnnotationWriter
 from gsmap.datasets.annotations.record import CLASSES, UNITED, MapInstance, MapSample
 from gsmap.datasets.errors import naming
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import is_hidden
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
@@ -111,7 +112,7 @@ def _wanted(options: NuScenesOptions) -> tuple[SplitList, str]:
     official = create_splits_scenes()
     for each in options.versions:
         if each not in _OFFICIAL_SPLITS:
-            raise ValueError(
+            raise InputError(
                 f"version {each!r} has no official splits: give --split-file, or write {own} "
                 "(docs/data.md says how)."
             )
@@ -132,7 +133,7 @@ def _resolved(
     ):
         split_of, missing = resolve_scenes(wanted.scenes, names)
     if not split_of:
-        raise ValueError(
+        raise InputError(
             f"none of the split's scenes is in {where}: it has {sorted(names.values())[:5]}; give "
             "--split-file."
         )

@@ -17,6 +17,7 @@ from gsmap.datasets.annotations.record import RANGES, MapInstance
 from gsmap.datasets.errors import naming
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.polylines import Points
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import is_hidden
 from mapdata.crossings import (
     CROSSINGS,
@@ -85,7 +86,7 @@ def check_classes(classes: Collection[str]) -> None:
     """Raise a ``ValueError`` unless the classes are known."""
     unknown = [name for name in classes if name not in MAP_CLASSES]
     if unknown:
-        raise ValueError(f"classes must be among {MAP_CLASSES}, got {unknown}.")
+        raise InputError(f"classes must be among {MAP_CLASSES}, got {unknown}.")
 
 
 def expansion(root: Path, name: str) -> Path:
@@ -109,7 +110,7 @@ def open_layers(root: Path, name: str, classes: Collection[str]) -> MapLayers:
     """
     path = expansion(root, name)
     if Path(name).name != name:
-        raise ValueError(f"the location {name!r:.80} cannot be the name of a map: rename it.")
+        raise InputError(f"the location {name!r:.80} cannot be the name of a map: rename it.")
     if not path.is_file():
         raise FileNotFoundError(
             f"no map expansion for {name!r} in {path.parent}, which has "
@@ -131,7 +132,7 @@ def open_layers(root: Path, name: str, classes: Collection[str]) -> MapLayers:
             _read_centerlines(nusc_map, layers)
         for geometries in (layers.lines, *layers.polygons.values()):
             if not np.isfinite(shapely.get_coordinates(geometries)).all():
-                raise ValueError("a point is not finite")
+                raise InputError("a point is not finite")
     return layers
 
 
@@ -200,7 +201,7 @@ class NuScenesLocalMap:
     ) -> None:
         check_classes(classes)
         if crossings not in CROSSINGS:
-            raise ValueError(f"crossings must be one of {CROSSINGS}, got {crossings!r}.")
+            raise InputError(f"crossings must be one of {CROSSINGS}, got {crossings!r}.")
         self.classes = tuple(classes)
         self._crossings = crossings
         self.x_range, self.y_range = x_range, y_range

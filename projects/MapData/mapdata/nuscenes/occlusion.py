@@ -16,6 +16,7 @@ from gsmap.datasets.annotations.record import CameraRecord, MapSample
 from gsmap.structures.polylines import arc_lengths, resample
 from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.cli import output_file
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import write_text
 from gsmap.utils.words import counted
 from mapdata.nuscenes.tables import pose_of, read_table
@@ -51,7 +52,7 @@ def read_boxes(folder: Path, tokens: Collection[str]) -> dict[str, Boxes]:
             width, length, height = record["size"]
             boxes.append((pose_of(record), np.array([length, width, height]) / 2))
     if not any(found.values()):
-        raise ValueError(f"{folder} has no box of these samples: give the tables of their data.")
+        raise InputError(f"{folder} has no box of these samples: give the tables of their data.")
     return {
         token: Boxes(
             invert_rigid(np.array([pose for pose, _ in boxes]).reshape(-1, 4, 4)),
@@ -87,7 +88,7 @@ def _map_points(sample: MapSample) -> Array:
     ValueError if it has no ground truth.
     """
     if sample.instances is None:
-        raise ValueError(f"sample {sample.token!r} has no ground truth, of which parts could hide.")
+        raise InputError(f"sample {sample.token!r} has no ground truth, of which parts could hide.")
     height_m = 0.0 if sample.ego_from_frame is None else sample.ego_from_frame[2, 3]
     lines = [
         resample(i.points, max(math.ceil(arc_lengths(i.points)[-1] / _STEP_M), 1) + 1)
@@ -154,7 +155,7 @@ def run(arguments: argparse.Namespace) -> str:
     """
     limits = arguments.limits
     if any(low >= high for low, high in pairwise((0, *limits, 100))):
-        raise ValueError(f"--limits must rise between 0 and 100, got {limits}.")
+        raise InputError(f"--limits must rise between 0 and 100, got {limits}.")
     file = AnnotationFile(arguments.annotations)
     boxes = read_boxes(arguments.tables, file.column("token"))
     groups = {s.token: word_for(hidden_share(s, boxes[s.token]), limits) for s in file}

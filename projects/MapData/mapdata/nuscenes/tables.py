@@ -12,6 +12,7 @@ from pyquaternion import Quaternion
 
 from gsmap.datasets.annotations.record import CameraRecord, LidarRecord, MapSample, SweepRecord
 from gsmap.structures.rigid import invert_rigid, rigid
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import is_hidden
 from gsmap.utils.json_items import items_of
 from gsmap.utils.words import counted
@@ -73,12 +74,12 @@ def pose_of(record: Mapping[str, Any], prefix: str = "") -> np.ndarray:
     rotation = turned if turned.shape == (3, 3) else Quaternion(turned).rotation_matrix
     shift = np.asarray(record[f"{prefix}translation"], np.float64)
     if shift.size != 3:
-        raise ValueError(f"{prefix}translation must be 3 numbers, got {shift.tolist()!r:.60}")
+        raise InputError(f"{prefix}translation must be 3 numbers, got {shift.tolist()!r:.60}")
     return rigid(rotation, shift.reshape(3))
 
 
 def _damaged(folder: Path, table: str, wrong: str) -> ValueError:
-    return ValueError(f"{folder}/{table}.json{wrong}; download the tables again.")
+    return InputError(f"{folder}/{table}.json{wrong}; download the tables again.")
 
 
 def read_table(folder: Path, table: str) -> Iterator[dict[str, Any]]:
@@ -178,7 +179,7 @@ class NuScenesTables:
             return cameras, LIDAR
         if len(lidars) == 1 and self.frame == "ego":
             return cameras, lidars[0]
-        raise ValueError(
+        raise InputError(
             f"{self._folder} has no {LIDAR}, whose axes are those of the frame `lidar`; its "
             f"channels are {sorted(channels)!r:.300}. Name the LiDAR so if its axes are (x right, "
             "y ahead); else convert with --frame ego, which takes one LiDAR of any name."
@@ -304,14 +305,14 @@ def read_nuscenes(
     """
     found = versions_in(root)
     if version is None and len(found) > 1:
-        raise ValueError(f"{root} holds several versions, {found}: name one with --version.")
+        raise InputError(f"{root} holds several versions, {found}: name one with --version.")
     if version is not None and version not in found:
-        raise ValueError(f"{root} holds no version {version!r}, but {found}.")
+        raise InputError(f"{root} holds no version {version!r}, but {found}.")
     tables = NuScenesTables(version or found[0], root, max_sweeps=10)
     pairs = [(record, scene) for scene in tables.scene for record in tables.samples_of(scene)]
     used = [(record, scene) for record, scene in pairs if tables.lidar in record["data"]]
     note = f"{len(used)} of {counted(len(pairs), 'sample')} used: the others have no key frame of "
     if not used:
-        raise ValueError(f"{root}: {note}{tables.lidar}; download the tables again.")
+        raise InputError(f"{root}: {note}{tables.lidar}; download the tables again.")
     samples = [tables.read(record, scene) for record, scene in used]
     return samples, (note + tables.lidar,) if len(used) < len(pairs) else ()

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from gsmap.utils.errors import InputError
 from mapdata.upstream_configs.fields import Fields
 
 DATASETS = (
@@ -41,7 +42,7 @@ def data_settings(fields: Fields) -> dict[str, Any]:
     """
     train = dict(fields.section("data.train"))
     if train.get("type") not in DATASETS:
-        raise ValueError(
+        raise InputError(
             f"data.train.type must be one of {sorted(DATASETS)}, got {train.get('type')!r}."
         )
     classes, root = list(train["map_classes"]), train.get("data_root")

@@ -3,6 +3,8 @@
 from collections.abc import Iterator
 from typing import Any
 
+from gsmap.utils.errors import InputError
+
 _REQUIRED = object()
 
 
@@ -30,7 +32,7 @@ class Fields:
         section, _, key = name.rpartition(".")
         values = self.section(section) if section else self._values
         if key not in values and default is _REQUIRED:
-            raise ValueError(f"{name} is missing.")
+            raise InputError(f"{name} is missing.")
         return values.pop(key, default)
 
     def items(self, name: str) -> list[str]:
@@ -38,7 +40,7 @@ class Fields:
         section, _, key = name.rpartition(".")
         values = self.section(section).get(key)
         if not isinstance(values, (list, tuple)):
-            raise ValueError(f"{name} must be a list, got {values!r}.")
+            raise InputError(f"{name} must be a list, got {values!r}.")
         return [f"{name}.{i}" for i in range(len(values))]
 
     def move(self, places: dict[str, str], required: bool = True) -> dict[str, Any]:

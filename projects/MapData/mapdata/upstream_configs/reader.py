@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import read_text
 
 ARITHMETIC: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
@@ -34,24 +35,24 @@ def read_assignments(path: str | Path) -> dict[str, Any]:
     try:
         tree = ast.parse(source)
     except SyntaxError as error:
-        raise ValueError(f"{path}, line {error.lineno}: {error.msg}.") from None
+        raise InputError(f"{path}, line {error.lineno}: {error.msg}.") from None
     except ValueError as error:  # a zero byte, before Python 3.12
-        raise ValueError(f"{path}: {error}.") from None
+        raise InputError(f"{path}: {error}.") from None
     except (RecursionError, MemoryError):
-        raise ValueError(f"{path} cannot be read: it is nested too deep.") from None
+        raise InputError(f"{path} cannot be read: it is nested too deep.") from None
     for node in tree.body:
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
             continue  # a docstring
         try:
             if not isinstance(node, ast.Assign):
-                raise ValueError("only assignments of names are read")
+                raise InputError("only assignments of names are read")
             for target in node.targets:
                 if not isinstance(target, ast.Name):
-                    raise ValueError("only assignments of names are read")
+                    raise InputError("only assignments of names are read")
                 names[target.id] = _value(node.value, names)
         except (ValueError, TypeError, LookupError, ArithmeticError, RecursionError) as error:
             line = source.split("\n")[node.lineno - 1].strip()
-            raise ValueError(f"{path}, line {node.lineno}, {line[:80]!r}: {error}.") from None
+            raise InputError(f"{path}, line {node.lineno}, {line[:80]!r}: {error}.") from None
     return dict(names)
 
 
@@ -63,14 +64,14 @@ class _Names(dict[str, Any]):
     def take(self, name: str) -> Any:
         """Return a copy of a value; ValueError if there is none, or all copies are too much."""
         if name not in self:
-            raise ValueError(f"{name} is not assigned before")
+            raise InputError(f"{name} is not assigned before")
         self._count(self[name], 0)
         return copy.deepcopy(self[name])
 
     def _count(self, value: Any, depth: int) -> None:
         self._left -= len(value) if isinstance(value, str) else 1
         if self._left < 0 or depth > _DEEPEST:
-            raise ValueError("earlier names stand for too much, or for lists nested too deep")
+            raise InputError("earlier names stand for too much, or for lists nested too deep")
         if isinstance(value, (list, tuple, dict)):
             for inner in (*value, *value.values()) if isinstance(value, dict) else value:
                 self._count(inner, depth + 1)
@@ -103,19 +104,19 @@ def _computed(node: ast.expr, names: _Names) -> Any:
         case ast.Call(ast.Name(name), [argument], []) if name in CALLS:
             return CALLS[name](_value(argument, names))
         case ast.Call(function):
-            raise ValueError(f"{ast.unparse(function)}() is not called")
+            raise InputError(f"{ast.unparse(function)}() is not called")
         case ast.UnaryOp(ast.USub(), operand):
             return -_value(operand, names)
         case ast.BinOp(left, sign, right) if type(sign) in ARITHMETIC:
             sides = _value(left, names), _value(right, names)
             # a text or list multiplied may fill the memory
             if isinstance(sign, ast.Mult) and not all(isinstance(v, (int, float)) for v in sides):
-                raise ValueError("only numbers are multiplied")
+                raise InputError("only numbers are multiplied")
             result = ARITHMETIC[type(sign)](*sides)
             if isinstance(result, (int, float)) and not abs(result) <= _LARGEST:
-                raise ValueError(f"no setting is beyond {_LARGEST:g}")
+                raise InputError(f"no setting is beyond {_LARGEST:g}")
             return result
-    raise ValueError(f"{ast.unparse(node)!r} is more than a value")
+    raise InputError(f"{ast.unparse(node)!r} is more than a value")
 
 
 def _mapping(pairs: Iterable[Any], names: _Names) -> dict[Any, Any]:

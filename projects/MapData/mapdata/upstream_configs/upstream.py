@@ -9,6 +9,7 @@ from typing import Any
 
 from mmengine.config import Config
 
+from gsmap.utils.errors import InputError
 from mapdata.upstream_configs.data import FLAT, data_settings, schedule_settings
 from mapdata.upstream_configs.fields import Fields
 
@@ -139,7 +140,7 @@ def _check_kind(fields: Fields, section: str, kinds: tuple[str, ...]) -> None:
     kind = fields.section(section).get("type")
     if kind not in kinds:
         known = ", ".join(kinds)
-        raise ValueError(f"{kind!s:.60} is not supported: {section}.type must be one of {known}.")
+        raise InputError(f"{kind!s:.60} is not supported: {section}.type must be one of {known}.")
 
 
 def merge(conversion: Conversion, configs: Path) -> Config:
@@ -179,22 +180,22 @@ def _check_plain(value: Any, name: str) -> None:
         for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
             own = f"{name}.{key}".lstrip(".")
             if isinstance(value, dict) and not (isinstance(key, str) and _KEY.fullmatch(key)):
-                raise ValueError(f"{own[:60]!r} is no name of a setting")
+                raise InputError(f"{own[:60]!r} is no name of a setting")
             if key == "type" and not (isinstance(inner, str) and _TYPE.fullmatch(inner)):
-                raise ValueError(f"{own} must be the name of a registered class, got {inner!r:.60}")
+                raise InputError(f"{own} must be the name of a registered class, got {inner!r:.60}")
             _check_plain(inner, own)
     elif isinstance(value, str):
         if "{{" in value:
-            raise ValueError(f"{name} is {value!r:.60}, which mmengine would replace")
+            raise InputError(f"{name} is {value!r:.60}, which mmengine would replace")
     elif not (value is None or (isinstance(value, (int, float)) and math.isfinite(value))):
-        raise ValueError(f"{name} is {value!r:.60}, neither a finite number nor a text")
+        raise InputError(f"{name} is {value!r:.60}, neither a finite number nor a text")
 
 
 def _base(encoder: str, av2: bool, with_depth: bool) -> str:
     """Return our config that has the same encoder and data set."""
     of_nuscenes = {"SpatialCrossAttention": "bevformer", "PlainLSSTransform": "bevpool"}
     if encoder in of_nuscenes and av2:
-        raise ValueError(
+        raise InputError(
             f"{encoder.removeprefix('Plain')} of MapTR is not supported on Argoverse 2."
         )
     if encoder in of_nuscenes:

@@ -10,6 +10,7 @@ from gsmap.datasets.annotations.record import AnnotationMeta
 from gsmap.datasets.annotations.schema import matrices_of
 from gsmap.structures.elements import FARTHEST_M
 from gsmap.structures.rigid import is_rigid
+from gsmap.utils.errors import InputError
 
 _OPTIONAL = {"lidar", "can_bus", "instances", "ego_from_frame"}
 _PLACES = {"cameras[]": "camera's ", "lidar": "LiDAR ", "sweeps[]": "sweep's "}
@@ -50,7 +51,7 @@ class _Walk:
         elif pa.types.is_list(array.type):
             lengths = np.diff(array.offsets.to_numpy())
             if lengths.sum() != len(array.values):
-                raise ValueError(f"{where}{name} has items that belong to no sample.")
+                raise InputError(f"{where}{name} has items that belong to no sample.")
             if pa.types.is_struct(array.type.value_type):
                 self.check(array.values, f"{name}[]", np.repeat(rows, lengths), where)
         if name in _RULES:
@@ -63,7 +64,7 @@ class _Walk:
         """Raise an error that names the sample of the first item that is not good."""
         if not good.all():
             token = self.tokens[int(rows[np.argmin(good)])].as_py()
-            raise ValueError(f"sample {token!r}: {wrong}.")
+            raise InputError(f"sample {token!r}: {wrong}.")
 
 
 @np.errstate(invalid="ignore", over="ignore")

@@ -30,6 +30,7 @@ from gsmap.datasets.annotations.schema import (
     row_of,
     schema_of,
 )
+from gsmap.utils.errors import InputError
 from gsmap.utils.faults import is_of_the_machine
 from gsmap.utils.files import atomic_write
 from gsmap.utils.inputs import heed_input
@@ -84,7 +85,7 @@ class AnnotationWriter:
                 (``check_batch``) may be noticed some samples later, or when the file is finished.
         """
         if sample.token in self._tokens:
-            raise ValueError(f"sample {sample.token!r} was already written to {self.path}.")
+            raise InputError(f"sample {sample.token!r} was already written to {self.path}.")
         self._tokens.add(sample.token)
         self._rows.append(row_of(sample, self.meta))
         if len(self._rows) == _ROWS_PER_BATCH:
@@ -159,7 +160,7 @@ def merge_annotations(path: Path, shards: Sequence[ShardFile]) -> int:
     """
     files = [AnnotationFile(shard.path) for shard in shards]
     if not any(map(len, files)):
-        raise ValueError(f"no shard of {path} has a sample: give the command other data.")
+        raise InputError(f"no shard of {path} has a sample: give the command other data.")
     return write_annotations(path, files[0].meta, chain.from_iterable(files))
 
 
@@ -211,7 +212,7 @@ class AnnotationFile(Sequence[MapSample]):
         except (pa.ArrowException, OSError, ValueError, TypeError) as error:
             if is_of_the_machine(error):
                 raise
-            raise ValueError(
+            raise InputError(
                 f"{self.path} is not a whole annotation file ({error}): delete it and run "
                 "tools/create_data.py again."
             ) from error
@@ -223,12 +224,12 @@ class AnnotationFile(Sequence[MapSample]):
             if sums is None:
                 self._check(seal)
             elif [end for end, _ in sums] != ends:
-                raise ValueError("it was replaced after this run had opened it")
+                raise InputError("it was replaced after this run had opened it")
         except (pa.ArrowException, ValueError, TypeError, KeyError) as error:
             if is_of_the_machine(error):
                 raise
             text = str(error).rstrip(".")
-            raise ValueError(
+            raise InputError(
                 f"{self.path} is damaged: {text}. Copy it again, or {self.remedy}"
             ) from error
         self._decoders = [decoder_of(b.to_struct_array(), self.meta.dim) for b in self._batches]
@@ -240,13 +241,13 @@ class AnnotationFile(Sequence[MapSample]):
             stated = json.loads(seal)
             found = dict(self._sums).get(stated["bytes"])
             if found != stated["crc32"] or sum(map(len, self._batches)) != stated["rows"]:
-                raise ValueError("its checksum does not fit its content")
+                raise InputError("its checksum does not fit its content")
         for batch in self._batches:
             batch.validate(full=True)
             check_batch(batch, self.meta)
         tokens = pa.chunked_array([batch.column("token") for batch in self._batches], pa.string())
         if pc.count_distinct(tokens).as_py() < len(tokens):
-            raise ValueError("two samples have one token")
+            raise InputError("two samples have one token")
 
     def _current_state(self) -> tuple[int, int, int]:
         """Return what differs after a write to the file: its size and time; and the process."""
@@ -268,7 +269,7 @@ class AnnotationFile(Sequence[MapSample]):
             if zlib.crc32(memoryview(self._content)[start:end], before) == after:
                 self._intact.add(number)
                 return
-        raise ValueError(
+        raise InputError(
             f"{self.path} was changed while it was in use: end what writes there, {self.remedy} "
             "Then go on from the last checkpoint."
         )
@@ -302,7 +303,7 @@ class AnnotationFile(Sequence[MapSample]):
             found = getattr(self.meta, name)
             wanted = tuple(wanted) if isinstance(wanted, list) else wanted
             if wanted is not None and wanted != found:
-                raise ValueError(
+                raise InputError(
                     f"{self.path} was made with {name} {found}, the config asks for {wanted}: "
                     "change the config, or make the file for it. It was made with "
                     f"`{self.meta.command or 'an unknown command'}`; `python tools/create_data.py "
@@ -324,7 +325,7 @@ class AnnotationFile(Sequence[MapSample]):
         steps = steps[same == 0]
         if not len(steps) or 0.8 < (ratio := np.median(steps) * wanted_hz) < 1.25:
             return
-        raise ValueError(
+        raise InputError(
             f"{self.path} has {wanted_hz / ratio:.3g} samples per second of a drive, the config "
             f"asks for {wanted_hz:g}: make it again with `--rate {wanted_hz:g}hz`, or set "
             "train_dataloader.dataset.rate_hz=None if epochs may have another length. It was made "
@@ -366,10 +367,10 @@ def _meta_of(schema: pa.Schema) -> AnnotationMeta:
     """Read the metadata of a file, which tell whether it is an annotation file of this version."""
     values = json.loads((schema.metadata or {}).get(META_KEY, b"null"))
     if not isinstance(values, dict):
-        raise ValueError("it holds Arrow's data, but it is not an annotation file")
+        raise InputError("it holds Arrow's data, but it is not an annotation file")
     found, command = values.get("format_version"), values.get("command")
     if found != FORMAT_VERSION or not schema.equals(pa.schema(FIELDS)):
-        raise ValueError(
+        raise InputError(
             f"it has format version {found} or other columns than version {FORMAT_VERSION}, which "
             f"this program reads: make it again with `{command or 'tools/create_data.py'}`"
         )
@@ -385,4 +386,4 @@ def _require_plain(values: dict[str, Any]) -> None:
         words |= {f"class {number}": name for number, name in enumerate(classes)}
     for name, word in words.items():
         if word is not None and not (isinstance(word, str) and word.isprintable()):
-            raise ValueError(f"its {name} must be plain text, got {word!a:.80}")
+            raise InputError(f"its {name} must be plain text, got {word!a:.80}")

@@ -10,6 +10,8 @@ from itertools import pairwise
 
 import pyarrow as pa
 
+from gsmap.utils.errors import InputError
+
 _START, _END = b"ARROW1\0\0", b"ARROW1"
 # The seal has no rows; its metadata hold the checksum of all bytes before it.
 SEAL_KEY = b"gsmap_seal"
@@ -24,7 +26,7 @@ def read_messages(
     """
     size = content.size
     if size < len(_START) + 10 or content[: len(_START)].to_pybytes() != _START:
-        raise ValueError("it does not begin as an Arrow file")
+        raise InputError("it does not begin as an Arrow file")
     source = pa.BufferReader(content)
     source.seek(len(_START))
     reader = pa.ipc.open_stream(source)
@@ -34,11 +36,11 @@ def read_messages(
         found.append(message)
     tail = content[source.tell() :].to_pybytes()
     if tail[-6:] != _END or int.from_bytes(tail[-10:-6], "little") != len(tail) - 10:
-        raise ValueError("it ends too early")
+        raise InputError("it ends too early")
     seal = (found[-1].custom_metadata or {}).get(SEAL_KEY) if found else None
     batches = [batch for batch, _ in (found if seal is None else found[:-1])]
     if not all(map(len, batches)):
-        raise ValueError("it has an empty part")  # as a seal with a damaged name would be
+        raise InputError("it has an empty part")  # as a seal with a damaged name would be
     return reader.schema, batches, seal, ends[: len(batches) + 2]
 
 

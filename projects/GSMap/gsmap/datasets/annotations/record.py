@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from gsmap.utils.errors import InputError
 from gsmap.utils.split_lists import SPLIT_LIST, checked_identity
 
 FORMAT_VERSION = 1
@@ -126,9 +127,9 @@ def _names(classes: Any) -> tuple[str, ...]:
     names = classes if isinstance(classes, (list, tuple)) else ()
     named = all(isinstance(name, str) and name for name in names)
     if not (named and 0 < len(names) == len(set(names))):
-        raise ValueError(f"classes must be names, different ones, got {classes!r}.")
+        raise InputError(f"classes must be names, different ones, got {classes!r}.")
     if len(names) > _MOST_CLASSES:
-        raise ValueError(f"there are at most {_MOST_CLASSES} classes, not {len(names)}.")
+        raise InputError(f"there are at most {_MOST_CLASSES} classes, not {len(names)}.")
     return tuple(names)
 
 
@@ -175,25 +176,25 @@ class AnnotationMeta:
     def __post_init__(self) -> None:
         for name in ("dataset", "split", "source_fingerprint", "command"):
             if not isinstance(getattr(self, name), str):
-                raise ValueError(f"{name} must be a text, got {getattr(self, name)!r}.")
+                raise InputError(f"{name} must be a text, got {getattr(self, name)!r}.")
         if not isinstance(self.options, dict):
-            raise ValueError(f"options must be a dictionary, got {self.options!r:.60}.")
+            raise InputError(f"options must be a dictionary, got {self.options!r:.60}.")
         checked_identity(self.split_list)
         if self.ground_z_m is not None and not abs(float(self.ground_z_m)) < _HIGHEST_GROUND_M:
-            raise ValueError(
+            raise InputError(
                 f"ground_z_m must be metres, between -{_HIGHEST_GROUND_M:g} and "
                 f"{_HIGHEST_GROUND_M:g}, got {self.ground_z_m!r}."
             )
         if self.frame not in RANGES:
-            raise ValueError(f"frame must be one of {tuple(RANGES)}, got {self.frame!r}.")
+            raise InputError(f"frame must be one of {tuple(RANGES)}, got {self.frame!r}.")
         if self.dim not in (2, 3):
-            raise ValueError(f"dim must be 2 or 3, got {self.dim!r}.")
+            raise InputError(f"dim must be 2 or 3, got {self.dim!r}.")
         object.__setattr__(self, "classes", _names(self.classes))
         for name, usual in zip(("x_range", "y_range"), RANGES[self.frame], strict=True):
             given = getattr(self, name)
             low, high = (float(v) for v in (usual if given is None else given))
             if not -np.inf < low < high < np.inf:
-                raise ValueError(f"{name} must be (low, high) with low < high, got {(low, high)}.")
+                raise InputError(f"{name} must be (low, high) with low < high, got {(low, high)}.")
             object.__setattr__(self, name, (low, high))
 
     @property

@@ -20,6 +20,7 @@ from gsmap.datasets.annotations.record import (
     SweepRecord,
 )
 from gsmap.structures.calibration import NUM_CAN_BUS
+from gsmap.utils.errors import InputError
 
 META_KEY = b"gsmap"
 _POSE, _INTRINSICS = pa.list_(pa.float64(), 16), pa.list_(pa.float64(), 9)
@@ -107,7 +108,7 @@ def _flat(value: Any, name: str, dim: int, where: str) -> np.ndarray:
     shape = _SHAPES.get(name, (max(array.size // dim, 2), dim))
     if array.shape != shape or array.dtype.kind not in "iuf":
         wanted = f"of shape {shape}" if name in _SHAPES else f"(n >= 2, {dim})"
-        raise ValueError(
+        raise InputError(
             f"{where}{name} must be numbers {wanted}, got {array.dtype} {array.shape}."
         )
     return array.astype(np.float64 if name in _SHAPES else np.float32).reshape(-1)
@@ -123,7 +124,7 @@ def batch_of(rows: Sequence[dict[str, Any]], schema: pa.Schema) -> pa.RecordBatc
         columns = [pa.array([row[name] for row in rows], kind) for name, kind in FIELDS.items()]
     except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError) as error:
         tokens = [row["token"] for row in rows]
-        raise ValueError(f"one of the samples {tokens[0]!r} to {tokens[-1]!r}: {error}.") from error
+        raise InputError(f"one of the samples {tokens[0]!r} to {tokens[-1]!r}: {error}.") from error
     return pa.record_batch(columns, schema=schema)
 
 

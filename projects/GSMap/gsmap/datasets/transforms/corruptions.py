@@ -23,6 +23,7 @@ from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.transforms.image_steps import finish_on_host
 from gsmap.structures.calibration import OUT_OF_SIGHT
 from gsmap.structures.rigid import invert_rigid, rigid
+from gsmap.utils.errors import InputError
 
 SEVERITIES = (1, 2, 3, 4, 5)
 Image = NDArray[np.uint8]
@@ -80,7 +81,7 @@ class CorruptImages(BaseTransform):
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS or self.severity not in SEVERITIES:
-            raise ValueError(
+            raise InputError(
                 f"kind must be one of {KINDS} and severity one of {SEVERITIES}, got "
                 f"{self.kind!r} and {self.severity!r}."
             )

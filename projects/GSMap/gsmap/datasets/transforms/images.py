@@ -20,6 +20,7 @@ from gsmap.datasets.transforms.image_steps import (
     shape_after_steps,
     take_step,
 )
+from gsmap.utils.errors import InputError
 
 _MOST_SHRUNK = 2.0  # by bilinear sampling, which reads four pixels
 
@@ -97,11 +98,11 @@ class ScaleImages(BaseTransform):
 
     def __post_init__(self) -> None:
         if self.kernel not in FILTERS:
-            raise ValueError(f"kernel must be one of {FILTERS}, got {self.kernel!r}.")
+            raise InputError(f"kernel must be one of {FILTERS}, got {self.kernel!r}.")
         if (self.scale is None) == (self.size is None):
-            raise ValueError(f"give scale or size, got {self.scale} and {self.size}.")
+            raise InputError(f"give scale or size, got {self.scale} and {self.size}.")
         if not min(self.size or (cast(float, self.scale),)) > 0:
-            raise ValueError(f"scale or size must be > 0, got {self.size or self.scale}.")
+            raise InputError(f"scale or size must be > 0, got {self.size or self.scale}.")
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Scale ``results['img']``."""
@@ -114,7 +115,7 @@ class ScaleImages(BaseTransform):
             by_area = min(size) > 0 and width / size[0] > _MOST_SHRUNK
             _say_scaled((width, height), size, tuple(self.trained_size), by_area)
         if min(size) < 1:
-            raise ValueError(f"scale {self.scale} leaves nothing of a {width} x {height} image.")
+            raise InputError(f"scale {self.scale} leaves nothing of a {width} x {height} image.")
         matrix = np.diag([size[0] / width, size[1] / height, 1.0, 1.0])
         if by_area:
             finish_on_host(results)
@@ -176,13 +177,13 @@ class CropImages(BaseTransform):
 
     def __post_init__(self) -> None:
         if self.top < 1:
-            raise ValueError(f"top must be >= 1 row, got {self.top}.")
+            raise InputError(f"top must be >= 1 row, got {self.top}.")
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Crop ``results['img']``."""
         height, width = shape_after_steps(results)
         if height <= self.top:
-            raise ValueError(f"top={self.top} leaves nothing of images of {height} rows.")
+            raise InputError(f"top={self.top} leaves nothing of images of {height} rows.")
         matrix = np.eye(4)
         matrix[1, 2] = -self.top
         take_step(results, CropTop(self.top))

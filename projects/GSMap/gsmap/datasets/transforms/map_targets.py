@@ -21,6 +21,7 @@ from gsmap.structures.polylines import (
     resample,
     sampled_orders,
 )
+from gsmap.utils.errors import InputError
 
 ORDERS = ("vertices", "points")
 
@@ -56,7 +57,7 @@ def map_targets(
         ValueError: If elements have fewer coordinates than ``dim``, or ``orders_of`` is unknown.
     """
     if orders_of not in ORDERS:
-        raise ValueError(f"orders_of must be one of {ORDERS}, got {orders_of!r}.")
+        raise InputError(f"orders_of must be one of {ORDERS}, got {orders_of!r}.")
     slots = max(num_points - 1, 2) if orders_of == "vertices" else 2 * (num_points - 1)
     points = np.empty((len(instances), num_points, dim))
     orders = np.empty((len(instances), slots, num_points, dim))
@@ -65,7 +66,7 @@ def map_targets(
     closed = np.empty(len(instances), bool)
     for i, instance in enumerate(instances):
         if instance.points.shape[1] < dim:
-            raise ValueError(
+            raise InputError(
                 f"targets of dim {dim} need points of as many coordinates, got "
                 f"{instance.points.shape}."
             )

@@ -17,6 +17,7 @@ from gsmap.datasets.annotations.record import MapInstance
 from gsmap.structures.elements import annotated
 from gsmap.structures.grid import padded_size
 from gsmap.structures.polylines import resample
+from gsmap.utils.errors import InputError
 from gsmap.utils.settings import check_positive
 
 _PV_SAMPLES = 200
@@ -96,7 +97,7 @@ class MakeInstanceMasks(BaseTransform):
         """Draw the masks; ValueError if the sample has no ground truth, or no targets yet."""
         instances = annotated(results, self)
         if "gt_instances_3d" not in results:
-            raise ValueError(
+            raise InputError(
                 f"sample {results['token']!r} has no targets yet: put MakeInstanceMasks behind "
                 "FormatMapTargets in the pipeline."
             )
@@ -192,7 +193,7 @@ def channel_of(instance: MapInstance, num_classes: int | None) -> int:
     if num_classes is None:
         return 0
     if not 0 <= instance.label < num_classes:
-        raise ValueError(f"label {instance.label} of an element, but num_classes={num_classes}.")
+        raise InputError(f"label {instance.label} of an element, but num_classes={num_classes}.")
     return instance.label
 
 

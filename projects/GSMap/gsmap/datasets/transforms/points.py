@@ -15,6 +15,7 @@ from pyarrow import feather
 
 from gsmap.datasets.errors import BrokenSampleError
 from gsmap.structures.grid import padded_size
+from gsmap.utils.errors import InputError
 from gsmap.utils.faults import is_of_the_machine
 from gsmap.utils.inputs import heed_input
 
@@ -61,7 +62,7 @@ def read_points(path: str, load_dim: int) -> np.ndarray:
 def _read_feather(path: str, load_dim: int) -> np.ndarray:
     """Read a sweep of Argoverse 2. (n, load_dim)."""
     if load_dim > len(FEATHER_COLUMNS):
-        raise ValueError(
+        raise InputError(
             f"load_dim must be at most {len(FEATHER_COLUMNS)} for {path}, got {load_dim}."
         )
     names = FEATHER_COLUMNS[:load_dim]

@@ -15,6 +15,7 @@ from numba import njit
 import gsmap.utils.compilation  # noqa: F401 - says that kernels are compiled
 from gsmap.evaluation.core.report import UNDEFINED, MetricReport
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray
+from gsmap.utils.errors import InputError
 
 _RECALL_POINTS = np.linspace(0.0, 1.0, 101)
 _SPACING = np.spacing(1.0)  # that COCO adds to a denominator
@@ -63,7 +64,7 @@ class Resamples:
     def __post_init__(self) -> None:
         scenes = len(set(self.scene_of.values()))
         if scenes < 2 or self.count < 2 or self.seed < 0:
-            raise ValueError(
+            raise InputError(
                 "intervals need two scenes, two resamples and a seed >= 0 at least, got "
                 f"{scenes}, {self.count} and {self.seed}."
             )
@@ -71,7 +72,7 @@ class Resamples:
     def draw(self, tokens: Sequence[str]) -> tuple[IntArray, FloatArray]:
         """Return the scene of each sample (S,), and how often each scene is drawn. (B, scenes)"""
         if missing := next((token for token in tokens if token not in self.scene_of), None):
-            raise ValueError(f"the scene of sample {missing!r} is not known.")
+            raise InputError(f"the scene of sample {missing!r} is not known.")
         scenes = [self.scene_of[token] for token in tokens]
         names, numbers = np.unique(np.array(scenes, str), return_inverse=True)
         shares = np.full(len(names), 1 / len(names))
@@ -241,7 +242,7 @@ def ap_differences(
         ValueError: If they are of other metrics or samples.
     """
     if [(r.name, list(r.tokens)) for r in first] != [(r.name, list(r.tokens)) for r in second]:
-        raise ValueError("two results can be compared on the same samples and metrics only.")
+        raise InputError("two results can be compared on the same samples and metrics only.")
     found = {}
     for one, other in zip(first, second, strict=True):
         ours, theirs = (resampled_figures(report, resamples) for report in (one, other))

@@ -15,6 +15,7 @@ from gsmap.evaluation.core.metric import Sample
 from gsmap.evaluation.core.report import MetricReport
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 from gsmap.structures.polylines import equivalent_orders
+from gsmap.utils.errors import InputError
 from gsmap.utils.model_facts import LAW_NAMES
 
 AXES = ("along", "across")
@@ -60,7 +61,7 @@ def matched_vertices(samples: Iterable[Sample], config: ChamferConfig) -> Vertic
     """
     parts = [part for sample in samples for part in _of_sample(*sample, config)]
     if not parts:
-        raise ValueError("no prediction matches: there is no vertex to measure.")
+        raise InputError("no prediction matches: there is no vertex to measure.")
     labels, errors, sigmas, distances = map(np.concatenate, zip(*parts, strict=True))
     return Vertices(labels, errors, sigmas, distances)
 
@@ -72,7 +73,7 @@ def _of_sample(
     if not len(found):
         return
     if found.scales is None or found.rotations is None:
-        raise ValueError(
+        raise InputError(
             f"sample {token!r} has predictions without Gaussians: predict with a model that has "
             "them, such as GSMap."
         )
@@ -221,14 +222,14 @@ def fitted_factors(
         ValueError: If a class has too few vertices for that, or ``num_sigmas`` is not in (0, 3].
     """
     if not 0 < num_sigmas <= 3:
-        raise ValueError(f"num_sigmas must be in (0, 3], got {num_sigmas}.")
+        raise InputError(f"num_sigmas must be in (0, 3], got {num_sigmas}.")
     covered = 2 * stats.norm.cdf(num_sigmas) - 1
     width = half_widths(law, covered)
     factors = np.empty((len(classes), len(AXES)))
     for label, name in enumerate(classes):
         own = vertices.of(vertices.labels == label)
         if len(own.labels) < _FEWEST:
-            raise ValueError(
+            raise InputError(
                 f"class {name!r} has {len(own.labels)} matched vertices, {_FEWEST} are needed: "
                 "give results of more samples."
             )

@@ -15,6 +15,7 @@ from gsmap.structures.bezier import (
     largest_deviation,
 )
 from gsmap.structures.elements import FloatArray
+from gsmap.utils.errors import InputError
 
 _DECIMALS = 3  # control points are written in whole millimetres
 _ROUNDING_M = 0.001
@@ -50,7 +51,7 @@ def compact_results(
         ValueError: If it is malformed, or a setting is out of range.
     """
     if max_error_m <= _ROUNDING_M:
-        raise ValueError(f"the error must be more than {_ROUNDING_M} m, got {max_error_m}.")
+        raise InputError(f"the error must be more than {_ROUNDING_M} m, got {max_error_m}.")
     file, samples = SampleFile(results, RESULTS_KEY, ()), []
     total = Compaction(0, 0, 0, 0.0)
     for item, token, elements, _ in file.raw():

@@ -20,6 +20,7 @@ from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElemen
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import resample_all
 from gsmap.structures.rigid import invert_rigid
+from gsmap.utils.errors import InputError
 
 TRACK_POINTS, CHAMFER_POINTS = 20, 200
 _LONG_PX, _SHORT_PX, _LINE_PX, _SMALL_PX = 200, 100, 3, 20
@@ -55,12 +56,12 @@ class ConsistencyConfig:
 
     def __post_init__(self) -> None:
         if not self.classes or not self.thresholds or min(self.thresholds) <= 0:
-            raise ValueError(
+            raise InputError(
                 "classes and thresholds must not be empty and thresholds must be > 0 m, got "
                 f"{self.classes} and {self.thresholds}."
             )
         if self.look_back < 1:
-            raise ValueError(f"look_back must be >= 1, got {self.look_back}.")
+            raise InputError(f"look_back must be >= 1, got {self.look_back}.")
 
 
 @dataclass

@@ -17,6 +17,7 @@ from gsmap.evaluation.analysis.consistency import (
 )
 from gsmap.evaluation.core.results_json import RESULTS_KEY, SampleFile, vectors_of, write_results
 from gsmap.structures.elements import IntArray, MapElements
+from gsmap.utils.errors import InputError
 from gsmap.utils.json_items import items_of
 
 TRACK_KEY = "track_id"
@@ -45,7 +46,7 @@ def drive_frames(
 def _frames_of(samples: SampleFile, annotations: AnnotationFile) -> list[DriveFrame]:
     """Return what `drive_frames` does; then the file has said what it says of itself."""
     if not annotations.meta.options.get("poses", True):
-        raise ValueError(f"{annotations.path} knows no poses, which consistency needs.")
+        raise InputError(f"{annotations.path} knows no poses, which consistency needs.")
     found, results = {}, samples.path
     items = items_of(results, RESULTS_KEY, "give a result file")
     # samples first, for what they say of a bad file
@@ -57,12 +58,12 @@ def _frames_of(samples: SampleFile, annotations: AnnotationFile) -> list[DriveFr
         found[token] = elements, ids
     tracked = {ids is not None: token for token, (elements, ids) in found.items() if len(elements)}
     if len(tracked) > 1:
-        raise ValueError(
+        raise InputError(
             f"{results}: sample {tracked[True]!r} has tracks, sample {tracked[False]!r} has none: "
             f"give every vector a {TRACK_KEY}, or none."
         )
     if missing := [token for token in annotations.column("token") if token not in found]:
-        raise ValueError(
+        raise InputError(
             f"{results} has no sample {missing[0]!r} ({len(missing)} are missing): consistency "
             "needs whole drives."
         )
@@ -75,7 +76,7 @@ def _frames_of(samples: SampleFile, annotations: AnnotationFile) -> list[DriveFr
         sample = annotations[row]
         elements, ids = found[sample.token]
         if sample.instances is None:
-            raise ValueError(f"sample {sample.token!r} has no ground truth: it cannot be scored.")
+            raise InputError(f"sample {sample.token!r} has no ground truth: it cannot be scored.")
         truth = elements_of_instances(sample.instances)
         frames.append(
             DriveFrame(sample.token, sample.scene, sample.global_from_frame, elements, truth, ids)
@@ -89,7 +90,7 @@ def _track_ids(ids: list[object], results: Path, token: str) -> IntArray | None:
         return None
     for track in ids:
         if type(track) is not int or not -1 <= track < 2**31:
-            raise ValueError(
+            raise InputError(
                 f"{results}, sample {token!r}: {TRACK_KEY} must be an integer from -1 (no track), "
                 f"got {track!r:.40}."
             )
@@ -101,7 +102,7 @@ def _check_tracks(ids: IntArray, elements: MapElements, results: Path, token: st
     pairs, counts = np.unique([elements.labels, ids], axis=1, return_counts=True)
     twice = pairs[1, (counts > 1) & (pairs[1] >= 0)]
     if len(twice):
-        raise ValueError(
+        raise InputError(
             f"{results}, sample {token!r}: two elements of a class have {TRACK_KEY} {twice[0]}: a "
             "track is one element in each frame."
         )

@@ -12,6 +12,7 @@ from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.evaluation.analysis.bootstrap import resampled_figures
 from gsmap.evaluation.core.report import UNDEFINED, MetricReport
 from gsmap.structures.elements import FloatArray, IntArray
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import read_json
 
 CONDITIONS = ("clear", "cloudy", "dusk", "night", "rain")
@@ -39,7 +40,7 @@ class Groups:
     def draw(self, tokens: Sequence[str]) -> tuple[IntArray, FloatArray]:
         """Return the group of each sample (S,), and each group alone, as a resample. (G, G)"""
         if missing := next((token for token in tokens if token not in self.group_of), None):
-            raise ValueError(f"the group of sample {missing!r} is not known.")
+            raise InputError(f"the group of sample {missing!r} is not known.")
         numbers = {name: number for number, name in enumerate(self.names)}
         found = np.array([numbers[self.group_of[token]] for token in tokens], dtype=np.int64)
         return found, np.eye(len(self.names))
@@ -58,7 +59,7 @@ def read_groups(annotations: str | Path, by: str) -> Groups:
         ValueError: If there are no groups in it, or a scene or sample is not in the JSON file.
     """
     if Path(annotations).suffix.lower() == ".json":
-        raise ValueError(f"{annotations} knows no scenes: give the annotation file (.arrow).")
+        raise InputError(f"{annotations} knows no scenes: give the annotation file (.arrow).")
     if by not in _COLUMNS and not Path(by).is_file():
         raise FileNotFoundError(
             f"--by takes {', '.join(_COLUMNS)} or a JSON file, and there is no file {by!r}."
@@ -71,7 +72,7 @@ def read_groups(annotations: str | Path, by: str) -> Groups:
         of_samples = not group_of.keys().isdisjoint(tokens)
         kind, names = ("sample", tokens) if of_samples else ("scene", groups)
         if missing := next((name for name in names if name not in group_of), None):
-            raise ValueError(f"{by} has no {kind} {missing!r}, which {annotations} has.")
+            raise InputError(f"{by} has no {kind} {missing!r}, which {annotations} has.")
         groups = [group_of[name] for name in names]
     return Groups(dict(zip(tokens, groups, strict=True)))
 
@@ -85,7 +86,7 @@ def _groups_in(path: str) -> dict[str, str]:
         isinstance(text, str) and 0 < len(text) <= _LONGEST and text.isprintable()
         for text in content.values()
     ):
-        raise ValueError(
+        raise InputError(
             f"{path} is neither an object with the group of each scene or sample, in at most "
             f"{_LONGEST} characters, nor a scene.json of nuScenes."
         )

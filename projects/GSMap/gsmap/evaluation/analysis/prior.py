@@ -17,6 +17,7 @@ from gsmap.evaluation.core.metric import Sample
 from gsmap.evaluation.core.raster_ap import MIN_SCORE
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
 from gsmap.structures.polylines import resample_all
+from gsmap.utils.errors import InputError
 from gsmap.utils.split_lists import require_same_list
 
 _MIN_PRECISION = 1e-3  # an element that is right once in a thousand samples adds nothing
@@ -129,7 +130,7 @@ def fit_prior(
     """
     fits = [_ClassFit(label, truth, chamfer) for label in range(len(chamfer.classes))]
     if not any(len(fit.candidates) for fit in fits):
-        raise ValueError("the training set holds no ground truth of these classes.")
+        raise InputError("the training set holds no ground truth of these classes.")
     chosen: list[tuple[FloatArray, int, float]] = []  # line, label, score
     while len(chosen) < max_elements:
         proposals = [fit.propose() for fit in fits]

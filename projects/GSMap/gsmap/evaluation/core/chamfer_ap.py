@@ -25,6 +25,7 @@ from gsmap.evaluation.core.matches import (
 from gsmap.evaluation.core.metric import Metric, MetricSettings, Sample, register_metric
 from gsmap.evaluation.core.report import MetricReport, distance_figures
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
+from gsmap.utils.errors import InputError
 
 CHAMFER_THRESHOLDS = (0.5, 1.0, 1.5)
 HARD_CHAMFER_THRESHOLDS = (0.2, 0.5, 1.0)
@@ -64,11 +65,11 @@ class ChamferConfig(Metric):
         object.__setattr__(self, "thresholds", thresholds)
         object.__setattr__(self, "classes", checked_classes(self.classes))
         if not (thresholds and 0 < thresholds[0] <= thresholds[-1] < math.inf):
-            raise ValueError(f"thresholds must be > 0 m, at least one, got {thresholds}.")
+            raise InputError(f"thresholds must be > 0 m, at least one, got {thresholds}.")
         if self.num_points < 2:
-            raise ValueError(f"num_points must be >= 2, got {self.num_points}.")
+            raise InputError(f"num_points must be >= 2, got {self.num_points}.")
         if self.dim not in (2, 3):
-            raise ValueError(f"dim must be 2 or 3, got {self.dim!r}.")
+            raise InputError(f"dim must be 2 or 3, got {self.dim!r}.")
 
     @classmethod
     def of(cls, settings: MetricSettings) -> "ChamferConfig":
@@ -211,7 +212,7 @@ def _matches(sample: Sample, config: ChamferConfig) -> FrameMatches:
     try:
         best, distance = _nearest(sample, config)
     except ValueError as error:
-        raise ValueError(f"sample {token!r}, AP_chamfer of dim {config.dim}: {error}") from error
+        raise InputError(f"sample {token!r}, AP_chamfer of dim {config.dim}: {error}") from error
     rows = ranked_predictions(predictions, num_classes)
     fit = np.full((len(rows), len(ground_truth) + 1), -np.inf)
     fit[np.arange(len(rows)), best[rows]] = -distance[rows]  # in the last column without a nearest

@@ -19,6 +19,7 @@ from gsmap.evaluation.core.metric import (
 from gsmap.evaluation.core.report import MetricReport, flat_metrics
 from gsmap.structures.elements import MapElements
 from gsmap.structures.polylines import resample_all
+from gsmap.utils.errors import InputError
 
 METRIC_NAMES = ("chamfer", "raster")
 """The metrics of published tables, which are the default."""
@@ -49,11 +50,11 @@ class MapEvaluator:
         object.__setattr__(self, "ground_truth_points", ground_truth_points)
         names = [metric.name for metric in metrics]
         if len({metric.classes for metric in metrics}) != 1:
-            raise ValueError("name at least one metric; all have the same classes.")
+            raise InputError("name at least one metric; all have the same classes.")
         if len(set(names)) != len(names):
-            raise ValueError(f"the metrics must have different names, got {names}.")
+            raise InputError(f"the metrics must have different names, got {names}.")
         if ground_truth_points is not None and ground_truth_points < 2:
-            raise ValueError(f"ground_truth_points must be >= 2, got {ground_truth_points}.")
+            raise InputError(f"ground_truth_points must be >= 2, got {ground_truth_points}.")
 
     @classmethod
     def named(
@@ -156,5 +157,5 @@ class MapEvaluator:
             for name, table in tables.items():
                 table.add(sample[name])  # type: ignore[arg-type]
         if not tables:
-            raise ValueError("there is no sample to score.")
+            raise InputError("there is no sample to score.")
         return [report for metric in self.metrics for report in metric.reports(tables[metric.name])]

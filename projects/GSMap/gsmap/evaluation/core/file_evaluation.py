@@ -17,6 +17,7 @@ from gsmap.evaluation.core.metric import Sample
 from gsmap.evaluation.core.report import MetricReport
 from gsmap.evaluation.core.results_json import GROUND_TRUTH_KEY, RESULTS_KEY, THREE_D, SampleFile
 from gsmap.structures.elements import MapElements
+from gsmap.utils.errors import InputError
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
 from gsmap.utils.shards import WHOLE, Shard
@@ -45,7 +46,7 @@ class AnnotatedTruth:
         names = self._file.meta.classes
         missing = [name for name in classes if name not in names]
         if missing:
-            raise ValueError(f"{path} has the classes {names}, not {missing}.")
+            raise InputError(f"{path} has the classes {names}, not {missing}.")
         self._labels = np.array([classes.index(n) if n in classes else -1 for n in names])
         self._rows = shard.part(range(len(self._file)))
         self.ignored = Counter({THREE_D: len(self._file) * (self._file.meta.dim == 3)})
@@ -56,7 +57,7 @@ class AnnotatedTruth:
         for row in self._rows:
             sample = self._file[row]
             if sample.instances is None:
-                raise ValueError(
+                raise InputError(
                     f"{self._file.path}, sample {sample.token!r} has no ground truth: it cannot "
                     "be scored."
                 )
@@ -86,7 +87,7 @@ class AnnotatedTruth:
 def scenes_of(path: str | Path) -> dict[str, str]:
     """Return the scene of each sample of an annotation file, by token; ValueError for JSON."""
     if Path(path).suffix.lower() == ".json":
-        raise ValueError(f"{path} knows no scenes: give the annotation file (.arrow).")
+        raise InputError(f"{path} knows no scenes: give the annotation file (.arrow).")
     file = AnnotationFile(path)
     return dict(zip(file.column("token"), file.column("scene"), strict=True))
 
@@ -130,7 +131,7 @@ def mismatch_notes(results: Collection[str], truth: Collection[str], allowed: bo
             said = f"{counted(len(alone), what)} {verb} {lack}, such as {alone[0]!r}"
             notes.append(f"{said}: {treatment}" if allowed else said)
     if notes and not allowed:
-        raise ValueError(
+        raise InputError(
             "; ".join(notes) + ": score the split that was predicted, or allow the mismatch."
         )
     return notes

@@ -12,6 +12,7 @@ from gsmap.evaluation.core.evaluator import MapEvaluator, SampleMatches
 from gsmap.evaluation.core.metric import Matches, MetricSettings, arrays_of, matches_of
 from gsmap.evaluation.core.report import MetricReport
 from gsmap.structures.grid import BEVGrid
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import DAMAGED_ZIP, atomic_write
 from gsmap.utils.shards import Shard, ShardFile
 
@@ -84,7 +85,7 @@ def report_shards(shards: Sequence[ShardFile]) -> tuple[list[MetricReport], list
     try:
         evaluator = _evaluator(shards[0].manifest["options"]["evaluator"])
     except _FAULTS as error:
-        raise ValueError(
+        raise InputError(
             f"the manifest of {shards[0].path} tells no rules of metrics ({error!r}): make that "
             "shard again."
         ) from error
@@ -97,7 +98,7 @@ def report_shards(shards: Sequence[ShardFile]) -> tuple[list[MetricReport], list
                 found = {name: file[name] for name in file.files}
             matches += _samples(found, evaluator) if len(found) > 1 else ()
         except (*_FAULTS, *DAMAGED_ZIP) as error:
-            raise ValueError(
+            raise InputError(
                 f"{shard.path} holds no matches by the rules of its manifest ({error!r}): make "
                 "that shard again."
             ) from error
@@ -109,7 +110,7 @@ def _samples(arrays: Arrays, evaluator: MapEvaluator) -> list[SampleMatches]:
     metrics = {name.removesuffix(_TOKENS) for name in arrays if name.endswith(_TOKENS)}
     empty = evaluator.match_empty()
     if metrics != empty.keys():
-        raise ValueError(f"it has matches of {sorted(metrics)}, not of {sorted(empty)}")
+        raise InputError(f"it has matches of {sorted(metrics)}, not of {sorted(empty)}")
     columns = [_records(arrays, metric, like) for metric, like in empty.items()]
     return [dict(zip(empty, of_sample, strict=True)) for of_sample in zip(*columns, strict=True)]
 
@@ -122,7 +123,7 @@ def _records(arrays: Arrays, metric: str, like: Matches) -> Iterator[Matches]:
         ends = np.cumsum(arrays[f"{metric}/{name}{_LENGTHS}"])
         values = arrays[f"{metric}/{name}"]
         if len(ends) != len(tokens) or ends[-1] != len(values):
-            raise ValueError(f"{metric}/{name} has {len(values)} rows, its samples have {ends}")
+            raise InputError(f"{metric}/{name} has {len(values)} rows, its samples have {ends}")
         columns[name] = np.split(values, ends[:-1])
     for number, token in enumerate(tokens):
         own = {name: values[number] for name, values in columns.items()}

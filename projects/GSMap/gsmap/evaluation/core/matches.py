@@ -9,6 +9,7 @@ from numba import njit
 
 import gsmap.utils.compilation  # noqa: F401 - says that kernels are compiled
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
+from gsmap.utils.errors import InputError
 
 _COLUMNS = {  # of a table, with the codes of their numbers
     "length": "q",
@@ -99,7 +100,7 @@ def checked_classes(classes: Iterable[str]) -> tuple[str, ...]:
     """Return names of classes; ValueError if they are none, or one text in place of several."""
     names = tuple(classes)
     if isinstance(classes, str) or not all(isinstance(name, str) for name in names) or not names:
-        raise ValueError(
+        raise InputError(
             f"classes must be names, such as ('divider', 'boundary'), got {classes!r}."
         )
     return names
@@ -120,12 +121,12 @@ def check_pair(
         beyond = (elements.labels < -1) | (elements.labels >= len(classes))
         if beyond.any():
             index = beyond.argmax()
-            raise ValueError(
+            raise InputError(
                 f"sample {token!r}: {what} {index} has the label {elements.labels[index]}, beyond "
                 f"the {len(classes)} classes {', '.join(classes)}."
             )
     if len(predictions) and predictions.scores is None:
-        raise ValueError(f"sample {token!r}: predictions need scores, in [0, 1].")
+        raise InputError(f"sample {token!r}: predictions need scores, in [0, 1].")
 
 
 def ranked_predictions(

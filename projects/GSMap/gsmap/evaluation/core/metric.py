@@ -17,6 +17,7 @@ from gsmap.evaluation.core.report import MetricReport
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
+from gsmap.utils.errors import InputError
 
 PACKAGE = Path(gsmap.__file__).parent
 _CORE = {
@@ -115,7 +116,7 @@ class MetricSettings:
     def canvas(self) -> BEVGrid:
         """The extent of the map; ValueError if it is not known."""
         if self.grid is None:
-            raise ValueError("metrics of masks or of shrunk maps need the range of the map.")
+            raise InputError("metrics of masks or of shrunk maps need the range of the map.")
         return self.grid
 
     @property
@@ -183,7 +184,7 @@ def register_metric(metric: MetricClass) -> MetricClass:
     """
     known = _REGISTERED.setdefault(metric.name, metric)
     if (known.__module__, known.__qualname__) != (metric.__module__, metric.__qualname__):
-        raise ValueError(f"{known.__module__} has a metric {metric.name!r}: choose another name.")
+        raise InputError(f"{known.__module__} has a metric {metric.name!r}: choose another name.")
     _REGISTERED[metric.name] = metric
     return metric
 
@@ -202,7 +203,7 @@ def metric_class(name: str) -> type[Metric]:
             if name == stem or name.startswith(f"{stem}_"):
                 import_module(module)
     if name not in _REGISTERED:
-        raise ValueError(f"there is no metric [{name!r}]; there are {metric_names()}.")
+        raise InputError(f"there is no metric [{name!r}]; there are {metric_names()}.")
     return _REGISTERED[name]
 
 
@@ -264,5 +265,5 @@ def matches_of(token: str, arrays: Mapping[str, npt.NDArray[Any]], like: Matches
     per_prediction = ("labels", "pred_index", "scores", "matched_gt", "quality")
     if not fitting or len({shapes[name][0] for name in per_prediction}) > 1:
         known = {name: values.shape for name, values in wanted.items()}
-        raise ValueError(f"shapes {shapes} where an empty sample has {known}")
+        raise InputError(f"shapes {shapes} where an empty sample has {known}")
     return FrameMatches(token, **arrays)

@@ -26,6 +26,7 @@ from gsmap.evaluation.core.report import UNDEFINED, MetricReport, class_figures
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
 from gsmap.structures.grid import BEVGrid
+from gsmap.utils.errors import InputError
 
 LINE_THRESHOLDS = (0.25, 0.3, 0.35, 0.4, 0.45, 0.5)
 POLYGON_THRESHOLDS = (0.5, 0.55, 0.6, 0.65, 0.7, 0.75)
@@ -66,15 +67,15 @@ class RasterConfig(Metric):
     def __post_init__(self) -> None:
         object.__setattr__(self, "classes", checked_classes(self.classes))
         if self.px_per_m <= 0 or min(self.size_px) < 1:
-            raise ValueError(f"px_per_m must give at least one pixel, got {self.px_per_m}.")
+            raise InputError(f"px_per_m must give at least one pixel, got {self.px_per_m}.")
         if np.prod(self.size_px, dtype=np.float64) > _MOST_PX:
             columns, rows = self.size_px
-            raise ValueError(
+            raise InputError(
                 f"a canvas of AP_raster has at most {_MOST_PX:.0e} pixels, not {columns} x {rows}: "
                 "give --range, or leave that metric out with --eval chamfer"
             )
         if self.dilation_px < 1 or self.dilation_px % 2 == 0:
-            raise ValueError(f"dilation_px must be odd and >= 1, got {self.dilation_px}.")
+            raise InputError(f"dilation_px must be odd and >= 1, got {self.dilation_px}.")
 
     @property
     def size_px(self) -> tuple[int, int]:

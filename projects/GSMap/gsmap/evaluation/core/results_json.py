@@ -17,6 +17,7 @@ import numpy as np
 
 from gsmap.structures.bezier import curve_points
 from gsmap.structures.elements import FARTHEST_M, MOST_M, MapElements
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import atomic_write
 from gsmap.utils.json_items import Place, items_of
 from gsmap.utils.shards import ShardFile
@@ -91,7 +92,7 @@ class SampleFile:
         for item, place in items_of(self.path, self._key, f"it must be {form}", beside):
             token, elements = self._convert(item, self.ignored)
             if token in seen:
-                raise ValueError(f"{self.path} holds sample {token!r} more than once.")
+                raise InputError(f"{self.path} holds sample {token!r} more than once.")
             seen.add(token)
             yield item, token, elements, place
         self.about = beside["meta"] if isinstance(beside["meta"], dict) else {}
@@ -108,19 +109,19 @@ class SampleFile:
             found, elements = self._convert(json.loads(file.read(length)), Counter())
             if found == token:
                 return elements
-        raise ValueError(
+        raise InputError(
             f"{self.path} was changed while it was read: end what writes there, and start again."
         )
 
     def _convert(self, item: Any, ignored: Counter[str]) -> tuple[str, MapElements]:
         """Return token and elements of a sample, and count what is ignored."""
         if not isinstance(item, dict) or not {"sample_token", "vectors"} <= item.keys():
-            raise ValueError(f"{self.path}: {item!r:.80} has no sample_token or no vectors.")
+            raise InputError(f"{self.path}: {item!r:.80} has no sample_token or no vectors.")
         token = str(item["sample_token"])
         try:
             return token, self._elements(item["vectors"], ignored)
         except (ValueError, KeyError, TypeError, OverflowError) as error:
-            raise ValueError(
+            raise InputError(
                 f"{self.path}, sample {token!r}: {error!r}; each vector needs pts, "
                 "cls_name and, in results, confidence_level."
             ) from error
@@ -168,12 +169,12 @@ def _require_near(elements: MapElements) -> None:
     if np.abs(points).max() > FARTHEST_M or total > FARTHEST_M:
         lengths = [steps[a:b].sum() for a, b in pairwise(elements.offsets)]
         if (worst := max(np.abs(points).max(), *lengths)) > FARTHEST_M:
-            raise ValueError(
+            raise InputError(
                 f"a line of {worst:.3g} m, or that far from the vehicle: at most "
                 f"{FARTHEST_M / 1000:g} km are read"
             )
     if total > MOST_M:
-        raise ValueError(
+        raise InputError(
             f"lines of {total:.3g} m in all: at most {MOST_M / 1000:g} km of a sample are read"
         )
 
@@ -241,12 +242,12 @@ def merge_results(path: Path, shards: Sequence[ShardFile]) -> int:
         files = [stack.enter_context(s.path.open(encoding="utf-8")) for s in shards]
         head, *others = [file.readline() for file in files]
         if set(others) - {head}:
-            raise ValueError(f"the shards of {path} have different first lines: make them anew.")
+            raise InputError(f"the shards of {path} have different first lines: make them anew.")
         out.write(head.removesuffix("\n"))
         count, last = 0, None
         for token, line in heapq.merge(*map(_lines_by_token, files)):
             if last is not None and token <= last:
-                raise ValueError(f"shards of {path} hold sample {token!r} twice or out of order.")
+                raise InputError(f"shards of {path} hold sample {token!r} twice or out of order.")
             out.write(",\n" if count else "\n")
             out.write(line)
             count, last = count + 1, token
@@ -261,5 +262,5 @@ def _lines_by_token(file: Iterable[str]) -> Iterator[tuple[str, str]]:
         if line != _LAST_LINE:
             token, _ = decoder.raw_decode(line, start)
             if not isinstance(token, str):
-                raise ValueError(f"{token!r:.80} is no token of a sample.")
+                raise InputError(f"{token!r:.80} is no token of a sample.")
             yield token, line.rstrip(",\n")

@@ -29,6 +29,7 @@ from gsmap.evaluation.core.metric import Metric, MetricSettings, Sample
 from gsmap.evaluation.core.report import UNDEFINED, MetricReport, distance_figures
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 from gsmap.structures.grid import BEVGrid
+from gsmap.utils.errors import InputError
 
 PIXEL_M = 0.15
 _FAR_PX = 2.0**20  # farther points are pulled in, so that they fit the integers of the drawing
@@ -66,7 +67,7 @@ class SampleAP(Metric):
     def __post_init__(self) -> None:
         object.__setattr__(self, "classes", checked_classes(self.classes))
         if not 0 <= self.min_score <= 1:
-            raise ValueError(f"min_score must be in [0, 1], got {self.min_score}.")
+            raise InputError(f"min_score must be in [0, 1], got {self.min_score}.")
 
     @classmethod
     def of(cls, settings: MetricSettings) -> "SampleAP":

@@ -26,6 +26,7 @@ from gsmap.evaluation.core.metric import (
 from gsmap.evaluation.core.report import MetricReport
 from gsmap.structures.elements import FloatArray
 from gsmap.structures.polylines import arc_lengths
+from gsmap.utils.errors import InputError
 
 _STEP_M = 0.5  # between the points that are compared
 _MOST_STEPS = 2000  # of a line; the work grows with the square
@@ -157,7 +158,7 @@ class PLD(Metric):
         object.__setattr__(self, "classes", checked_classes(self.classes))
         object.__setattr__(self, "cutoffs_m", cutoffs)
         if not (cutoffs and 0 < cutoffs[0] <= cutoffs[-1] < np.inf):
-            raise ValueError(f"cutoffs_m must be > 0 m, at least one, got {cutoffs}.")
+            raise InputError(f"cutoffs_m must be > 0 m, at least one, got {cutoffs}.")
 
     @classmethod
     def of(cls, settings: MetricSettings) -> "PLD":

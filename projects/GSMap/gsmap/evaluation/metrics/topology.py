@@ -19,6 +19,7 @@ from gsmap.evaluation.core.metric import (
 from gsmap.evaluation.core.report import MetricReport
 from gsmap.structures.elements import BoolArray, FloatArray, MapElements
 from gsmap.structures.polylines import arc_lengths, resample
+from gsmap.utils.errors import InputError
 
 _POINTS = 128  # that an element is looked at, at equal distances
 _FOLD_CHORD_M = 2.0  # before and after a fold
@@ -54,7 +55,7 @@ class Topology(Metric):
     def __post_init__(self) -> None:
         object.__setattr__(self, "classes", checked_classes(self.classes))
         if not (0 <= self.min_score <= 1 and 0 < 2 * self.tolerance_m < self.min_piece_m < np.inf):
-            raise ValueError(
+            raise InputError(
                 "min_score must be in [0, 1], tolerance_m > 0 and min_piece_m more than twice "
                 f"that, got {self.min_score}, {self.tolerance_m} and {self.min_piece_m}."
             )

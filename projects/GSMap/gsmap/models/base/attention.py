@@ -18,6 +18,7 @@ from gsmap.ops.deformable_sampling import (
     sum_rows,
 )
 from gsmap.structures.tensors import at_least_float32, constant
+from gsmap.utils.errors import InputError
 
 _IM2COL_STEP = 64
 _CORNERS = 4
@@ -92,7 +93,7 @@ class SamplingAttention(nn.Module):
     ) -> None:
         super().__init__()
         if embed_dims % num_heads:
-            raise ValueError(
+            raise InputError(
                 f"embed_dims must be divisible by num_heads, got {embed_dims} and {num_heads}."
             )
         query_dims = query_dims or embed_dims

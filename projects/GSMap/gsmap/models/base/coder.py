@@ -13,6 +13,7 @@ from gsmap.models.base.references import Reference
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import shortest_orders
 from gsmap.structures.tensors import constant
+from gsmap.utils.errors import InputError
 from gsmap.utils.targets import NeedsTargets
 
 Tensors = dict[str, Tensor]
@@ -49,9 +50,9 @@ class MapCoder:
         unfold_classes: Sequence[int] = (),
     ) -> None:
         if max_num < 1:
-            raise ValueError(f"max_num must be >= 1, got {max_num}.")
+            raise InputError(f"max_num must be >= 1, got {max_num}.")
         if margin_m is not None and margin_m <= 0:
-            raise ValueError(f"margin_m must be > 0, got {margin_m}.")
+            raise InputError(f"margin_m must be > 0, got {margin_m}.")
         self.grid, self.max_num = grid, max_num
         self.margin_m, self.score_threshold = margin_m, score_threshold
         self.unfold_classes = tuple(unfold_classes)

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from gsmap.utils.errors import InputError
+
 
 @dataclass(frozen=True)
 class QueryGroup:
@@ -26,6 +28,6 @@ class QueryGroup:
 
     def __post_init__(self) -> None:
         if self.num < 1 or self.repeats < 1:
-            raise ValueError(
+            raise InputError(
                 f"a query group needs num >= 1 and repeats >= 1, got {self.num} and {self.repeats}."
             )

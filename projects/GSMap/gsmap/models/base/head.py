@@ -36,6 +36,7 @@ from gsmap.models.base.queries import PointTable, added_settings
 from gsmap.models.base.references import RefinedReference
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32
+from gsmap.utils.errors import InputError, InputTypeError
 
 _PRIOR_PROBABILITY = 0.01
 Instances = Sequence[InstanceData]
@@ -116,7 +117,7 @@ class MapHead(DetectionHead):
             {"type": "MapDecoder", "layer": {}, **shared, **handed_on, **decoder}
         )
         if point_queries is not None and not self.decoder.point_queries:
-            raise ValueError(
+            raise InputError(
                 f"{type(self.decoder).__name__} has queries of instances, no embeddings of points: "
                 f"leave out {', '.join(settings) or 'point_queries'}."
             )
@@ -160,7 +161,7 @@ class MapHead(DetectionHead):
         known = {name for base in kind.__mro__ for name in signature(base).parameters}
         unknown = sorted(set(settings) - known)
         if unknown:
-            raise ValueError(
+            raise InputError(
                 f"coder.{unknown[0]} is no setting of {kind.__name__}, the coder of "
                 f"{type(self.reference).__name__}: leave it out, or take a head whose reference "
                 "has a coder with it."
@@ -172,7 +173,7 @@ class MapHead(DetectionHead):
         """Refuse parts that do not fit together, see the class."""
         for loss in self.losses.values():
             if not isinstance(loss, MapLoss):
-                raise TypeError(
+                raise InputTypeError(
                     f"{type(loss).__name__} is no MapLoss: derive it from "
                     "gsmap.models.base.losses.MapLoss (docs/add_a_method.md)."
                 )
@@ -182,7 +183,7 @@ class MapHead(DetectionHead):
         for group in self.query_groups:
             unknown = sorted(set(group.losses or ()) - set(names))
             if unknown:
-                raise ValueError(
+                raise InputError(
                     f"query group {group.name!r} names losses {unknown}; there are {names}."
                 )
         for name, given in (

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from gsmap.models.base.pairs import BuiltHead, MatchedPairs
 from gsmap.models.base.parts import WEIGHT, weights_of
+from gsmap.utils.errors import InputTypeError
 from gsmap.utils.targets import NeedsTargets
 
 
@@ -42,7 +43,9 @@ class MapLoss(nn.Module, NeedsTargets):
         own = {name: getattr(type(self), name) for name in ("forward", "by_layer")}
         is_sum = own == {name: getattr(MapLoss, name) for name in own}
         if isinstance(loss_weight, Sequence) and not is_sum:
-            raise TypeError(f"{type(self).__name__} is no sum over pairs: give one loss_weight.")
+            raise InputTypeError(
+                f"{type(self).__name__} is no sum over pairs: give one loss_weight."
+            )
         self.loss_weight = loss_weight
         self.last_layer_only, self.first_group_only = last_layer_only, first_group_only
 
@@ -50,7 +53,7 @@ class MapLoss(nn.Module, NeedsTargets):
         super().__init_subclass__()
         flags = [name for name, value in vars(cls).items() if isinstance(value, bool)]
         if flags:
-            raise TypeError(
+            raise InputTypeError(
                 f"{cls.__name__} sets {flags} as attributes of the class: pass last_layer_only and "
                 "first_group_only to MapLoss.__init__."
             )

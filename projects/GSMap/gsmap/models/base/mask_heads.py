@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from gsmap.ops.soft_iou import dice_loss
 from gsmap.structures.tensors import check_same_shape, constant
+from gsmap.utils.errors import InputError
 from gsmap.utils.targets import NeedsTargets
 
 Samples = Sequence[Det3DDataSample]
@@ -37,7 +38,7 @@ def stack_targets(head: Any, samples: Samples, name: str, device: torch.device) 
     """
     for sample in samples:
         if name not in sample:
-            raise ValueError(
+            raise InputError(
                 f"sample {sample.metainfo.get('token')!r} has no {name}: add its transform "
                 f"{head.transforms[0]} to the training pipeline, or remove its loss from the model."
             )
@@ -89,7 +90,7 @@ class BEVMaskHead(nn.Sequential, NeedsTargets):
         if self.num_masks == 1:
             target = target.amax(1, keepdim=True)
         elif target.shape[1] != self.num_masks:
-            raise ValueError(
+            raise InputError(
                 f"{self.target} has {target.shape[1]} channels, {self.num_masks} masks are "
                 f"predicted: set num_classes={self.num_masks} in its transform."
             )

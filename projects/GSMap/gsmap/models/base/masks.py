@@ -13,6 +13,7 @@ from gsmap.ops.polyline_raster import draw_polylines
 from gsmap.structures.gaussians import gaussians_along
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import constant
+from gsmap.utils.errors import InputError
 
 SOURCES = ("full", "points", "gaussians")
 
@@ -48,7 +49,7 @@ class ElementMasks:
         held_classes: Sequence[int] = (),
     ) -> None:
         if source not in SOURCES:
-            raise ValueError(f"source must be one of {SOURCES}, got {source!r}.")
+            raise InputError(f"source must be one of {SOURCES}, got {source!r}.")
         longer_m = max(grid.extent_m)
         self.grid = grid.rasterized(pixel_m or longer_m / 200)
         self.cost_grid = grid.rasterized(cost_pixel_m or longer_m / 128)
@@ -102,7 +103,7 @@ class ElementMasks:
         if self.of_points:
             return self.draw(torch.cat([sample.pts for sample in gt_instances]), labels, grid)
         if any("polylines" not in sample for sample in gt_instances):
-            raise ValueError(
+            raise InputError(
                 "masks of source 'full' need gt_instances_3d.polylines: make the targets with "
                 "FormatMapTargets."
             )

@@ -14,6 +14,7 @@ from torch import Tensor
 from gsmap.models.base.pairs import BuiltHead, GroundTruth, MapMatches, Predictions, SampleView
 from gsmap.models.base.parts import WEIGHT
 from gsmap.structures.tensors import uploaded
+from gsmap.utils.errors import InputError, NotFiniteError
 
 
 class MapAssigner:
@@ -29,7 +30,7 @@ class MapAssigner:
 
     def __init__(self, match_costs: Sequence[dict[str, Any]]) -> None:
         if not match_costs:
-            raise ValueError("match_costs must hold at least one cost.")
+            raise InputError("match_costs must hold at least one cost.")
         self.match_costs = [TASK_UTILS.build(cost) for cost in match_costs]
         self.names = [type(cost).__name__ for cost in self.match_costs]
         of_points = (cost for cost in self.match_costs if isinstance(cost, PointsCost))
@@ -209,7 +210,7 @@ def check_finite(values: Tensor, names: Sequence[str], img_meta: dict[str, Any] 
     if not finite.all():
         token = (img_meta or {}).get("token", "unknown")
         what = names[int(finite.int().argmin())]
-        raise FloatingPointError(
+        raise NotFiniteError(
             f"{what} of sample {token!r} is not finite before the assignment: look at the "
             "sample's images and ground truth, then at the learning rate and at the loss scale "
             "of mixed precision."

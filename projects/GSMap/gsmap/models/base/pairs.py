@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from gsmap.models.base.decoder import Decoded, JoinedDecoded, MapDecoder
 from gsmap.models.base.masks import ElementMasks
 from gsmap.models.base.references import RefinedReference
+from gsmap.utils.errors import InputError
 
 
 class BuiltHead(Protocol):
@@ -131,7 +132,7 @@ class GroundTruth:
     def pipeline_masks(self) -> Tensor:
         """Masks that the pipeline drew; ValueError if it did not. (T, H, W)"""
         if any("masks" not in sample for sample in self._instances):
-            raise ValueError(
+            raise InputError(
                 "a loss needs gt_instances_3d.masks: add MakeInstanceMasks to the training "
                 "pipeline, behind FormatMapTargets, or remove the loss from the model."
             )

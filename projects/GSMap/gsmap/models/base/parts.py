@@ -10,6 +10,7 @@ from mmengine.registry import Registry
 from torch import Tensor, nn
 
 from gsmap.structures.tensors import constant
+from gsmap.utils.errors import InputError
 
 PARTS = dict[str, Any]
 WEIGHT = float | Sequence[float]  # one for all classes, or one for each
@@ -58,7 +59,7 @@ def with_points_weight(
         return list(parts)
     found = [class_of(part, registry) is kind for part in parts]
     if not any(found):
-        raise ValueError(
+        raise InputError(
             f"points_weight is {weight}, and there is no {kind.__name__}: add one, or set "
             "points_weight=None."
         )
@@ -75,7 +76,7 @@ def refuse_twins(names: Sequence[str], what: str) -> None:
     """Raise ValueError if two have one name."""
     twins = sorted({name for name in names if names.count(name) > 1})
     if twins:
-        raise ValueError(f"two {what} have one name, {twins[0]!r}; there are {list(names)}.")
+        raise InputError(f"two {what} have one name, {twins[0]!r}; there are {list(names)}.")
 
 
 def weights_of(weight: WEIGHT, labels: Tensor) -> Tensor:
@@ -93,7 +94,7 @@ def check_weight(part: Any, weight: WEIGHT, classes: Sequence[str]) -> None:
         classes: Names of the classes.
     """
     if isinstance(weight, Sequence) and len(weight) != len(classes):
-        raise ValueError(
+        raise InputError(
             f"{type(part).__name__} has the weights {list(weight)}: give one, or one for each of "
             f"{list(classes)}."
         )
@@ -108,4 +109,4 @@ def check_classes(name: str, indices: Sequence[int], classes: Sequence[str]) -> 
         classes: Names of the classes.
     """
     if any(not 0 <= index < len(classes) for index in indices):
-        raise ValueError(f"{name} must be indices of {list(classes)}, got {tuple(indices)}.")
+        raise InputError(f"{name} must be indices of {list(classes)}, got {tuple(indices)}.")

@@ -14,6 +14,7 @@ from gsmap.models.encoders.projection import pixel_rays
 from gsmap.models.lines.decoder import AttentionLayer
 from gsmap.models.lines.front import ahead, centres, front_size, turned
 from gsmap.structures.grid import BEVGrid
+from gsmap.utils.errors import InputError
 
 
 @MODELS.register_module()
@@ -56,7 +57,7 @@ class BezierBEVEncoder(CameraEncoder):
     ) -> None:
         super().__init__(init_cfg)
         if len(num_layers) != 2 or num_layers[1] < 1:
-            raise ValueError(
+            raise InputError(
                 "num_layers must be those over the cameras and those of the BEV cells, of which at "
                 f"least 1, got {tuple(num_layers)}."
             )
@@ -119,7 +120,7 @@ class BezierBEVEncoder(CameraEncoder):
         matrices = ground_from_img.float()
         image_size = self.position_size or img_shape
         if image_size[0] < img_shape[0] or image_size[1] != img_shape[1]:
-            raise ValueError(
+            raise InputError(
                 f"position_size of BezierBEVEncoder is {tuple(image_size)}, but images have "
                 f"{img_shape[0]} rows and {img_shape[1]} columns: set it to their size before rows "
                 "are cut off, or to None."

@@ -22,6 +22,7 @@ from gsmap.models.lines.front import front_size
 from gsmap.models.lines.head import LineHead, LinePredictions, class_scores
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import constant
+from gsmap.utils.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ class BezierHead(LineHead):
     ) -> None:
         check_curves(degrees, pieces)
         if not len(queries) == len(degrees) == len(classes) or min(queries) < 1:
-            raise ValueError(
+            raise InputError(
                 f"queries (>= 1), degrees and pieces must be one for each of {list(classes)}, got "
                 f"{list(queries)}, {list(degrees)} and {list(pieces)}."
             )
@@ -154,7 +155,7 @@ class BezierHead(LineHead):
             own = instances.labels_3d == label
             numbers, most = instances.num_pts[own], curve.weights.shape[-1]
             if ((numbers > most) | ((numbers - 1) % curve.degree != 0)).any():
-                raise ValueError(
+                raise InputError(
                     f"lines of class {label} have {numbers.tolist()} control points, but the head "
                     f"pieces of degree {curve.degree} and at most {most} points: set degrees and "
                     "pieces of FormatBezierTargets to those of the head."

@@ -13,6 +13,7 @@ from torch import Tensor
 from gsmap.models.base.matching import assigned
 from gsmap.models.bemapnet.curves import around, missed
 from gsmap.models.lines.losses import Case, LineLosses
+from gsmap.utils.errors import InputError
 
 COSTS = ("class scores", "masks", "control points", "pieces", "curves", "recovery")
 OVERSAMPLING, UNCERTAIN = 3.0, 0.9  # of a mask's points: drawn per taken one, share of the taken
@@ -65,7 +66,7 @@ class BezierLosses(LineLosses):
 
     def __post_init__(self) -> None:
         if self.mask_points is not None and self.mask_points < 10:
-            raise ValueError(f"mask_points must be >= 10 or None, got {self.mask_points}.")
+            raise InputError(f"mask_points must be >= 10 or None, got {self.mask_points}.")
 
     @torch.no_grad()
     def distances(self, masks: Sequence[Tensor], truths: Sequence[Tensor]) -> list[Tensor]:

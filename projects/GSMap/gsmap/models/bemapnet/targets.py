@@ -10,6 +10,7 @@ from gsmap.models.lines.targets import FormatLineTargets, Points, directed
 from gsmap.structures.bezier import MAX_DEGREE, curve_points, fit_pieces, mean_deviation
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import is_closed
+from gsmap.utils.errors import InputError
 
 
 @TRANSFORMS.register_module()
@@ -62,9 +63,9 @@ class FormatBezierTargets(FormatLineTargets):
 def check_curves(degrees: Sequence[int], pieces: Sequence[int]) -> None:
     """Raise ValueError if these are not degrees and numbers of pieces of classes."""
     if len(degrees) != len(pieces) or not all(1 <= d <= MAX_DEGREE for d in degrees):
-        raise ValueError(
+        raise InputError(
             f"degrees must be 1 to {MAX_DEGREE} for each class of pieces, got {list(degrees)} for "
             f"{list(pieces)}."
         )
     if min(pieces, default=0) < 1:
-        raise ValueError(f"pieces must be >= 1 for each class, got {list(pieces)}.")
+        raise InputError(f"pieces must be >= 1 for each class, got {list(pieces)}.")

@@ -14,6 +14,7 @@ from gsmap.models.encoders.camera_encoder import CameraEncoder
 from gsmap.models.encoders.projection import PillarProjection, pillar_points, project_pillars
 from gsmap.structures.calibration import NUM_CAN_BUS
 from gsmap.structures.grid import BEVGrid
+from gsmap.utils.errors import InputError
 
 
 class BEVSelfAttention(BEVDeformableAttention):
@@ -227,7 +228,7 @@ class BEVQueryEncoder(CameraEncoder):
         """
         first = feats if isinstance(feats, Tensor) else feats[0]
         if first.shape[1] != len(self.cams_embeds):
-            raise ValueError(
+            raise InputError(
                 f"the encoder is built for {len(self.cams_embeds)} cameras, got {first.shape[1]}."
             )
         codes = (self.cams_embeds + self.level_embeds[:, None])[..., None, None].to(first.dtype)

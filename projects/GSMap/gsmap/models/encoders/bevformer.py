@@ -10,6 +10,7 @@ from torch import Tensor
 from gsmap.models.base.attention import SamplingAttention, sample_map
 from gsmap.models.encoders.projection import PillarProjection
 from gsmap.structures.tensors import constant
+from gsmap.utils.errors import InputError
 
 
 @MODELS.register_module()
@@ -41,7 +42,7 @@ class SpatialCrossAttention(SamplingAttention):
         num_levels: int = 1,
     ) -> None:
         if num_points % num_heights:
-            raise ValueError(
+            raise InputError(
                 f"num_points must be a multiple of num_heights, got {num_points} and {num_heights}."
             )
         super().__init__(embed_dims, num_heads, num_points, dropout=0.0, num_parts=num_levels)

@@ -9,6 +9,7 @@ from gsmap.models.encoders.projection import PillarProjection
 from gsmap.ops.deformable_sampling import sum_rows
 from gsmap.ops.kernel_sampling import has_kernel, sample_kernels
 from gsmap.ops.kernel_sampling.reference import kernel_pixels
+from gsmap.utils.errors import InputError
 
 
 def kernel_offsets(kernel_size: tuple[int, int]) -> Tensor:
@@ -64,9 +65,9 @@ class GeometryKernelAttention(nn.Module):
     ) -> None:
         super().__init__()
         if not bilinear and any(size % 2 == 0 for size in kernel_size):
-            raise ValueError(f"kernel_size must be odd, got {tuple(kernel_size)}.")
+            raise InputError(f"kernel_size must be odd, got {tuple(kernel_size)}.")
         if embed_dims % num_heads:
-            raise ValueError(
+            raise InputError(
                 f"embed_dims must be divisible by num_heads, got {embed_dims} and {num_heads}."
             )
         self.num_heads = self.num_heights = num_heads

@@ -5,6 +5,7 @@ from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
 from gsmap.structures.tensors import uploaded
+from gsmap.utils.errors import InputError
 
 
 @MODELS.register_module()
@@ -22,7 +23,7 @@ class GridMask(nn.Module):
     def __init__(self, prob: float = 0.7, ratio: float = 0.5) -> None:
         super().__init__()
         if not 0 <= prob <= 1 or not 0 < ratio < 1:
-            raise ValueError(f"prob must be in [0, 1] and ratio in (0, 1), got {prob} and {ratio}.")
+            raise InputError(f"prob must be in [0, 1] and ratio in (0, 1), got {prob} and {ratio}.")
         self.prob = prob
         self.ratio = ratio
 

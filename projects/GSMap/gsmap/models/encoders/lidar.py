@@ -13,6 +13,7 @@ from mmengine.model import BaseModule
 from torch import Tensor
 
 from gsmap.structures.grid import BEVGrid
+from gsmap.utils.errors import WorkError
 
 
 @MODELS.register_module()
@@ -67,12 +68,12 @@ class LidarEncoder(BaseModule):
         coors = voxels["coors"]
         if isinstance(self.middle_encoder, SparseEncoder) and not coors.is_cuda:
             if self.training and torch.is_grad_enabled():
-                raise RuntimeError(
+                raise WorkError(
                     "the sparse LiDAR encoder trains on a GPU only (spconv's backward pass needs "
                     "CUDA): on a CPU use a PointPillars config."
                 )
             if not IS_SPCONV2_AVAILABLE:
-                raise RuntimeError(
+                raise WorkError(
                     "the sparse LiDAR encoder needs a GPU or the package spconv (2.x); without "
                     "them use a PointPillars config."
                 )

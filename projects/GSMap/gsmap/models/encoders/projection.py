@@ -7,6 +7,7 @@ from torch import Tensor
 
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import constant
+from gsmap.utils.errors import InputError
 
 _MIN_DEPTH_M = 1e-5
 
@@ -128,7 +129,7 @@ def frustum_points(
         ValueError: If ``frame_from_img`` does not contain 4 x 4 matrices.
     """
     if frame_from_img.shape[-2:] != (4, 4):
-        raise ValueError(
+        raise InputError(
             f"frame_from_img must hold 4 x 4 matrices, got shape {tuple(frame_from_img.shape)}."
         )
     rays = pixel_rays(frame_from_img, image_size, feature_size)

@@ -11,6 +11,8 @@ from mmdet3d.registry import MODELS
 from mmengine.model import BaseModule
 from torch import Tensor, nn
 
+from gsmap.utils.errors import InputError
+
 STEM_CHANNELS = (64, 64, 128)
 STAGE_CHANNELS = ((128, 256), (160, 512), (192, 768), (224, 1024))  # hidden, output
 LAYERS_AND_BLOCKS = {  # layers per block, blocks of the four stages
@@ -105,9 +107,9 @@ class VoVNet(BaseModule):
     ) -> None:
         super().__init__(init_cfg)
         if depth not in LAYERS_AND_BLOCKS:
-            raise ValueError(f"depth must be one of {[*LAYERS_AND_BLOCKS]}, got {depth}.")
+            raise InputError(f"depth must be one of {[*LAYERS_AND_BLOCKS]}, got {depth}.")
         if not set(out_indices) <= {0, 1, 2, 3} or not -1 <= frozen_stages <= 4:
-            raise ValueError(
+            raise InputError(
                 "out_indices must lie in 0 to 3 and frozen_stages in -1 to 4, got "
                 f"{tuple(out_indices)} and {frozen_stages}."
             )

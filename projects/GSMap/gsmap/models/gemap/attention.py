@@ -5,6 +5,7 @@ from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
 from gsmap.models.base.layers import mlp
+from gsmap.utils.errors import InputError
 
 
 class _AttentionBlock(nn.Module):
@@ -71,7 +72,7 @@ class GeometryDecoupledAttention(nn.Module):
         """
         batch, count = query.shape[:2]
         if count % self.num_points or count < 2 * self.num_points:
-            raise ValueError(
+            raise InputError(
                 f"need two or more instances of num_points {self.num_points} queries each, "
                 f"got {count} queries."
             )

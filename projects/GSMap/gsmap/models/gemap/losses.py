@@ -14,6 +14,7 @@ from torch import Tensor
 from gsmap.models.base.losses import MapLoss
 from gsmap.models.base.pairs import MatchedPairs
 from gsmap.structures.tensors import check_same_shape, uploaded
+from gsmap.utils.errors import InputError
 
 NORM_EPS = 1e-6  # added to the product of two lengths: an edge may be a single point
 
@@ -91,7 +92,7 @@ def euclidean_relation_loss(pred: Tensor, target: Tensor, counts: Sequence[int])
     """
     check_same_shape(pred=pred, target=target)
     if sum(counts) != pred.shape[-3]:
-        raise ValueError(f"counts must add up to {pred.shape[-3]} matches, got {list(counts)}.")
+        raise InputError(f"counts must add up to {pred.shape[-3]} matches, got {list(counts)}.")
     pairs = [torch.zeros(2, 0, dtype=torch.long)]
     shares: list[float] = []
     first = 0

@@ -5,6 +5,7 @@ from typing import Any
 from torch import Tensor
 
 from gsmap.models.base.coder import MapCoder, Tensors
+from gsmap.utils.errors import InputError
 
 
 class GaussianCoder(MapCoder):
@@ -22,7 +23,7 @@ class GaussianCoder(MapCoder):
     def __init__(self, *args: Any, sigma_power: float = 0.0, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         if not sigma_power >= 0:
-            raise ValueError(f"sigma_power must be >= 0, got {sigma_power}.")
+            raise InputError(f"sigma_power must be >= 0, got {sigma_power}.")
         self.sigma_power = sigma_power
 
     def weighed(self, scores: Tensor, fields: Tensors) -> Tensor:

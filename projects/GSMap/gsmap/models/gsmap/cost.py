@@ -10,6 +10,7 @@ from gsmap.models.base.pairs import BuiltHead, SampleView
 from gsmap.models.base.parts import WEIGHT, weights_of
 from gsmap.models.gsmap.reference import require_gaussians
 from gsmap.ops.soft_iou import pairwise_dice_loss, pairwise_soft_iou
+from gsmap.utils.errors import InputError
 
 
 @TASK_UTILS.register_module()
@@ -27,7 +28,7 @@ class IoUCost(MapCost):
     def __init__(self, weight: WEIGHT = 1.0, kind: str = "iou") -> None:
         super().__init__(weight)
         if kind not in ("iou", "dice"):
-            raise ValueError(f"kind must be 'iou' or 'dice', got {kind!r}.")
+            raise InputError(f"kind must be 'iou' or 'dice', got {kind!r}.")
         self.kind = kind
 
     def check(self, head: BuiltHead) -> None:

@@ -8,6 +8,7 @@ from gsmap.checkpoints.strict import AddsWeights
 from gsmap.models.base.decoder import Guidance
 from gsmap.models.base.layers import mlp
 from gsmap.structures.gaussians import GaussianSpace
+from gsmap.utils.errors import InputError
 
 
 @MODELS.register_module()
@@ -43,7 +44,7 @@ class GaussianGuidance(Guidance, AddsWeights):
     ) -> None:
         super().__init__()
         if space is None:
-            raise ValueError("a guided decoder layer needs a reference that holds Gaussians.")
+            raise InputError("a guided decoder layer needs a reference that holds Gaussians.")
         self.space, self.sampling, self.invariant = space, sampling, invariant
         self.embedding = mlp(6, hidden_dims, embed_dims) if embedding else None
         self.init_weights()

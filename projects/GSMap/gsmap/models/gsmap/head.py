@@ -21,6 +21,7 @@ from gsmap.models.maptr.losses import PointsLoss
 from gsmap.structures.gaussians import Gaussians, stretched
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import constant
+from gsmap.utils.errors import InputError
 
 
 @MODELS.register_module()
@@ -88,7 +89,7 @@ class GSMapHead(MapHead):
         if temperatures is not None:
             fits = [len(pair) == 2 and min(pair) > 0 for pair in temperatures]
             if fits != [True] * len(self.classes):
-                raise ValueError(
+                raise InputError(
                     f"temperatures must be two numbers > 0 for each of the {len(self.classes)} "
                     f"classes, got {temperatures}."
                 )

@@ -12,6 +12,7 @@ from gsmap.models.base.parts import WEIGHT, check_weight, weights_of
 from gsmap.models.gsmap.reference import require_gaussians
 from gsmap.ops.raster_loss import NORMALIZATIONS, raster_loss
 from gsmap.ops.soft_iou import dice_loss, soft_iou
+from gsmap.utils.errors import InputError
 
 
 class MaskLoss(MapLoss):
@@ -84,15 +85,15 @@ class RasterLoss(MaskLoss):
     ) -> None:
         super().__init__(loss_weight, full_iou, **flags)
         if not 0 <= alpha <= 1:
-            raise ValueError(f"alpha must lie in [0, 1], got {alpha}.")
+            raise InputError(f"alpha must lie in [0, 1], got {alpha}.")
         if foreground_weight <= 0:
-            raise ValueError(f"foreground_weight must be > 0, got {foreground_weight}.")
+            raise InputError(f"foreground_weight must be > 0, got {foreground_weight}.")
         if normalize not in NORMALIZATIONS:
-            raise ValueError(f"normalize must be one of {NORMALIZATIONS}, got {normalize!r}.")
+            raise InputError(f"normalize must be one of {NORMALIZATIONS}, got {normalize!r}.")
         if window_size < 1 or window_size % 2 == 0:
-            raise ValueError(f"window_size must be odd and >= 1, got {window_size}.")
+            raise InputError(f"window_size must be odd and >= 1, got {window_size}.")
         if window_sigma <= 0:
-            raise ValueError(f"window_sigma must be > 0, got {window_sigma}.")
+            raise InputError(f"window_sigma must be > 0, got {window_sigma}.")
         self.settings: dict[str, Any] = {
             "alpha": alpha,
             "foreground_weight": foreground_weight,
@@ -129,7 +130,7 @@ class MaskOverlapLoss(MaskLoss):
     ) -> None:
         super().__init__(loss_weight, full_iou, **flags)
         if kind not in ("dice", "iou"):
-            raise ValueError(f"kind must be 'dice' or 'iou', got {kind!r}.")
+            raise InputError(f"kind must be 'dice' or 'iou', got {kind!r}.")
         self.kind = kind
 
     def per_instance(self, preds: Tensor, targets: Tensor) -> Tensor:

@@ -15,6 +15,7 @@ from gsmap.models.gsmap.reference import require_gaussians
 from gsmap.models.streams.query_memory import QueryMemory
 from gsmap.structures.gaussians import fused_gaussians, moved_gaussians
 from gsmap.structures.past import Past
+from gsmap.utils.errors import InputError
 
 COVARIANCES = ("points", "moved", "fused")
 
@@ -46,9 +47,9 @@ class GaussianMemory(QueryMemory):
     ) -> None:
         super().__init__(*args, **kwargs)
         if covariance not in COVARIANCES:
-            raise ValueError(f"covariance must be one of {COVARIANCES}, got {covariance!r}.")
+            raise InputError(f"covariance must be one of {COVARIANCES}, got {covariance!r}.")
         if not (noise_m >= 0 and noise_deg >= 0):
-            raise ValueError(f"noise_m and noise_deg must be >= 0, got {noise_m} and {noise_deg}.")
+            raise InputError(f"noise_m and noise_deg must be >= 0, got {noise_m} and {noise_deg}.")
         self.covariance = covariance
         self.noise_m, self.noise_rad = noise_m, math.radians(noise_deg)
 

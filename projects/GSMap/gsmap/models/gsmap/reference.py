@@ -16,6 +16,7 @@ from gsmap.models.maptr.references import PointReference
 from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.structures.gaussians import Gaussians, GaussianSpace
 from gsmap.structures.grid import BEVGrid
+from gsmap.utils.errors import InputError
 
 
 @MODELS.register_module()
@@ -108,7 +109,7 @@ def require_gaussians(part: Any, head: BuiltHead) -> GaussianReference:
     """Return a head's Gaussians; ValueError if a part of a model needs them and gets points."""
     if isinstance(head.reference, GaussianReference):
         return head.reference
-    raise ValueError(
+    raise InputError(
         f"{type(part).__name__} needs Gaussians, got {type(head.reference).__name__}: set "
         "reference=dict(type='GaussianReference'), or take GSMapHead."
     )

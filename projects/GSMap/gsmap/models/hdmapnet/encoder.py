@@ -14,6 +14,7 @@ from gsmap.models.encoders.camera_encoder import CameraEncoder
 from gsmap.models.hdmapnet.layout import ahead_size
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import constant
+from gsmap.utils.errors import InputError
 
 
 def conv_block(inputs: int, outputs: int) -> list[nn.Module]:
@@ -95,7 +96,7 @@ class ViewTransformEncoder(CameraEncoder):
         across, ahead = ahead_size(self.grid)
         self.view_size = 2 * across // 5, 2 * ahead // 5
         if min(*self.feature_size, *self.view_size) < 1:
-            raise ValueError(
+            raise InputError(
                 f"image_size {tuple(image_size)} by stride {stride} makes {self.feature_size} "
                 f"feature pixels, and the map a camera's map of {self.view_size} cells: neither "
                 "may be empty."
@@ -122,7 +123,7 @@ class ViewTransformEncoder(CameraEncoder):
         """
         found = feats.shape[1], *feats.shape[-2:]
         if found != (len(self.views), *self.feature_size):
-            raise ValueError(
+            raise InputError(
                 f"the encoder is built for {len(self.views)} cameras of {self.feature_size} "
                 f"feature pixels, got {found[0]} of {found[1:]}: set num_cams, image_size and "
                 "stride of ViewTransformEncoder to those of the images."

@@ -19,6 +19,7 @@ from gsmap.models.hdmapnet.losses import LineMapLosses
 from gsmap.models.hdmapnet.vectorizing import VectorizeConfig, vectorize
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import padded
+from gsmap.utils.errors import InputError
 
 TARGETS = ("gt_lines", "gt_directions")
 
@@ -65,14 +66,14 @@ class HDMapNetHead(DetectionHead):
     ) -> None:
         super().__init__(init_cfg)
         if num_directions < 1 or 360 % num_directions:
-            raise ValueError(f"num_directions must divide 360, got {num_directions}.")
+            raise InputError(f"num_directions must divide 360, got {num_directions}.")
         self.grid, self.classes = grid.rasterized(pixel_m), tuple(classes)
         self.map_size, self.random_start = ahead_size(self.grid), random_start
         self.losses = LineMapLosses(**(losses or {}))
         self.num_directions, degrees = num_directions, 360 // num_directions
         self.vectorizing = VectorizeConfig(**{"degrees": degrees, **(vectorizing or {})})
         if self.vectorizing.degrees != degrees:
-            raise ValueError(
+            raise InputError(
                 f"vectorizing.degrees is {self.vectorizing.degrees}, but {num_directions} "
                 f"directions are {degrees} degrees apart: leave it out, num_directions decides it."
             )
@@ -104,19 +105,19 @@ class HDMapNetHead(DetectionHead):
     def target(self, sample: Det3DDataSample, name: str) -> Tensor:
         """Return a sample's target; ValueError if there is none, or it is not of this head."""
         if name not in sample:
-            raise ValueError(
+            raise InputError(
                 f"sample {sample.metainfo.get('token')!r} has no {name}: put MakeLineMaps into the "
                 "training pipeline."
             )
         target = sample.get(name).long()
         wanted = {"gt_lines": len(self.classes), "gt_directions": 2}[name], *self.map_size
         if tuple(target.shape) != wanted:
-            raise ValueError(
+            raise InputError(
                 f"{name} is {tuple(target.shape)}, the head's maps are {wanted}: give MakeLineMaps "
                 "the head's pixel_m and number of classes, and the grid's forward."
             )
         if name == "gt_directions" and target.max() > self.num_directions:
-            raise ValueError(
+            raise InputError(
                 f"gt_directions has direction {int(target.max())} of {self.num_directions}: give "
                 "MakeLineMaps the head's num_directions."
             )

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from gsmap.models.hdmapnet.decoder import LineMaps
 from gsmap.structures.tensors import constant
+from gsmap.utils.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class LineMapLosses:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if value < 0:
-                raise ValueError(f"losses.{name} must not be negative.")
+                raise InputError(f"losses.{name} must not be negative.")
 
     def __call__(self, maps: LineMaps, numbers: Tensor, directions: Tensor) -> dict[str, Tensor]:
         """Return the weighted losses.

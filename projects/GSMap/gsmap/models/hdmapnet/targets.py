@@ -15,6 +15,7 @@ from gsmap.models.hdmapnet.layout import ahead_size, pixels_from_metres
 from gsmap.structures.elements import annotated
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import parts_inside, sampled
+from gsmap.utils.errors import InputError
 from gsmap.utils.settings import check_positive
 
 Pixels = NDArray[np.int32]
@@ -54,7 +55,7 @@ class MakeLineMaps(BaseTransform):
         check_positive(num_classes=self.num_classes, pixel_m=self.pixel_m, step_m=self.step_m)
         check_positive(thickness_px=self.thickness_px, gap_px=self.gap_px)
         if self.num_directions < 1 or 360 % self.num_directions:
-            raise ValueError(f"num_directions must divide 360, got {self.num_directions}.")
+            raise InputError(f"num_directions must divide 360, got {self.num_directions}.")
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Add the targets; ValueError without ground truth or for an unknown class."""
@@ -94,7 +95,7 @@ class MakeLineMaps(BaseTransform):
         """Yield class and pixels (column, row) of each part of an element on the map, by class."""
         for element in sorted(instances, key=lambda element: element.label):
             if not 0 <= element.label < self.num_classes:
-                raise ValueError(
+                raise InputError(
                     f"label {element.label} of an element, but num_classes={self.num_classes} in "
                     "MakeLineMaps."
                 )

@@ -17,6 +17,7 @@ from torch import Tensor, from_numpy
 import gsmap.utils.compilation  # noqa: F401 - says that kernels are compiled
 from gsmap.models.hdmapnet.clustering import dense_clusters
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
+from gsmap.utils.errors import InputError
 from gsmap.utils.settings import check_positive
 
 Float32 = np.float32
@@ -50,7 +51,7 @@ class VectorizeConfig:
             **{name: value for name, value in vars(self).items() if name != "min_area_px"}
         )
         if not self.min_area_px >= 0:
-            raise ValueError(f"min_area_px must not be negative, got {self.min_area_px}.")
+            raise InputError(f"min_area_px must not be negative, got {self.min_area_px}.")
 
 
 class TracedLine(NamedTuple):
@@ -130,11 +131,11 @@ def _check(semantic: Tensor, embedding: Tensor, direction: Tensor, config: Vecto
     """Check the shapes of the maps."""
     shapes = [tuple(values.shape) for values in (semantic, embedding, direction)]
     if any(len(shape) != 3 or shape[1:] != shapes[0][1:] for shape in shapes):
-        raise ValueError(f"the maps must be (channels, H, W) of one size, got {shapes}.")
+        raise InputError(f"the maps must be (channels, H, W) of one size, got {shapes}.")
     if len(semantic) < 2:
-        raise ValueError("semantic needs the background and at least one class.")
+        raise InputError("semantic needs the background and at least one class.")
     if (len(direction) - 1) * config.degrees != 360:
-        raise ValueError(
+        raise InputError(
             f"{len(direction)} channels of direction are none and {len(direction) - 1} directions, "
             f"which make no circle in steps of {config.degrees} degrees."
         )
@@ -143,7 +144,7 @@ def _check(semantic: Tensor, embedding: Tensor, direction: Tensor, config: Vecto
         name for name, values in named.items() if not torch.stack(values.aminmax()).isfinite().all()
     ]
     if broken:
-        raise ValueError(f"{' and '.join(broken)} have values that are not finite.")
+        raise InputError(f"{' and '.join(broken)} have values that are not finite.")
 
 
 def top_directions(direction: Tensor) -> IntArray:

@@ -17,6 +17,7 @@ from gsmap.models.lines.front import front_size, turned
 from gsmap.models.lines.losses import LINE, Case, LineLosses
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import tensor_versions
+from gsmap.utils.errors import InputError
 
 # of the losses of decoder layers; of fewer, the last ones
 LAYER_WEIGHTS = (0.4, 0.4, 0.4, 0.8, 1.2, 1.6)
@@ -87,7 +88,7 @@ class LineHead(DetectionHead):
         self.decoder = MODELS.build(settings | decoder)
         num_layers = len(self.decoder.layers)
         if not 0 < num_layers <= len(LAYER_WEIGHTS):
-            raise ValueError(
+            raise InputError(
                 f"decoder.num_layers must be 1 to {len(LAYER_WEIGHTS)}, which have weights in the "
                 f"losses, got {num_layers}."
             )
@@ -150,13 +151,13 @@ class LineHead(DetectionHead):
         """Return a sample's annotated lines; ValueError if they are not of this head."""
         instances, transform = sample.get("gt_instances_3d", InstanceData()), self.transforms[0]
         if "num_pts" not in instances or "masks" not in instances:
-            raise ValueError(
+            raise InputError(
                 f"sample {sample.metainfo.get('token')!r} has no {self.targets}: put {transform} "
                 "in place of FormatMapTargets into the training pipeline."
             )
         found = tuple(instances.masks.shape[1:])
         if found != self.mask_size:
-            raise ValueError(
+            raise InputError(
                 f"masks of {transform} are {found}, the head's {self.mask_size}: set pixel_m there "
                 "to the head's mask_pixel_m."
             )
@@ -179,7 +180,7 @@ class LineHead(DetectionHead):
         ValueError if there are more levels than weights.
         """
         if len(levels) > len(self.level_weights):
-            raise ValueError(
+            raise InputError(
                 f"the BEV encoder returns {len(levels)} levels, but {type(self).__name__} has "
                 f"weights for the class masks of {len(self.level_weights)}: give the encoder fewer "
                 "layers."

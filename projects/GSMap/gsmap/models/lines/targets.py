@@ -15,6 +15,7 @@ from gsmap.models.lines.front import front_size
 from gsmap.structures.elements import annotated
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import is_closed, padded, parts_inside, sampled
+from gsmap.utils.errors import InputError
 from gsmap.utils.settings import check_positive
 
 Points = NDArray[np.float64]
@@ -83,7 +84,7 @@ class FormatLineTargets(BaseTransform):
         check_positive(pixel_m=self.pixel_m, thickness_px=self.thickness_px, step_m=self.step_m)
         name, numbers = self.by_class()
         if not set(self.edge_classes) <= set(range(len(numbers))):
-            raise ValueError(
+            raise InputError(
                 f"edge_classes must be indices of the {len(numbers)} classes of {name}, got "
                 f"{self.edge_classes}."
             )
@@ -130,7 +131,7 @@ class FormatLineTargets(BaseTransform):
         """Return the parts of an element on the map, [0, 1] from the front and the left."""
         name, numbers = self.by_class()
         if not 0 <= element.label < len(numbers):
-            raise ValueError(
+            raise InputError(
                 f"label {element.label} of an element, but {name} of "
                 f"{type(self).__name__} is {numbers}: give one for each class."
             )

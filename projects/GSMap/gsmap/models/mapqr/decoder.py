@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from gsmap.models.base.attention import BEVDeformableAttention
 from gsmap.models.base.decoder import Decoded, MapDecoder, MapDecoderLayer
 from gsmap.models.base.layers import mlp
+from gsmap.utils.errors import InputError
 
 
 def sine_code(points: Tensor, channels: int) -> Tensor:
@@ -125,7 +126,7 @@ class MapQRDecoderLayer(MapDecoderLayer):
         **kwargs: Any,
     ) -> None:
         if embed_dims % 4:
-            raise ValueError(f"embed_dims must be divisible by 4, got {embed_dims}.")
+            raise InputError(f"embed_dims must be divisible by 4, got {embed_dims}.")
         scattered = {"type": "ScatterGatherAttention", "points_per_instance": num_points}
         super().__init__(
             embed_dims,

@@ -12,6 +12,7 @@ from gsmap.models.encoders.bev_query_encoder import BEVQueryEncoder
 from gsmap.models.encoders.gkt import GeometryKernelAttention
 from gsmap.models.encoders.projection import PillarProjection, pillar_points, visible_points
 from gsmap.structures.tensors import at_least_float32
+from gsmap.utils.errors import InputTypeError
 
 
 class MovingPillars:
@@ -132,7 +133,7 @@ class HeightQueryEncoder(BEVQueryEncoder):
         super().__init__({"type": HeightKernelAttention, **(cross_attn or {})}, **kwargs)
         kind = type(next(iter(self.layers)).cross_attn)
         if not issubclass(kind, HeightKernelAttention):
-            raise TypeError(
+            raise InputTypeError(
                 f"HeightQueryEncoder needs HeightKernelAttention, got {kind.__name__}: set "
                 "bev_encoder.cross_attn.type, or take BEVQueryEncoder."
             )

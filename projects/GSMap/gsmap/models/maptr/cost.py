@@ -9,6 +9,7 @@ from torch import Tensor
 from gsmap.models.base.matching import PointsCost
 from gsmap.models.base.pairs import SampleView
 from gsmap.models.base.parts import WEIGHT, weights_of
+from gsmap.utils.errors import InputError
 
 
 def order_distances(pts: Tensor, pts_shifts: Tensor) -> Tensor:
@@ -25,7 +26,7 @@ def order_distances(pts: Tensor, pts_shifts: Tensor) -> Tensor:
         ValueError: If the numbers of points differ.
     """
     if pts.shape[-2:] != pts_shifts.shape[-2:]:
-        raise ValueError(
+        raise InputError(
             f"predictions of {tuple(pts.shape[-2:])} points and ground truth of "
             f"{tuple(pts_shifts.shape[-2:])} do not fit: set the same number of points in the head "
             "and in the pipeline."

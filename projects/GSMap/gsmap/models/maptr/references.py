@@ -11,6 +11,7 @@ from gsmap.models.base.layers import init_matrices, mlp
 from gsmap.models.base.references import RefinedReference
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32, check_same_shape, in_float32
+from gsmap.utils.errors import InputError, InputTypeError
 
 _EPS = 1e-5  # points closer to the border are moved to this distance before the logit
 
@@ -70,11 +71,11 @@ class PointReference(nn.Module, RefinedReference):
     ) -> None:
         super().__init__()
         if coords not in (2, 3) or (coords == 3) != (z_range is not None):
-            raise ValueError(
+            raise InputError(
                 f"coords must be 2, or 3 with a z_range, got coords={coords}, z_range={z_range}."
             )
         if z_range is not None and not z_range[0] < z_range[1]:
-            raise ValueError(f"z_range must be (low, high) with low < high, got {z_range}.")
+            raise InputError(f"z_range must be (low, high) with low < high, got {z_range}.")
         self.grid = grid
         self.coords = coords
         self.z_range = None if z_range is None else (float(z_range[0]), float(z_range[1]))
@@ -151,7 +152,7 @@ class PointReference(nn.Module, RefinedReference):
             ValueError: If the points have no height but the reference has.
         """
         if points_m.shape[-1] < self.coords:
-            raise ValueError(
+            raise InputError(
                 f"the model's points have {self.coords} coordinates, the targets' "
                 f"{points_m.shape[-1]}: set dim={self.coords} in the data set."
             )
@@ -208,4 +209,6 @@ class PointReference(nn.Module, RefinedReference):
         Raises:
             TypeError: Always.
         """
-        raise TypeError(f"{type(self).__name__} has no masks: set reference to GaussianReference.")
+        raise InputTypeError(
+            f"{type(self).__name__} has no masks: set reference to GaussianReference."
+        )

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from gsmap.structures.tensors import num_depth_bins
+from gsmap.utils.errors import InputError
 
 
 def depth_bins(depth_m: Tensor, stride: int, depth_range: tuple[float, float, float]) -> Tensor:
@@ -25,7 +26,7 @@ def depth_bins(depth_m: Tensor, stride: int, depth_range: tuple[float, float, fl
     """
     height, width = depth_m.shape[-2:]
     if height % stride or width % stride:
-        raise ValueError(
+        raise InputError(
             f"depth_m must have a size divisible by stride {stride}, got {height} x {width}."
         )
     low, _, step = depth_range
@@ -50,7 +51,7 @@ def depth_loss(probs: Tensor, bins: Tensor) -> Tensor:
         ValueError: If the shapes disagree.
     """
     if probs.shape[:-3] + probs.shape[-2:] != bins.shape:
-        raise ValueError(
+        raise InputError(
             f"bins must have the shape of probs without its bin axis, got {tuple(bins.shape)} "
             f"for {tuple(probs.shape)}."
         )

@@ -14,6 +14,7 @@ from gsmap.models.mapvr.cost import RenderedDiceCost
 from gsmap.models.mapvr.losses import RenderedDiceLoss, SelfDirectionLoss
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.grid import BEVGrid
+from gsmap.utils.errors import InputError
 
 
 @MODELS.register_module()
@@ -67,7 +68,7 @@ class MapVRHead(MapHead):
     ) -> None:
         unknown = sorted(set(polygons or ()) - set(classes))
         if unknown:
-            raise ValueError(f"polygons must be classes of {list(classes)}, got {unknown}.")
+            raise InputError(f"polygons must be classes of {list(classes)}, got {unknown}.")
         areas = AREA_CLASSES if polygons is None else polygons
         indices = tuple(index for index, name in enumerate(classes) if name in areas)
         sizes = {"pixel_m": 60 / 256, "cost_pixel_m": 60 / 128}

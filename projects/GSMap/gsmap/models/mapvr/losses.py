@@ -14,6 +14,7 @@ from gsmap.models.maptr.losses import turns
 from gsmap.ops.polyline_raster import DISTANCES, soft_rasters
 from gsmap.ops.soft_iou import dice_loss
 from gsmap.structures.tensors import constant
+from gsmap.utils.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -40,13 +41,13 @@ class ElementRenderer:
 
     def __post_init__(self) -> None:
         if len(self.size) != 2 or min(self.size) < 1:
-            raise ValueError(f"size must be rows and columns, both >= 1, got {self.size}.")
+            raise InputError(f"size must be rows and columns, both >= 1, got {self.size}.")
         if any(label < 0 for label in self.polygon_classes):
-            raise ValueError(f"polygon_classes must be >= 0, got {self.polygon_classes}.")
+            raise InputError(f"polygon_classes must be >= 0, got {self.polygon_classes}.")
         if self.distance not in DISTANCES:
-            raise ValueError(f"distance must be one of {DISTANCES}, got {self.distance!r}.")
+            raise InputError(f"distance must be one of {DISTANCES}, got {self.distance!r}.")
         if self.line_softness <= 0 or self.polygon_softness <= 0:
-            raise ValueError(
+            raise InputError(
                 f"softness must be > 0, got {self.line_softness} and {self.polygon_softness}."
             )
 

@@ -19,6 +19,7 @@ from gsmap.models.mgmap.refinement import (
     mask_network,
     patches_around,
 )
+from gsmap.utils.errors import InputError
 
 
 @dataclass(eq=False)
@@ -73,7 +74,7 @@ class MGMapDecoder(MapDecoder):
         layer = {**layer, "cross_attn": {**levels, **layer.get("cross_attn", {})}}
         super().__init__(layer, embed_dims=embed_dims, **kwargs)
         if not 0 <= refinements <= len(self.layers):
-            raise ValueError(
+            raise InputError(
                 f"refinements use the branches of layers, each one, got {refinements} and "
                 f"{len(self.layers)} layers."
             )

@@ -12,6 +12,7 @@ from gsmap.models.base.losses import MapLoss
 from gsmap.models.base.pairs import BuiltHead, MatchedPairs
 from gsmap.models.mgmap.decoder import MaskedDecoded, MGMapDecoder, RefinedDecoded
 from gsmap.structures.tensors import check_same_shape, constant
+from gsmap.utils.errors import InputError
 
 
 @MODELS.register_module()
@@ -38,7 +39,7 @@ class QueryMaskLoss(MapLoss):
         """Raise ValueError if there are other queries than masks, or none of both."""
         queries, masks = len(head.instance_embedding.weight), decoder_of(self, head).num_masks
         if queries != masks:
-            raise ValueError(f"decoder.num_masks is {masks}, and there are {queries} queries.")
+            raise InputError(f"decoder.num_masks is {masks}, and there are {queries} queries.")
 
     def reads(self, pairs: MatchedPairs) -> bool:
         """Return whether it is a decoder layer: the refinement has no masks of its own."""
@@ -80,7 +81,7 @@ class ForegroundLoss(MapLoss):
     def check(self, head: BuiltHead) -> None:
         """Raise ValueError if there is no segmentation."""
         if not len(decoder_of(self, head).refinements):
-            raise ValueError("ForegroundLoss needs a refinement: set decoder.refinements.")
+            raise InputError("ForegroundLoss needs a refinement: set decoder.refinements.")
 
     def forward(self, pairs: MatchedPairs) -> Tensor:
         """Return the weighted loss."""
@@ -98,7 +99,7 @@ class ForegroundLoss(MapLoss):
 def decoder_of(loss: MapLoss, head: BuiltHead) -> MGMapDecoder:
     """Return the head's decoder; ValueError if it has no masks for the loss."""
     if not isinstance(head.decoder, MGMapDecoder):
-        raise ValueError(
+        raise InputError(
             f"{type(loss).__name__} needs the masks of MGMapDecoder, got "
             f"{type(head.decoder).__name__}: leave the loss out, or set decoder.type."
         )

@@ -12,6 +12,7 @@ from gsmap.models.base.attention import SamplingAttention, place_samples
 from gsmap.models.base.layers import feed_forward, mlp
 from gsmap.ops.deformable_sampling import deformable_sample
 from gsmap.structures.tensors import at_least_float32
+from gsmap.utils.errors import InputError
 
 
 class Granularities(NamedTuple):
@@ -82,7 +83,7 @@ class PerPointSampling(SamplingAttention):
         """Place and weigh the samples of instance queries (B, N, C) with their position added."""
         levels, points, _ = self.layout
         if len(feats) != levels or reference.shape[2] != points:
-            raise ValueError(
+            raise InputError(
                 f"expected {levels} levels of BEV features and {points} points per instance, got "
                 f"{len(feats)} and {reference.shape[2]}."
             )

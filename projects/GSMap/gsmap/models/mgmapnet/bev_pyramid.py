@@ -2,6 +2,8 @@
 
 from torch import Tensor, nn
 
+from gsmap.utils.errors import InputError
+
 
 class PatchMerging(nn.Module):
     """Halve a map: the C channels of 2 x 2 cells are joined, normalised and mixed (MGMapNet)."""
@@ -15,7 +17,7 @@ class PatchMerging(nn.Module):
         """Halve a map; ValueError if a side is odd. (B, C, H, W) -> (B, C, H / 2, W / 2)"""
         height, width = feats.shape[-2:]
         if height % 2 or width % 2:
-            raise ValueError(f"a BEV level needs even sides to be halved, got {height} x {width}.")
+            raise InputError(f"a BEV level needs even sides to be halved, got {height} x {width}.")
         patches = feats.unflatten(3, (-1, 2)).unflatten(2, (-1, 2))  # (B, C, h, 2, w, 2)
         # the order of a checkpoint's channels: both rows of the even column, then of the odd one
         # (mmdet's PatchMerging has another)
@@ -29,7 +31,7 @@ class BEVPyramid(nn.Module):
     def __init__(self, embed_dims: int = 256, num_levels: int = 2) -> None:
         super().__init__()
         if num_levels < 1:
-            raise ValueError(f"num_levels must be >= 1, got {num_levels}.")
+            raise InputError(f"num_levels must be >= 1, got {num_levels}.")
         self.merges = nn.ModuleList(PatchMerging(embed_dims) for _ in range(num_levels - 1))
 
     def forward(self, bev_feats: Tensor) -> list[Tensor]:

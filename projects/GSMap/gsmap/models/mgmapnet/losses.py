@@ -13,6 +13,7 @@ from gsmap.models.base.pairs import BuiltHead, MatchedPairs
 from gsmap.models.mgmapnet.decoder import MGMapNetDecoded, MGMapNetDecoder
 from gsmap.ops.soft_iou import dice_loss
 from gsmap.structures.tensors import check_same_shape
+from gsmap.utils.errors import InputError
 
 PAIRINGS = ("matched", "released")
 
@@ -63,7 +64,7 @@ class InstanceMaskLoss(MapLoss):
     ) -> None:
         super().__init__(loss_weight, last_layer_only, first_group_only)
         if pairing not in PAIRINGS:
-            raise ValueError(f"pairing must be one of {PAIRINGS}, got {pairing!r}.")
+            raise InputError(f"pairing must be one of {PAIRINGS}, got {pairing!r}.")
         self.embedding = mlp(embed_dims, embed_dims, embed_dims, embed_dims)
         self.dice_weight, self.pairing = dice_weight, pairing
 
@@ -104,7 +105,7 @@ class SamplingLocationLoss(MapLoss):
     def check(self, head: BuiltHead) -> None:
         """Raise ValueError if the decoder does not say where it samples."""
         if not isinstance(head.decoder, MGMapNetDecoder):
-            raise ValueError(
+            raise InputError(
                 "SamplingLocationLoss needs the sampling locations of MGMapNetDecoder, got "
                 f"{type(head.decoder).__name__}: leave the loss out, or take MGMapHead."
             )

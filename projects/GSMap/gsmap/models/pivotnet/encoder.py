@@ -14,6 +14,7 @@ from gsmap.models.encoders.camera_encoder import CameraEncoder
 from gsmap.models.encoders.projection import project_pillars
 from gsmap.models.lines.front import centres, front_size, turned
 from gsmap.structures.grid import BEVGrid
+from gsmap.utils.errors import InputError
 
 Shapes = Sequence[tuple[int, int]]
 
@@ -82,7 +83,7 @@ class PivotBEVEncoder(CameraEncoder):
     ) -> None:
         super().__init__(init_cfg)
         if camera_by not in ("depth", "angle"):
-            raise ValueError(f"camera_by must be 'depth' or 'angle', got {camera_by!r}.")
+            raise InputError(f"camera_by must be 'depth' or 'angle', got {camera_by!r}.")
         self.grid, self.camera_by = grid.rasterized(bev_pixel_m), camera_by
         self.shapes = [(image_size[0] // s, num_cams * (image_size[1] // s)) for s in strides]
         self.input_proj = nn.ModuleList(
@@ -134,7 +135,7 @@ class PivotBEVEncoder(CameraEncoder):
         joined = [f.permute(0, 2, 3, 1, 4).flatten(3) for f in feats]
         found = [tuple(f.shape[-2:]) for f in joined]
         if found != self.shapes:
-            raise ValueError(
+            raise InputError(
                 f"the cameras side by side must have {self.shapes} feature pixels, not {found}; "
                 "set image_size, strides and num_cams of PivotBEVEncoder to those of the images."
             )

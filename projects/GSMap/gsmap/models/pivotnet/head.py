@@ -18,6 +18,7 @@ from gsmap.models.lines.decoder import ClassLines
 from gsmap.models.lines.head import LineHead, LinePredictions, class_scores
 from gsmap.models.pivotnet.losses import PIVOT, Lines, PivotLosses, TrueLines
 from gsmap.structures.grid import BEVGrid
+from gsmap.utils.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ class PivotHead(LineHead):
         **kwargs: Any,
     ) -> None:
         if len(queries) != len(classes) or any(n < 1 or p < 2 for n, p in queries):
-            raise ValueError(
+            raise InputError(
                 "queries must be lines (>= 1) and their points (>= 2) for each of "
                 f"{list(classes)}, got {list(queries)}."
             )
@@ -125,7 +126,7 @@ class PivotHead(LineHead):
         for label, (_, most) in enumerate(self.decoder.queries):
             own = labels == label
             if (numbers[own] > most).any():
-                raise ValueError(
+                raise InputError(
                     f"a line of class {label} has {int(numbers[own].max())} pivots, but the head "
                     f"has {most} points: set num_points of FormatPivotTargets to those of its "
                     "queries."

@@ -3,6 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from gsmap.utils.errors import InputError
+
 Floats = NDArray[np.floating]
 
 
@@ -41,7 +43,7 @@ def match_pivots(costs: Floats) -> NDArray[np.int64]:
     """
     num_pivots, num_points = costs.shape
     if num_pivots > num_points:
-        raise ValueError(f"{num_pivots} pivots cannot be matched with {num_points} points.")
+        raise InputError(f"{num_pivots} pivots cannot be matched with {num_points} points.")
     table, path = path_costs(costs), np.full(num_pivots, num_points - 1)
     for row in range(num_pivots - 1, 0, -1):
         path[row - 1] = table[row - 1, : path[row]].argmin()

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from gsmap.models.lines.front import front_size
 from gsmap.models.lines.targets import FormatLineTargets, Points, directed
 from gsmap.structures.grid import BEVGrid
+from gsmap.utils.errors import InputError
 
 
 def significances(points: Points) -> NDArray[np.float64]:
@@ -61,7 +62,7 @@ class FormatPivotTargets(FormatLineTargets):
 
     def __post_init__(self) -> None:
         if min(self.num_points, default=0) < 2:
-            raise ValueError(f"num_points must be >= 2 for each class, got {self.num_points}.")
+            raise InputError(f"num_points must be >= 2 for each class, got {self.num_points}.")
         super().__post_init__()
 
     def by_class(self) -> tuple[str, Sequence[int]]:

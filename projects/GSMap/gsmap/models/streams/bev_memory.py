@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from gsmap.checkpoints.strict import AddsWeights
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.past import Past
+from gsmap.utils.errors import InputError
 
 
 @MODELS.register_module()
@@ -47,12 +48,12 @@ class BEVMemory(nn.Module, AddsWeights):
     ) -> None:
         super().__init__()
         if kept_dims is not None and not 0 < kept_dims <= embed_dims:
-            raise ValueError(
+            raise InputError(
                 f"temporal.bev.kept_dims must be 1 to {embed_dims}, the channels of the map's "
                 f"features, got {kept_dims}."
             )
         if present_share is not None and not 0 < present_share < 1:
-            raise ValueError(
+            raise InputError(
                 f"temporal.bev.present_share must lie between 0 and 1, got {present_share}."
             )
         self.grid, self.embed_dims = grid, embed_dims
@@ -103,7 +104,7 @@ class BEVMemory(nn.Module, AddsWeights):
         ValueError if they have other channels than the memory.
         """
         if feats.shape[1] != self.embed_dims:
-            raise ValueError(
+            raise InputError(
                 f"the map's features have {feats.shape[1]} channels, their memory "
                 f"{self.embed_dims}: set temporal.embed_dims={feats.shape[1]}."
             )

@@ -13,6 +13,7 @@ from gsmap.models.base.head import MapHead
 from gsmap.structures.gaussians import Gaussians, moved_gaussians
 from gsmap.structures.line_update import seen_again
 from gsmap.structures.past import Past
+from gsmap.utils.errors import InputError
 
 PREFIX = "element_"
 
@@ -46,12 +47,12 @@ class ElementMemory:
         noise_deg: float = 0.15,
     ) -> None:
         if not isinstance(head, MapHead) or "scales" not in head.reference.outputs:
-            raise ValueError(
+            raise InputError(
                 f"temporal.elements needs a head with Gaussians, got {type(head).__name__}: take "
                 "GSMapHead, or leave it out."
             )
         if not (gate_m > 0 and 0 <= min_score < 1 and noise_m >= 0 and noise_deg >= 0):
-            raise ValueError(
+            raise InputError(
                 "temporal.elements needs gate_m > 0, min_score in [0, 1), noise_m and noise_deg "
                 f">= 0, got {gate_m}, {min_score}, {noise_m} and {noise_deg}."
             )

@@ -20,6 +20,7 @@ from gsmap.models.streams.query_memory import Propagation, QueryMemory
 from gsmap.structures.past import Past
 from gsmap.structures.streams import Frame, MapStream, Scenes, Slots, StreamState
 from gsmap.structures.tensors import uploaded
+from gsmap.utils.errors import InputError
 
 # beginnings of names: half precision would move a point by centimetres
 _EXACT = ("references", "targets", PREFIX)
@@ -82,11 +83,11 @@ class StreamMemory(BaseModule):
     ) -> None:
         super().__init__()
         if bev is None and queries is None and elements is None:
-            raise ValueError(
+            raise InputError(
                 "temporal needs bev=dict(...), queries=dict(...), elements=dict(...) or several."
             )
         if not max_gap_s > 0:
-            raise ValueError(f"temporal.max_gap_s must be seconds > 0, got {max_gap_s}.")
+            raise InputError(f"temporal.max_gap_s must be seconds > 0, got {max_gap_s}.")
         self.max_gap_s, self.half = max_gap_s, half
         self.name = f"a model with {type(head).__name__}"
         self.bev: BEVMemory | None = None
@@ -96,7 +97,7 @@ class StreamMemory(BaseModule):
         self.queries: QueryMemory | None = None
         if queries is not None:
             if not isinstance(head, MapHead):
-                raise ValueError(
+                raise InputError(
                     f"{type(head).__name__} can have no memory of queries, which needs a MapHead: "
                     "set temporal.queries=None; temporal.bev works with every head."
                 )

@@ -14,6 +14,7 @@ from gsmap.models.base.decoder import Queries
 from gsmap.models.base.hooks import FlowHead, FlowHook
 from gsmap.models.base.pairs import GroundTruth, MatchedPairs, Predictions
 from gsmap.structures.past import Past
+from gsmap.utils.errors import InputError
 
 _POSE = 12  # the first three rows of a motion
 
@@ -57,13 +58,13 @@ class QueryMemory(BaseModule, AddsWeights):
     def check(self, head: FlowHead) -> None:
         """Raise ValueError if the head predicts with too few queries, or in one layer."""
         if len(head.decoder.layers) < 2:
-            raise ValueError(
+            raise InputError(
                 "a memory of queries enters after the first decoder layer, and the head has no "
                 "other: set map_head.decoder.num_layers to 2 or more."
             )
         own = head.query_groups[0].num
         if not 0 < self.num < own:
-            raise ValueError(
+            raise InputError(
                 f"a memory of {self.num} queries does not fit a head of {own}: set "
                 "temporal.queries.num to less than its queries."
             )

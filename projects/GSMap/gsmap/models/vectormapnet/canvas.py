@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from gsmap.structures.grid import Array, BEVGrid
+from gsmap.utils.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class Canvas:
 
     def __post_init__(self) -> None:
         if self.margin_m < 0:
-            raise ValueError(f"margin_m must be >= 0, got {self.margin_m}.")
+            raise InputError(f"margin_m must be >= 0, got {self.margin_m}.")
         self.grid.rasterized(self.pixel_m)
 
     @cached_property

@@ -22,6 +22,7 @@ from gsmap.models.base.references import Reference
 from gsmap.models.vectormapnet.canvas import Canvas
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import constant
+from gsmap.utils.errors import InputError
 
 _CORNERS = 2
 
@@ -162,7 +163,7 @@ class KeyPointHead(DetectionHead):
         coder_settings: PARTS = {"max_num": 35, "margin_m": None, **(coder or {})}
         self.coder = MapCoder(grid, **coder_settings)
         if self.coder.unfold_classes:
-            raise ValueError("coder.unfold_classes has no effect on boxes: leave it out.")
+            raise InputError("coder.unfold_classes has no effect on boxes: leave it out.")
         layer_settings: PARTS = {"num_heads": 8, "ffn_dims": 512, "dropout": 0.1, "num_layers": 6}
         layer_settings |= decoder or {}
         num_layers = layer_settings.pop("num_layers")
@@ -330,13 +331,13 @@ def get_targets(sample: Det3DDataSample, canvas: Canvas) -> InstanceData:
     """
     instances = sample.get("gt_instances_3d", InstanceData())
     if "keypoints" not in instances:
-        raise ValueError(
+        raise InputError(
             f"sample {sample.metainfo.get('token')!r} has no key points: add FormatPolylineTargets "
             "to the training pipeline."
         )
     target_settings = tuple(instances.metainfo["canvas"])
     if target_settings != canvas.settings:
-        raise ValueError(
+        raise InputError(
             f"FormatPolylineTargets has the canvas {target_settings} (pixel_m, "
             f"margin_m, ranges), the head {canvas.settings}: give both the same pixel_m and "
             "margin_m."

@@ -14,6 +14,7 @@ from gsmap.models.base.layers import enlarged, resnet_stages
 from gsmap.models.encoders.camera_encoder import CameraEncoder
 from gsmap.models.encoders.projection import PillarProjection, project_pillars
 from gsmap.structures.grid import BEVGrid
+from gsmap.utils.errors import InputError
 
 
 @MODELS.register_module()
@@ -106,7 +107,7 @@ class HeightPlanesEncoder(CameraEncoder):
             ValueError: If the number of levels differs from ``num_levels``.
         """
         if len(feats) != self.num_levels:
-            raise ValueError(
+            raise InputError(
                 f"HeightPlanesEncoder is built for {self.num_levels} levels of image features, got "
                 f"{len(feats)}: set its num_levels, or out_indices and num_outs of backbone and "
                 "neck."

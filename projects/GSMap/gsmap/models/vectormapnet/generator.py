@@ -12,6 +12,7 @@ from gsmap.models.vectormapnet.canvas import Canvas
 from gsmap.models.vectormapnet.detector import BEVEmbedding
 from gsmap.models.vectormapnet.layers import Cache, GatedLayer, append_cache, keep_most_likely
 from gsmap.structures.tensors import constant
+from gsmap.utils.errors import InputError
 
 _CONDITION = 5  # tokens of class and box, which precede the tokens of the points
 _FORBIDDEN = -1e9  # logit
@@ -78,9 +79,9 @@ class PolylineGenerator(BaseModule):
         super().__init__(init_cfg)
         for name, share in (("top_p", top_p), ("noise_share", noise_share)):
             if not 0 <= share <= 1:
-                raise ValueError(f"{name} must be in [0, 1], got {share}.")
+                raise InputError(f"{name} must be in [0, 1], got {share}.")
         if not 2 <= max_points <= num_positions:
-            raise ValueError(
+            raise InputError(
                 f"max_points must be 2 to num_positions = {num_positions}, got {max_points}."
             )
         self.canvas = canvas
@@ -197,7 +198,7 @@ class PolylineGenerator(BaseModule):
             ValueError: If a line has more points than there are positions.
         """
         if tokens.shape[1] > 2 * self.position.num_embeddings + 1:
-            raise ValueError(
+            raise InputError(
                 f"an annotated line has {tokens.shape[1] // 2} points, and num_positions of "
                 f"PolylineGenerator is {self.position.num_embeddings}: set it higher, or "
                 "tolerance_m of FormatPolylineTargets."

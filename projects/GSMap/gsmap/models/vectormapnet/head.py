@@ -16,6 +16,7 @@ from gsmap.models.vectormapnet.detector import KeyPointHead, get_targets
 from gsmap.models.vectormapnet.generator import Elements, PolylineGenerator
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import constant
+from gsmap.utils.errors import InputError
 
 
 @MODELS.register_module()
@@ -69,7 +70,7 @@ class VectorMapNetHead(DetectionHead):
         if isinstance(self.detector, KeyPointHead):
             detector_canvas = self.detector.reference.canvas
         if detector_canvas != self.canvas:
-            raise ValueError(
+            raise InputError(
                 f"the detector's canvas {detector_canvas.settings} is not the generator's "
                 f"{self.canvas.settings}: give canvas to VectorMapNetHead alone."
             )

@@ -10,6 +10,7 @@ from gsmap.evaluation.core.matches import FrameMatches
 from gsmap.evaluation.core.metric import MetricSettings, Sample, register_metric
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
+from gsmap.utils.errors import InputError
 
 SHRUNK_MARGIN_M = 2.0
 
@@ -31,7 +32,7 @@ class VectorMapNetAP(ChamferConfig):
         """
         resamples = settings.resample_predictions and settings.resample_ground_truth
         if settings.dim != 2 or not resamples:
-            raise ValueError(
+            raise InputError(
                 f"{cls.name} is AP_chamfer of lines of 100 points in the plane: leave out "
                 "heights (dim 3) and points as they are given."
             )

@@ -16,6 +16,7 @@ from gsmap.models.vectormapnet.canvas import Canvas, tokenize_points
 from gsmap.structures.elements import annotated
 from gsmap.structures.grid import BEVGrid, padded_size
 from gsmap.structures.polylines import padded
+from gsmap.utils.errors import InputError
 
 Floats = NDArray[np.float64]
 
@@ -94,7 +95,7 @@ class FormatPolylineTargets(BaseTransform):
 
     def __post_init__(self) -> None:
         if min(self.tolerance_m, self.smallest_box, self.border_px, *self.edge_classes, 0) < 0:
-            raise ValueError(f"settings of FormatPolylineTargets must not be negative: {self}.")
+            raise InputError(f"settings of FormatPolylineTargets must not be negative: {self}.")
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Add the targets to a sample.

@@ -14,6 +14,7 @@ from gsmap.datasets.errors import BrokenSampleError
 from gsmap.datasets.image_files import encode_jpeg, read_image
 from gsmap.evaluation.core.raster_ap import MIN_SCORE
 from gsmap.structures.frames import FrameView
+from gsmap.utils.errors import InputError
 from gsmap.visualization.camera_view import arrange_cameras, camera_title
 from gsmap.visualization.page.scores import ScoredResult
 
@@ -111,7 +112,7 @@ def thumbnail(path: Path, width_px: int) -> str:
     try:
         image = read_image(str(path), "page")
     except BrokenSampleError as error:
-        raise ValueError(
+        raise InputError(
             f"no readable image at {path} ({error}): give the folder that image paths start from "
             "as --data-root, or leave the images out with --no-images."
         ) from error

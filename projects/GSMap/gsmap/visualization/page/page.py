@@ -21,6 +21,7 @@ from gsmap.evaluation.core.raster_ap import MIN_SCORE
 from gsmap.structures.elements import MapElements
 from gsmap.structures.frames import frame_view
 from gsmap.structures.grid import BEVGrid
+from gsmap.utils.errors import InputError
 from gsmap.utils.files import write_text
 from gsmap.utils.words import counted
 from gsmap.visualization.bev_view import display_extent
@@ -73,7 +74,7 @@ class PageOptions:
 
     def __post_init__(self) -> None:
         if self.max_frames < 1 or self.image_width < 0 or not 0 <= self.score_thr <= 1:
-            raise ValueError(
+            raise InputError(
                 "max_frames must be >= 1, image_width >= 0 and score_thr in [0, 1], got "
                 f"{self.max_frames}, {self.image_width}, {self.score_thr}."
             )

@@ -18,6 +18,7 @@ from gsmap.evaluation.core.results_json import RESULTS_KEY, THREE_D, SampleFile
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import IntArray, MapElements
 from gsmap.structures.grid import BEVGrid
+from gsmap.utils.errors import InputError
 from gsmap.utils.model_facts import law_of
 from gsmap.utils.split_lists import require_results_of
 
@@ -89,7 +90,7 @@ def score_result(
     try:
         notes = mismatch_notes(predictions, truth, allow_mismatch)
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+        raise InputError(f"{path}: {error}") from error
     if others.pop(THREE_D, 0):
         notes.append("some predictions have heights, which no figure here counts")
     notes += [f"{n} predictions of class {c!r} are not scored" for c, n in sorted(others.items())]
