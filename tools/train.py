@@ -33,6 +33,19 @@ def parse_args() -> argparse.Namespace:
         action="store_true",
         help="scale the learning rate from the config's base batch size to the actual one",
     )
+    parser.add_argument(
+        "--overfit",
+        type=int,
+        metavar="N",
+        help="train on the first N samples alone, without validation, into work_dirs/NAME_overfit",
+    )
+    parser.add_argument(
+        "--overfit-iterations",
+        type=int,
+        default=300,
+        metavar="M",
+        help="length of such a training (default: %(default)s)",
+    )
     add_common_arguments(parser)
     return parser.parse_args()
 
@@ -74,9 +87,14 @@ def main() -> None:
 
     from gsmap.checkpoints.building import building
     from gsmap.engine.launch import load_config
+    from gsmap.engine.overfitting import overfit
     from gsmap.engine.run_log import MapRunner
 
+    if args.overfit is not None and not args.work_dir:
+        args.work_dir = str(Path("work_dirs") / f"{Path(args.config).stem}_overfit")
     cfg = load_config(args)
+    if args.overfit is not None:
+        overfit(cfg, args.overfit, args.overfit_iterations)
     if args.amp and torch.cuda.is_available():
         cfg.optim_wrapper.type = "MapAmpOptimWrapper"
         cfg.optim_wrapper.setdefault("loss_scale", "dynamic")

@@ -207,8 +207,10 @@ def _length(runner: Runner) -> str:
     text = f"{counted(loop.max_epochs, 'epoch')} of " if by_epoch else ""
     iterations = len(loader) if by_epoch else loop.max_iters
     unit = "epoch" if by_epoch else "iteration"
+    validation = "no validation"
+    if runner.val_loop is not None:
+        validation = f"validation every {counted(loop.val_interval, unit)}"
     return (
         f"{text}{counted(iterations, 'iteration')}, {counted(loader.batch_size, 'sample')} x "
-        f"{counted(runner.world_size, 'process')} each; validation every "
-        f"{counted(loop.val_interval, unit)}"
+        f"{counted(runner.world_size, 'process')} each; {validation}"
     )

@@ -1,0 +1,64 @@
+"""Training on a few samples until a model knows them by heart: the first test of new data."""
+
+from mmengine.config import Config
+
+LOG_LINES = 10  # of the losses of a run
+WARM_UP = 20  # iterations
+
+
+def overfit(cfg: Config, samples: int, iterations: int) -> None:
+    """Let a config train on the first samples of its training data alone, in place.
+
+    The run counts iterations, does not validate, writes one checkpoint at its end, and logs its
+    losses about `LOG_LINES` times. The learning rate rises during the first `WARM_UP` iterations and then
+    stays.
+
+    Args:
+        cfg: Config of a training, as `load_config` returns it.
+        samples: Number of samples, at least 1.
+        iterations: Length of the training, at least 1.
+
+    Raises:
+        ValueError: If a number is below 1, the training data are wrapped by another data set, or
+            the sampler makes streams of frames.
+    """
+    for name, number in (("--overfit", samples), ("--overfit-iterations", iterations)):
+        if number < 1:
+            raise ValueError(f"{name} must be >= 1, got {number}.")
+    loader = cfg.train_dataloader
+    if "dataset" in loader.dataset or "datasets" in loader.dataset:
+        raise ValueError(
+            f"--overfit: train_dataloader.dataset of {cfg.filename} is a {loader.dataset.type} of "
+            "other data sets: name one of these instead."
+        )
+    sampler = loader.sampler.type
+    if sampler != "DefaultSampler":
+        raise ValueError(
+            f"--overfit takes samples one by one, but train_dataloader.sampler of {cfg.filename} is "
+            f"a {sampler}: take a config of a model without memory."
+        )
+    loader.sampler = {"type": "InfiniteSampler", "shuffle": True}
+    loader.dataset.indices = samples
+    loader.batch_size = min(loader.batch_size, samples)
+    loader.num_workers = 0
+    loader.persistent_workers = False
+    cfg.train_cfg = {
+        "type": "IterBasedTrainLoop",
+        "max_iters": iterations,
+        "val_interval": iterations + 1,
+    }
+    cfg.val_cfg = None
+    cfg.val_dataloader = None
+    cfg.val_evaluator = None
+    cfg.param_scheduler = [
+        {"type": "LinearLR", "start_factor": 0.1, "by_epoch": False, "begin": 0, "end": WARM_UP}
+    ]
+    interval = max(iterations // LOG_LINES, 1)
+    hooks = cfg.default_hooks
+    hooks.logger = {"type": "LoggerHook", "interval": interval}
+    hooks.checkpoint.interval = iterations
+    hooks.checkpoint.by_epoch = False
+    hooks.checkpoint.save_best = None
+    hooks.visualization.draw = False
+    cfg.log_processor.by_epoch = False
+    cfg.log_processor.window_size = interval
