@@ -10,8 +10,8 @@ def overfit(cfg: Config, samples: int, iterations: int) -> None:
     """Let a config train on the first samples of its training data alone, in place.
 
     The run counts iterations, does not validate, writes one checkpoint at its end, and logs its
-    losses about `LOG_LINES` times. The learning rate rises during the first `WARM_UP` iterations and then
-    stays.
+    losses about `LOG_LINES` times. The learning rate rises during the first `WARM_UP` iterations
+    and then stays.
 
     Args:
         cfg: Config of a training, as `load_config` returns it.
@@ -34,8 +34,8 @@ def overfit(cfg: Config, samples: int, iterations: int) -> None:
     sampler = loader.sampler.type
     if sampler != "DefaultSampler":
         raise ValueError(
-            f"--overfit takes samples one by one, but train_dataloader.sampler of {cfg.filename} is "
-            f"a {sampler}: take a config of a model without memory."
+            f"--overfit takes samples one by one, but train_dataloader.sampler of {cfg.filename} "
+            f"is a {sampler}: take a config of a model without memory."
         )
     loader.sampler = {"type": "InfiniteSampler", "shuffle": True}
     loader.dataset.indices = samples
