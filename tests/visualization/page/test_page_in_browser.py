@@ -227,6 +227,30 @@ def test_a_phone_shows_everything_in_its_width(opened, frame):
     assert width == 360
 
 
+def test_long_names_stay_within_their_places(browser, page):
+    """Names of results, of 70 letters without a space, on a desk and on a phone."""
+    results = {f"{name}_{'long' * 16}": page.with_name(f"{name}.json") for name in ("good", "poor")}
+    data = page_data(page.with_name("case.arrow"), results, PageOptions(image_width=0))
+    write_page(page.with_name("long.html"), data)
+    browser.get(page.with_name("long.html").as_uri())
+    browser.find_element(By.CSS_SELECTOR, "#figures summary").click()
+    overflowing = """
+        const places = [...document.querySelectorAll('th, td, h1, h2, .pick, #zoom, #maps figure')];
+        const wide = places.filter((place) => place.scrollWidth > place.clientWidth + 1);
+        return wide.map((place) => place.textContent);
+    """
+    for width in (1400, 360):
+        size = {"width": width, "height": 740, "deviceScaleFactor": 1, "mobile": width < 500}
+        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        assert browser.execute_script(overflowing) == []
+    open_frame(browser, 0)
+    browser.find_element(By.CSS_SELECTOR, "#maps svg").click()
+    assert shown(browser, "#zoom")
+    assert browser.execute_script(overflowing) == []
+    browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    assert browser.get_log("browser") == []
+
+
 def test_small_maps_are_drawn_when_they_come_near(browser, page):
     data = page_data(page.with_name("case.arrow"), {}, PageOptions(image_width=0))
     write_page(page.with_name("many.html"), data | {"frames": 60 * data["frames"]})
