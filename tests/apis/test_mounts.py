@@ -253,6 +253,18 @@ def test_models_of_generated_streets_say_so_once_on_other_recordings(tmp_path, c
     assert caplog.text.count("the model has seen generated streets alone (MiniCity)") == 1
 
 
+def test_models_of_generated_streets_say_so_once_of_images_in_memory(caplog):
+    inferencer = MapInferencer("gsmap_r18_minicity", device="cpu")
+    names = inferencer.cfg.test_dataloader.dataset.cameras
+    intrinsics = dict.fromkeys(names, np.array([[100.0, 0, 80], [0, 100, 45], [0, 0, 1]]))
+    cam_from_vehicle = np.array([[0, -1, 0, 0], [0, 0, -1, 1.5], [1, 0, 0, 0], [0, 0, 0, 1.0]])
+    live = inferencer.live(intrinsics, dict.fromkeys(names, cam_from_vehicle), frame="vehicle")
+    with caplog.at_level(logging.WARNING):
+        for _ in range(2):
+            live.predict(dict.fromkeys(names, np.zeros((90, 160, 3), np.uint8)))
+    assert caplog.text.count("the model has seen generated streets alone (MiniCity)") == 1
+
+
 def test_a_model_that_lifts_images_sees_live_what_it_sees_of_files(tmp_path):
     """In the frame of the LiDAR, the default, and with the place of that frame in the vehicle."""
     (sample,) = make_samples(tmp_path, 1)

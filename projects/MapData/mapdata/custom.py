@@ -26,6 +26,7 @@ from gsmap.structures.polylines import Points, clip_to_box, is_closed
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import file_name
 from gsmap.utils.shards import WHOLE, Shard
+from mapdata.calibrated import calibrated_records
 from mapdata.folders.rig import RigCamera
 from mapdata.local_map import POLYGON, vertices_of
 
@@ -56,6 +57,7 @@ def from_records(
     data_root: str | Path,
     shard: Shard = WHOLE,
     join: bool = False,
+    calibration: str | Path | None = None,
 ) -> int:
     """Write an annotation file from plain records.
 
@@ -84,13 +86,19 @@ def from_records(
         data_root: Folder that image and LiDAR paths are relative to.
         shard: Which part of the records to take, such as ``Shard.parse("3/16")``.
         join: Join lines of a class whose ends meet, for maps that come in pieces (`join_lines`).
+        calibration: Calibration file of the vehicle as `infer` reads it beside a folder of images.
+            It defines intrinsics, distortion, place and, if it names ``poses``,
+            ``global_from_frame`` at the record's ``timestamp_ns``. Cameras of records have ``name``
+            and ``path`` then, and ``timestamp_ns`` where that of the image differs.
 
     Returns:
         How many samples were written.
 
     Raises:
-        FileNotFoundError: If an image is missing whose size is not given.
-        ValueError: If a record is malformed; the message names its token. No file is left then.
+        FileNotFoundError: If an image is missing whose size is not given, or there is no such
+            calibration file.
+        ValueError: If a record or the calibration file is malformed; the message names the token or
+            that file. No annotation file is left then.
     """
     if meta.frame == "ego" and meta.ground_z_m is None:
         _LOGGER.warning(_UNKNOWN_ROAD, path)
@@ -100,6 +108,8 @@ def from_records(
         tokens = "\n".join(str(r.get("token") if isinstance(r, Mapping) else r) for r in records)
         source = hashlib.sha256(tokens.encode()).hexdigest()
         records = shard.part(records)
+    if calibration is not None:
+        records = calibrated_records(list(records), Path(calibration), meta, Path(data_root))
     samples = _samples(records, meta, Path(data_root), join)
     return write_annotations(path, meta, samples, shard, source)
 

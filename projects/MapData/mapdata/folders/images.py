@@ -69,7 +69,7 @@ def read_image_folder(
     """
     with naming(file, "see docs/inference.md"):
         content = _calibration(file)
-        ground = rigid(np.eye(3), (0, 0, float(content.get("ground_z_m", 0.0))))
+        ground = _ground_of(content)
         rig, images, notes = [], {}, []
         for name, camera in content["cameras"].items():
             with naming(f"{file}, camera {name!r}", "see docs/inference.md"):
@@ -83,10 +83,7 @@ def read_image_folder(
             raise InputError("rate_hz must be > 0, and max_time_difference_ms >= 0")
         frames, time_of, assumed = _frames(images, rate_hz, tolerance_ns, file)
         notes += [note for note in (assumed, *_notes_on(frames, images, tolerance_ns)) if note]
-        poses = None
-        if content.get("poses"):
-            place = _below(file.parent, str(content["poses"]), "poses")
-            poses = read_poses(place, time_of, ground)
+        poses = _poses_of(content, file.parent, time_of, ground)
         pose_at = None if poses is None else cache(poses.at)  # asked for by frames and by images
         used, missing = _with_poses(frames, poses, pose_at)
         notes += missing
@@ -123,6 +120,52 @@ def read_rig(file: Path, ground: np.ndarray) -> tuple[list[tuple[RigCamera, str]
                     raise InputError("beside a bag it needs size_px: [width, height]")
                 rig.append((_camera(str(name), camera, ground, ()), str(camera.get("images", ""))))
         return rig, ground
+
+
+def read_vehicle(
+    file: Path, images: Mapping[str, Sequence[Path]], time_of: Mapping[str, int]
+) -> tuple[list[RigCamera], PoseTrack | None]:
+    """Read the cameras and the poses of a calibration file whose images are given.
+
+    Args:
+        file: The calibration file. Its ``poses`` start from its folder.
+        images: Images of each camera that is wanted, by the camera's name; other cameras of the
+            file are left out.
+        time_of: Times of the images in nanoseconds, by their names without suffix.
+
+    Returns:
+        The cameras, and the poses of the ground below the vehicle, None where the file has none.
+
+    Raises:
+        FileNotFoundError: If there is no calibration file, or no file of poses.
+        ValueError: If the file is malformed; the message names the camera.
+    """
+    rig = []
+    with naming(file, "see docs/inference.md"):
+        content = _calibration(file)
+        ground = _ground_of(content)
+        for name, camera in content["cameras"].items():
+            if str(name) not in images:
+                continue
+            with naming(f"{file}, camera {name!r}", "see docs/inference.md"):
+                _require_keys(camera, _CAMERA_KEYS, "a camera")
+                rig.append(_camera(str(name), camera, ground, images[str(name)]))
+        return rig, _poses_of(content, file.parent, time_of, ground)
+
+
+def _ground_of(content: Mapping[str, Any]) -> np.ndarray:
+    """Pose of the road in the vehicle's frame of a calibration file. (4, 4)"""
+    return rigid(np.eye(3), (0, 0, float(content.get("ground_z_m", 0.0))))
+
+
+def _poses_of(
+    content: Mapping[str, Any], folder: Path, time_of: Mapping[str, int], ground: np.ndarray
+) -> PoseTrack | None:
+    """Read the poses that a calibration file names; None where it names none."""
+    if not content.get("poses"):
+        return None
+    place = _below(folder, str(content["poses"]), "poses")
+    return read_poses(place, time_of, ground)
 
 
 class _Loader(yaml.SafeLoader):
