@@ -41,7 +41,10 @@ def with_memory(**queries):
 
 def step(head, memory, number: int):
     """Predict a frame; return the last layer's predictions, and the memory in the batch."""
-    with torch.no_grad(), memory.over({"bev_feats": features(number)}, [meta(number)]) as batch:
+    with (
+        torch.no_grad(),
+        memory.remember_batch({"bev_feats": features(number)}, [meta(number)]) as batch,
+    ):
         return head(batch.outputs, **batch.hooks)[-1], batch.propagation
 
 
@@ -72,12 +75,12 @@ def test_the_last_layers_gaussians_are_fused_with_those_before_point_by_point():
     step(head, memory, 0)
     kept = memory.streams.states["a"].values["references"][None]
     refined: list[Tensor] = []
-    own = memory.queries.fused
-    memory.queries.fused = lambda lines, *args: refined.append(lines) or own(lines, *args)
+    own = memory.queries.fuse_references
+    memory.queries.fuse_references = lambda lines, *args: refined.append(lines) or own(lines, *args)
     predicted, propagation = step(head, memory, 1)
     before, seen, fused = (
         of_first(head, lines)
-        for lines in (propagation.handed_on.reference, refined[0], predicted.references[:, :2])
+        for lines in (propagation.propagated.reference, refined[0], predicted.references[:, :2])
     )
     then, spread = of_first(head, kept)
     motion = invert_rigid(meta(1)["lidar2global"]) @ meta(0)["lidar2global"]
@@ -102,7 +105,9 @@ def test_each_setting_hands_on_what_it_says():
     references = torch.tensor([0.5, 0.6, 0.4, -0.3, 0.2]).expand(1, 2, 5, 5)
     head, _ = with_memory()
     moved = {
-        kind: GaussianMemory(16, num=2, covariance=kind).moved(head, references, past())
+        kind: GaussianMemory(16, num=2, covariance=kind).transform_references(
+            head, references, past()
+        )
         for kind in COVARIANCES
     }
     assert not moved["points"][..., 2:].any()
@@ -112,7 +117,7 @@ def test_each_setting_hands_on_what_it_says():
     assert (scales > head.reference.space.decode(references).scales).all()  # it is less certain
     for kind in ("points", "moved"):
         part = GaussianMemory(16, num=2, covariance=kind)
-        assert part.fused(references, moved[kind], head) is references
+        assert part.fuse_references(references, moved[kind], head) is references
 
 
 def test_without_noise_a_gaussian_is_moved_as_any_memory_moves_it():
@@ -120,7 +125,7 @@ def test_without_noise_a_gaussian_is_moved_as_any_memory_moves_it():
     head, _ = with_memory()
     motion = rigid([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [1, 2, 0])
     exact = GaussianMemory(16, num=2, noise_m=0.0, noise_deg=0.0)
-    moved = exact.moved(head, references, past(motion=motion))
+    moved = exact.transform_references(head, references, past(motion=motion))
     plain = head.reference.moved(references, past(motion=motion).now_from_then)
     torch.testing.assert_close(moved, plain, atol=1e-5, rtol=1e-5)
 
@@ -129,15 +134,15 @@ def test_a_gaussian_that_left_the_map_is_not_fused():
     head, memory = with_memory()
     references = torch.tensor([0.5, 0.6, 0.4, -0.3, 0.2]).expand(1, 2, 5, 5)
     motion = rigid(np.eye(3), [0, 50, 0])  # 56 m ahead, where the map ends at 30
-    before = memory.queries.moved(head, references, past(motion=motion))
+    before = memory.queries.transform_references(head, references, past(motion=motion))
     assert (before[..., 1] == 1).all()
-    assert torch.equal(memory.queries.fused(references, before, head), references)
+    assert torch.equal(memory.queries.fuse_references(references, before, head), references)
 
 
 def test_fused_predictions_train_the_decoder():
     head, memory = with_memory()
     step(head, memory, 0)
-    with memory.over({"bev_feats": features(1)}, [meta(1)]) as batch:
+    with memory.remember_batch({"bev_feats": features(1)}, [meta(1)]) as batch:
         head(batch.outputs, **batch.hooks)[-1].references[:, :2].square().sum().backward()
     for branches in (head.reference.branches, head.reference.gaussian_branches):
         gradient = torch.cat([p.grad.flatten() for p in branches[-1].parameters()])

@@ -240,7 +240,7 @@ def fusion_rows(
         metas = metas_of(data, frame)
         before = memory.streams.previous([Frame.of(meta) for meta in metas])
         first.append([state is None for state in before])
-        with memory.over({"bev_feats": flipped(value)}, metas) as batch:
+        with memory.remember_batch({"bev_feats": flipped(value)}, metas) as batch:
             fused.append(flipped(batch.outputs["bev_feats"]))
         scalar += (fused[-1] * parts.normal(f"smn_gf_t{frame}", tuple(value.shape))).sum()
     yield Row(name, f"{tag}is_first", largest_difference(first, data[f"{tag}is_first"]), 0)

@@ -47,7 +47,7 @@ def check_forward(golden: Golden, name: str) -> Iterator[Row]:
             yield from projection_rows(name, data, encoder)
         outputs = encoder(fpn, [meta])
         raw = flipped(outputs["bev_feats"])[0]
-        with model.temporal.over(outputs, [meta]) as batch:
+        with model.temporal.remember_batch(outputs, [meta]) as batch:
             fused = flipped(batch.outputs["bev_feats"])[0]
             predictions = head(batch.outputs, **batch.hooks)
         results = head.predict_by_feat(predictions, [meta])[0]
@@ -62,7 +62,7 @@ def check_forward(golden: Golden, name: str) -> Iterator[Row]:
             "lines_layers_q0": lines[:, ::10],
             "post_scores": results.scores_3d[back],
             "post_labels": results.labels_3d[back],
-            "mem_topk": batch.propagation.chosen[0],
+            "mem_topk": batch.propagation.best_inds[0],
         }
         for key in norms:
             cells = inside[key].unflatten(0, (50, 100))

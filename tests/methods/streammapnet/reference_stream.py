@@ -80,7 +80,7 @@ class Recorder:
             return pairs
 
         self.head.match = match  # type: ignore[method-assign]
-        with self.memory.over({"bev_feats": flipped(bev)}, metas) as batch:
+        with self.memory.remember_batch({"bev_feats": flipped(bev)}, metas) as batch:
             memory = batch.propagation
             predictions = self.head(batch.outputs, **batch.hooks)
             losses = self.head.loss_by_feat(predictions, gts, metas, [memory])
@@ -101,7 +101,7 @@ class Recorder:
             loss_reg=torch.stack([losses[f"{n}loss_pts"] for n in names]),
             frame_total_loss=total,
             trans_loss=trans,
-            mem_topk=memory.chosen,
+            mem_topk=memory.best_inds,
         )
         self.keep_memory(memory, predictions[-1].scores)
 
@@ -115,8 +115,8 @@ class Recorder:
             mem_target=torch.stack([state["targets"] for state in states]),
         )
         inserted = torch.full((BATCH, KEPT, 128), torch.nan)
-        if memory.handed_on is not None:
-            inserted = memory.handed_on.state[:, :, 0, ::4].detach()
+        if memory.propagated is not None:
+            inserted = memory.propagated.state[:, :, 0, ::4].detach()
         self.keep(prop_query=inserted, pose12=memory.past.now_from_then[:, :3].flatten(1).float())
 
 

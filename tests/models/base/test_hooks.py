@@ -186,13 +186,13 @@ def test_memory_and_noised_queries_take_part_in_one_flow():
     nothing = torch.eye(4).double()[None], torch.zeros(1).double()
     first = Propagation(memory, Past({}, *nothing, torch.tensor([False])))
     step(head, LANES, hooks=(first,))
-    left = {name: value.detach() for name, value in first.left().items()}
+    left = {name: value.detach() for name, value in first.collect_memory().items()}
     second = Propagation(memory, Past(left, *nothing, torch.tensor([True])))
     losses = step(head, LANES, hooks=(second,))
     assert losses["loss_trans"] > 0
     assert losses["loss_pts_dn"] > 0
-    assert second.total == N + 4  # two groups of two ground truths
-    assert second.chosen.max() < N
+    assert second.num_queries == N + 4  # two groups of two ground truths
+    assert second.best_inds.max() < N
 
 
 def test_two_parts_of_one_name_are_refused():

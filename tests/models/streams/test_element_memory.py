@@ -120,11 +120,11 @@ def test_among_many_lines_an_element_is_updated_as_by_the_nearest_one_alone():
 
 def test_what_a_frame_leaves_moves_with_the_vehicle_and_grows_by_the_noise():
     elements = memory(noise_m=0.2, noise_deg=0.0)
-    left = elements.left([detected(line(2.0))])
+    left = elements.remember([detected(line(2.0))])
     assert left["element_labels"].tolist() == [[0] + [-1] * (elements.num - 1)]
     motion = torch.eye(4).double()
     motion[0, 3] = -2.0  # the vehicle has moved 2 m along x
-    (found,) = elements.updated([detected(line(1.0))], past(left, motion))
+    (found,) = elements.update_detections([detected(line(1.0))], past(left, motion))
     known, new = 0.3**2 + 0.2**2 * 0.5, 0.3**2
     torch.testing.assert_close(found.pts[0, 4, 0], torch.tensor(known / (known + new)).float())
     assert torch.all(found.scales[0, :, 1] < 0.3)
@@ -132,14 +132,14 @@ def test_what_a_frame_leaves_moves_with_the_vehicle_and_grows_by_the_noise():
 
 def test_a_stream_that_starts_and_an_unlikely_element_stay_as_they_are():
     elements = memory(min_score=0.2)
-    left = elements.left([detected(line(0.0))])
+    left = elements.remember([detected(line(0.0))])
     for now, before in [
         (detected(line(1.0)), past(left, continues=False)),
         (detected(line(1.0)), past({})),
         (detected(line(1.0), score=0.1), past(left)),
-        (detected(line(1.0)), past(elements.left([detected(line(0.0), score=0.1)]))),
+        (detected(line(1.0)), past(elements.remember([detected(line(0.0), score=0.1)]))),
     ]:
-        (found,) = elements.updated([now], before)
+        (found,) = elements.update_detections([now], before)
         assert torch.equal(found.pts, now.pts)
 
 
@@ -156,11 +156,13 @@ def test_a_batch_of_streams_is_updated_as_each_stream_alone():
     motion = torch.eye(4).double().repeat(2, 1, 1)
     motion[1, 0, 3] = 0.3
     seconds, continues = torch.tensor([0.5, 1.0]).double(), torch.tensor([True, True])
-    batch = elements.updated(now, Past(elements.left(before), motion, seconds, continues))
+    batch = elements.update_detections(
+        now, Past(elements.remember(before), motion, seconds, continues)
+    )
     for index, found in enumerate(batch):
-        own = elements.left(before[index : index + 1])
+        own = elements.remember(before[index : index + 1])
         past_of_one = past(own, motion[index], float(seconds[index]))
-        (alone,) = elements.updated(now[index : index + 1], past_of_one)
+        (alone,) = elements.update_detections(now[index : index + 1], past_of_one)
         assert not torch.equal(found.pts, now[index].pts)
         assert torch.equal(found.pts, alone.pts)
         assert torch.equal(found.scales, alone.scales)

@@ -12,7 +12,7 @@ from mmengine.structures import InstanceData
 from model_cases import build_small, make_images, make_samples, straight_elements
 
 from gsmap.models.streams.bev_memory import BEVMemory
-from gsmap.models.streams.memory import StreamMemory, recalled
+from gsmap.models.streams.memory import StreamMemory, stack_past
 from gsmap.structures.past import Past
 from gsmap.structures.rigid import rigid
 from gsmap.structures.streams import Frame, MapStream, Scenes, Slots, StreamState
@@ -50,7 +50,7 @@ def with_memory(**settings):
 def step(head, memory, *metas: dict, feats: torch.Tensor | None = None) -> torch.Tensor:
     """Predict one batch and return the points of the last layer."""
     outputs = {"bev_feats": bev(len(metas))["bev_feats"] if feats is None else feats}
-    with torch.no_grad(), memory.over(outputs, metas) as batch:
+    with torch.no_grad(), memory.remember_batch(outputs, metas) as batch:
         return head(batch.outputs, **batch.hooks)[-1].pts
 
 
@@ -163,7 +163,7 @@ def test_a_stream_of_one_model_is_refused_by_another_and_both_are_named():
 def test_a_failed_batch_leaves_the_stream_where_it_was():
     head, memory = with_memory()
     step(head, memory, meta(0))
-    with pytest.raises(RuntimeError, match="on the way"), memory.over(bev(1), [meta(1)]):
+    with pytest.raises(RuntimeError, match="on the way"), memory.remember_batch(bev(1), [meta(1)]):
         raise RuntimeError("on the way")
     step(head, memory, meta(1))
 
@@ -215,7 +215,7 @@ def test_channels_that_are_not_kept_are_those_of_now():
     """The vehicle stands, so the memory lies where it was."""
     memory = BEVMemory(ALONG_Y, embed_dims=16, kept_dims=4)
     before, now = features(0), features(1)
-    kept = memory.kept(before)
+    kept = memory.remember(before)
     torch.testing.assert_close(kept, before[:, :4])
     still = torch.eye(4, dtype=torch.float64)[None], torch.ones(1), torch.ones(1, dtype=torch.bool)
     found = memory(now, Past({"bev_feats": kept}, *still))
@@ -288,7 +288,7 @@ def test_training_gives_every_weight_a_gradient_and_later_frames_a_loss():
     head.train(), memory.train()
     losses, shares = [], []
     for number in range(2):
-        with memory.over({"bev_feats": features(number)}, [meta(number)]) as batch:
+        with memory.remember_batch({"bev_feats": features(number)}, [meta(number)]) as batch:
             sample = make_samples(LANES)[0]
             sample.set_metainfo(meta(number))
             each = head.loss(batch.outputs, [sample], **batch.hooks)
@@ -310,15 +310,15 @@ def test_a_query_that_has_moved_as_the_vehicle_has_no_loss(config):
     head, memory = with_memory(**config)
     head.train(), memory.train()
     start, turned = (meta(n, lidar2global=pose(0.0, n * math.pi)) for n in range(2))
-    with memory.over({"bev_feats": features(0)}, [start]) as batch:
+    with memory.remember_batch({"bev_feats": features(0)}, [start]) as batch:
         (sample,) = make_samples(LANES)
         head.loss(batch.outputs, [sample], **batch.hooks)
-    past = recalled([Frame.of(turned)], memory.streams.states, torch.device("cpu"))
-    batch = memory.enter({"bev_feats": features(1)}, past)
+    past = stack_past([Frame.of(turned)], memory.streams.states, torch.device("cpu"))
+    batch = memory.recall({"bev_feats": features(1)}, past)
     head(batch.outputs, **batch.hooks)
     propagation = batch.propagation
     assert float(propagation.loss(head)) > 0.1
-    state, _, reference = (leaf.flatten(1, 2) for leaf in propagation.handed_on)
+    state, _, reference = (leaf.flatten(1, 2) for leaf in propagation.propagated)
     predicted = head.reference.refine(0, state, reference)[..., :2].detach()
     targets = head.reference.moved_points(predicted, past.then_from_now).view(1, 2, 5, 2)
     memories = {**past.memory, "targets": targets}
@@ -331,11 +331,11 @@ def test_further_query_groups_keep_their_queries():
     head, memory = with_memory(query_groups=groups)
     head.train(), memory.train()
     for number in range(2):
-        with memory.over({"bev_feats": features(number)}, [meta(number)]) as batch:
+        with memory.remember_batch({"bev_feats": features(number)}, [meta(number)]) as batch:
             head(batch.outputs, **batch.hooks)
             propagation = batch.propagation
             if number == 0:
-                propagation.matched = torch.zeros(1, 10, 5, 2)
+                propagation.target_pts = torch.zeros(1, 10, 5, 2)
     order = propagation.order(torch.zeros(1, 4), total=10)
     assert order[0, :2].tolist() == [0, 1]
     assert sorted(order[0, 2:4].tolist()) < [6, 6]

@@ -102,14 +102,14 @@ class ExportedDetector(nn.Module):
         else:
             memory = {name: named[f"{MEMORY}{name}"] for name in self.memory}
             motion, seconds, continues = (named[name] for name in OF_STREAM)
-            batch = temporal.enter(outputs, Past(memory, motion, seconds[0], continues[0] > 0.5))
+            batch = temporal.recall(outputs, Past(memory, motion, seconds[0], continues[0] > 0.5))
             predictions = head(batch.outputs, **batch.hooks)
         decoded = head.reference.decode(predictions[-1].references[0])
         best = head.coder.best(head.coder.weighed(predictions[-1].scores[0], decoded))
         fields = head.detected(decoded, best)
         names = ("pts", *head.reference.outputs[1:])
         elements = (best.scores, best.labels, *(fields[name] for name in names))
-        left = {} if temporal is None else temporal.left(batch)
+        left = {} if temporal is None else temporal.collect_memory(batch)
         return elements, {name: value[0] for name, value in left.items()}
 
     @torch.no_grad()

@@ -19,7 +19,7 @@ from gsmap.checkpoints.strict import adapt_state, neutral_keys
 from gsmap.models.encoders.folded_backbone import FoldedBackbone
 from gsmap.models.encoders.half_backbone import HalfBackbone
 from gsmap.models.loss_check import LossCheck
-from gsmap.models.streams.memory import Remembering, StreamMemory
+from gsmap.models.streams.memory import BatchMemory, StreamMemory
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32
 from gsmap.utils.errors import InputError
@@ -171,11 +171,13 @@ class MapDetector(Base3DDetector):
 
     def over_time(
         self, outputs: dict[str, Any], batch_data_samples: Samples
-    ) -> AbstractContextManager[Remembering]:
+    ) -> AbstractContextManager[BatchMemory]:
         """Return a context in which a batch has its memory, if the model has any."""
         if self.temporal is None:
-            return nullcontext(Remembering(outputs))
-        return self.temporal.over(outputs, [sample.metainfo for sample in batch_data_samples])
+            return nullcontext(BatchMemory(outputs))
+        return self.temporal.remember_batch(
+            outputs, [sample.metainfo for sample in batch_data_samples]
+        )
 
     def loss(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
         """Return all losses as scalars; FloatingPointError if one is not finite (`LossCheck`)."""
@@ -198,7 +200,7 @@ class MapDetector(Base3DDetector):
         with self.over_time(outputs, batch_data_samples) as batch:
             results = self.map_head.predict(batch.outputs, batch_data_samples, **batch.hooks)
             if self.temporal is not None:
-                results = self.temporal.updated(batch, results)
+                results = self.temporal.update_detections(batch, results)
         return self.add_pred_to_datasample(batch_data_samples, results)
 
     def _forward(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:

@@ -50,9 +50,12 @@ class GeometryDecoupledAttention(nn.Module):
     ) -> None:
         super().__init__()
         self.num_points = num_points
-        sizes = {"num_heads": num_heads, "ffn_dims": ffn_dims, "dropout": dropout}
-        self.inter = _AttentionBlock(embed_dims, **sizes)
-        self.intra = _AttentionBlock(embed_dims, **sizes)
+        self.inter = _AttentionBlock(
+            embed_dims, num_heads=num_heads, ffn_dims=ffn_dims, dropout=dropout
+        )
+        self.intra = _AttentionBlock(
+            embed_dims, num_heads=num_heads, ffn_dims=ffn_dims, dropout=dropout
+        )
 
     def forward(
         self, query: Tensor, query_pos: Tensor | None = None, attn_mask: Tensor | None = None

@@ -58,9 +58,9 @@ class GaussianMemory(QueryMemory):
         require_gaussians(self, head)
         super().check(head)
 
-    def moved(self, head: FlowHead, references: Tensor, past: Past) -> Tensor:
-        """Return Gaussians of the frame before as they lie now. (B, K, P, D)"""
-        points = super().moved(head, references, past)
+    def transform_references(self, head: FlowHead, references: Tensor, past: Past) -> Tensor:
+        """Transform Gaussians of the previous frame to the current one. (B, K, P, D)"""
+        points = super().transform_references(head, references, past)
         if self.covariance == "points":
             return torch.cat([points[..., :-3], torch.zeros_like(points[..., -3:])], -1)
         space = require_gaussians(self, head).space
@@ -74,7 +74,7 @@ class GaussianMemory(QueryMemory):
             )
             return space.encode(gaussians, points)
 
-    def fused(self, refined: Tensor, before: Tensor, head: FlowHead) -> Tensor:
+    def fuse_references(self, refined: Tensor, before: Tensor, head: FlowHead) -> Tensor:
         """Return refined Gaussians fused with those before, but where these left the map."""
         if self.covariance != "fused":
             return refined

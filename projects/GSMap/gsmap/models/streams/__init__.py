@@ -1,1 +1,1 @@
-"""Memory over the frames of a drive, for any method: states of streams, BEV and queries."""
+"""Memory over the frames of a drive, for any method: BEV features, queries and elements."""

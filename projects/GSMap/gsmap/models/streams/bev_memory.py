@@ -1,4 +1,4 @@
-"""Memory of BEV features: moved by the vehicle's motion, then fused by a convolutional GRU."""
+"""Memory of BEV features: warped by the ego motion, then fused by a convolutional GRU."""
 
 import math
 
@@ -16,26 +16,27 @@ from gsmap.utils.errors import InputError
 
 @MODELS.register_module()
 class BEVMemory(nn.Module, AddsWeights):
-    r"""Fuse the features of now, x, with those of the frame before, h (StreamMapNet).
+    r"""Fuse current BEV features x with the warped memory h of the previous frame (StreamMapNet).
 
-    :math:`z = \sigma(W_z [h, x])`, :math:`r = \sigma(W_r [h, x])`, :math:`q = W_q [r h, x]`
-    and LayerNorm of :math:`(1 - z) h + z q`, all by convolutions of 1 x 1. Differs from a GRU: the
-    released candidate q has no tanh. In a stream's first frame h is x without its gradient.
+    The output is the LayerNorm of :math:`(1 - z) h + z q` with :math:`z = \sigma(W_z [h, x])`,
+    :math:`r = \sigma(W_r [h, x])` and :math:`q = W_q [r h, x]`, where W are 1 x 1 convolutions.
+    Unlike in a GRU, the candidate q has no tanh, as in the released code. In the first frame of a
+    stream, h is x without its gradient.
 
     Args:
-        grid: The map's extent.
+        grid: Extent of the map.
         embed_dims: Channels C.
-        end_points: Take the cells to lie from edge to edge of the map, as released, instead of at
-            their centres. Then the memory of a standing vehicle moves too; the released weights
-            need it.
-        kept_dims: Channels that are kept, the first ones; the others of h are those of x, as in a
-            first frame. None keeps all, as published.
-        present_share: Start as a mean of present and past, z everywhere at this share and q = x,
-            without LayerNorm: then a model that was trained without memory still knows its
-            features. None starts from random weights, as published.
+        end_points: Space the cells from edge to edge of the map, as in the released code, instead
+            of at their centres. With it the memory of a standing vehicle is resampled, too. The
+            released weights require it.
+        kept_dims: Number of channels to remember, from the first on. The other channels of h are
+            those of x. None remembers all, as published.
+        present_share: Initialise as a mean of present and past, with z equal to this share, q = x
+            and no LayerNorm. A model that was trained without memory then keeps its features. None
+            initialises random weights, as published.
 
     Raises:
-        ValueError: If there are not as many channels to keep, or a share is not within (0, 1).
+        ValueError: If ``kept_dims`` is not in [1, C] or ``present_share`` not in (0, 1).
     """
 
     def __init__(
@@ -56,14 +57,15 @@ class BEVMemory(nn.Module, AddsWeights):
             raise InputError(
                 f"temporal.bev.present_share must lie between 0 and 1, got {present_share}."
             )
-        self.grid, self.embed_dims = grid, embed_dims
-        self.end_points, self.kept_dims = end_points, kept_dims
+        self.grid = grid
+        self.embed_dims = embed_dims
+        self.end_points = end_points
+        self.kept_dims = kept_dims
         published = present_share is None
         self.neutral_keys = () if published else ("conv",)  # a checkpoint may lack them
-        self.convz, self.convr, self.convq = (
-            nn.Conv2d(2 * embed_dims, embed_dims, 1, bias=bias)
-            for bias in (not published, False, False)
-        )
+        self.convz = nn.Conv2d(2 * embed_dims, embed_dims, 1, bias=not published)
+        self.convr = nn.Conv2d(2 * embed_dims, embed_dims, 1, bias=False)
+        self.convq = nn.Conv2d(2 * embed_dims, embed_dims, 1, bias=False)
         self.ln = nn.LayerNorm(embed_dims) if published else nn.Identity()
         for conv in (self.convz, self.convr, self.convq):
             nn.init.kaiming_normal_(conv.weight, mode="fan_out", nonlinearity="relu")
@@ -74,34 +76,66 @@ class BEVMemory(nn.Module, AddsWeights):
                 self.convq.weight[:, embed_dims:, 0, 0].fill_diagonal_(1.0)
 
     def cells(self, height: int, width: int) -> Tensor:
-        """Return where the cells lie, in metres, float64. (H, W, 2)"""
+        """Positions of the cells.
+
+        Args:
+            height: Rows H of the features.
+            width: Columns W of the features.
+
+        Returns:
+            Points in metres, float64. (H, W, 2)
+        """
         if not self.end_points:
             return self.grid.resized(height, width).pixel_centres(dtype=torch.float64)
-        x, y = (
-            torch.linspace(*ends, steps, dtype=torch.float64)
-            for ends, steps in ((self.grid.x_range, width), (self.grid.y_range, height))
-        )
+        low_x, high_x = self.grid.x_range
+        low_y, high_y = self.grid.y_range
+        x = torch.linspace(low_x, high_x, width, dtype=torch.float64)
+        y = torch.linspace(low_y, high_y, height, dtype=torch.float64)
         return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
 
-    def places(self, motion: Tensor, height: int, width: int) -> Tensor:
-        """Return where each cell's ground lay in the frame before, [-1, 1]. (B, H, W, 2)
+    def source_locations(self, motion: Tensor, height: int, width: int) -> Tensor:
+        """Sampling locations of the cells in the features of the previous frame.
 
-        The motion (B, 4, 4) takes metres now to metres then.
+        Args:
+            motion: Transform from the current to the previous frame, in metres. (B, 4, 4)
+            height: Rows H of the features.
+            width: Columns W of the features.
+
+        Returns:
+            Locations for ``grid_sample``, [-1, 1] over the map. (B, H, W, 2)
         """
         cells = self.cells(height, width).to(motion)
-        moved = cells.flatten(0, 1) @ motion[:, :2, :2].transpose(1, 2) + motion[:, None, :2, 3]
-        norm = self.grid.norm_from_metres(moved.unflatten(1, (height, width)))
+        rotation = motion[:, :2, :2].transpose(1, 2)
+        previous = cells.flatten(0, 1) @ rotation + motion[:, None, :2, 3]
+        norm = self.grid.norm_from_metres(previous.unflatten(1, (height, width)))
         return 2 * norm - 1
 
     def warp(self, memory: Tensor, motion: Tensor) -> Tensor:
-        """Move a memory to where its ground lies now; zero where it saw nothing. (B, C, H, W)"""
-        places = self.places(motion, *memory.shape[-2:])
-        return F.grid_sample(memory, places.to(memory), align_corners=False)
+        """Resample features of the previous frame to the cells of the current one.
+
+        Args:
+            memory: Features of the previous frame. (B, C, H, W)
+            motion: Transform from the current to the previous frame, in metres. (B, 4, 4)
+
+        Returns:
+            Features of the current cells; zero outside of the previous map. (B, C, H, W)
+        """
+        height, width = memory.shape[-2:]
+        locations = self.source_locations(motion, height=height, width=width)
+        return F.grid_sample(memory, locations.to(memory), align_corners=False)
 
     def forward(self, feats: Tensor, past: Past) -> Tensor:
-        """Return the features of now (B, C, H, W), fused with those of the frames before.
+        """Fuse BEV features with the memory.
 
-        ValueError if they have other channels than the memory.
+        Args:
+            feats: BEV features of the current frame. (B, C, H, W)
+            past: Memory of the streams and the ego motion.
+
+        Returns:
+            The fused features. (B, C, H, W)
+
+        Raises:
+            ValueError: If the number of channels differs from ``embed_dims``.
         """
         if feats.shape[1] != self.embed_dims:
             raise InputError(
@@ -115,12 +149,13 @@ class BEVMemory(nn.Module, AddsWeights):
             if self.kept_dims is not None:
                 warped = torch.cat([warped, hidden[:, self.kept_dims :]], 1)
             hidden = torch.where(past.continues.view(-1, 1, 1, 1), warped, hidden)
-        joined = torch.cat([hidden, feats], 1)
-        update, reset = self.convz(joined).sigmoid(), self.convr(joined).sigmoid()
+        both = torch.cat([hidden, feats], 1)
+        update = self.convz(both).sigmoid()
+        reset = self.convr(both).sigmoid()
         candidate = self.convq(torch.cat([reset * hidden, feats], 1))
         fused = torch.lerp(hidden, candidate, update)
         return self.ln(fused.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
-    def kept(self, fused: Tensor) -> Tensor:
-        """Return what the next frame remembers of fused features. (B, C, H, W)"""
+    def remember(self, fused: Tensor) -> Tensor:
+        """Memory for the next frame. (B, C, H, W) -> (B, kept_dims, H, W)"""
         return fused.detach()[:, : self.kept_dims]

@@ -1,4 +1,4 @@
-"""Memory of elements: what was detected in a frame says where it lies in the next."""
+"""Memory of elements: detections of a frame refine those of the next one."""
 
 import math
 from collections.abc import Sequence
@@ -20,22 +20,22 @@ PREFIX = "element_"
 
 @MODELS.register_module()
 class ElementMemory:
-    """Update the detections of a frame by those of the frame before (`seen_again`).
+    """Update of detections by the elements of the previous frame (`seen_again`).
 
-    The elements before are moved by the vehicle's motion, and their covariances grow by its noise.
-    It has no weights and takes no part in training, so it suits every trained model that predicts
-    Gaussians. This is ours.
+    The previous elements are transformed by the ego motion, and their covariances grow by its
+    noise. There are no weights and there is no training, so any trained model with Gaussians can
+    use it. It is not part of a published method.
 
     Args:
-        head: The detector's head, whose detections have ``scales`` and ``rotations``.
-        gate_m: Largest distance, in metres, at which an element is one seen before.
-        min_score: Smallest score of the elements that are updated and remembered.
-        noise_m: How far the motion of one second is off, standard deviation in metres; the variance
-            grows with the time.
-        noise_deg: The same for the vehicle's heading, in degrees.
+        head: Head of the detector; its detections have ``scales`` and ``rotations``.
+        gate_m: Largest distance between a detection and a previous element that match, in metres.
+        min_score: Smallest score of elements that are updated and remembered.
+        noise_m: Standard deviation of the ego translation after one second, in metres. The variance
+            grows with time.
+        noise_deg: Standard deviation of the ego heading after one second, in degrees.
 
     Raises:
-        ValueError: If the head has no Gaussians, or a setting is out of its range.
+        ValueError: If the head has no Gaussians, or a setting is out of range.
     """
 
     def __init__(
@@ -57,63 +57,94 @@ class ElementMemory:
                 f">= 0, got {gate_m}, {min_score}, {noise_m} and {noise_deg}."
             )
         self.num = head.coder.max_num
-        self.gate_m, self.min_score = gate_m, min_score
-        self.noise_m, self.noise_rad = noise_m, math.radians(noise_deg)
+        self.gate_m = gate_m
+        self.min_score = min_score
+        self.noise_m = noise_m
+        self.noise_rad = math.radians(noise_deg)
 
-    def updated(self, results: Sequence[InstanceData], past: Past) -> list[InstanceData]:
-        """Return a batch's detections, as the head predicts them, with updated Gaussians."""
+    def update_detections(self, results: Sequence[InstanceData], past: Past) -> list[InstanceData]:
+        """Update the Gaussians of a batch of detections.
+
+        Args:
+            results: Detections of each sample, as predicted by the head.
+            past: Memory of the streams and the ego motion.
+
+        Returns:
+            Detections of each sample; those of a stream that starts are unchanged.
+        """
         if f"{PREFIX}labels" not in past.memory:
             return list(results)
         labels = past.memory[f"{PREFIX}labels"]
-        known = Gaussians(*(past.memory[f"{PREFIX}{name}"] for name in Gaussians._fields))
+        remembered = Gaussians(
+            means=past.memory[f"{PREFIX}means"],
+            scales=past.memory[f"{PREFIX}scales"],
+            rotations=past.memory[f"{PREFIX}rotations"],
+        )
         spread = past.seconds.sqrt()
-        drift = self.noise_m * spread, self.noise_rad * spread
-        moved = moved_gaussians(known, past.now_from_then, *drift)
-        return [
-            self._update(found, Gaussians(*(values[index] for values in moved)), labels[index])
-            if goes_on
-            else found
-            for index, (found, goes_on) in enumerate(
-                zip(results, past.continues.tolist(), strict=True)
-            )
-        ]
+        previous = moved_gaussians(
+            remembered, past.now_from_then, self.noise_m * spread, self.noise_rad * spread
+        )
+        updated = []
+        for index, continues in enumerate(past.continues.tolist()):
+            detections = results[index]
+            if continues:
+                detections = self._update_sample(
+                    detections, previous=_select(previous, index), labels=labels[index]
+                )
+            updated.append(detections)
+        return updated
 
-    def _update(self, found: InstanceData, known: Gaussians, labels: Tensor) -> InstanceData:
-        """Update one sample's detections by the elements of non-negative labels."""
-        kept, own = labels >= 0, found.scores_3d >= self.min_score
-        now = gaussians_of(found)
+    def _update_sample(
+        self, detections: InstanceData, previous: Gaussians, labels: Tensor
+    ) -> InstanceData:
+        """Update the detections of one sample by previous elements; label -1 is no element."""
+        exists = labels >= 0
+        is_confident = detections.scores_3d >= self.min_score
+        gaussians = detected_gaussians(detections)
         new = seen_again(
-            Gaussians(*(values[own] for values in now)),
-            found.labels_3d[own],
-            Gaussians(*(values[kept] for values in known)),
-            labels[kept],
+            _select(gaussians, is_confident),
+            detections.labels_3d[is_confident],
+            _select(previous, exists),
+            labels[exists],
             self.gate_m,
         )
-        means, scales, rotations = (
-            old.index_put((own,), values) for old, values in zip(now, new, strict=True)
-        )
-        result = found.clone()
-        result.pts = torch.cat([means, found.pts[..., 2:]], -1)
-        result.scales, result.rotations = scales, rotations
+        means = gaussians.means.index_put((is_confident,), new.means)
+        result = detections.clone()
+        result.pts = torch.cat([means, detections.pts[..., 2:]], -1)
+        result.scales = gaussians.scales.index_put((is_confident,), new.scales)
+        result.rotations = gaussians.rotations.index_put((is_confident,), new.rotations)
         return result
 
-    def left(self, results: Sequence[InstanceData]) -> dict[str, Tensor]:
-        """Return what a batch's detections leave, by name. (B, max_num, ...)"""
-        frames = []
-        for found in results:
-            own = found.scores_3d >= self.min_score
-            values = [found.labels_3d[own] + 1, *(part[own] for part in gaussians_of(found))]
-            rows = [part.new_zeros(self.num, *part.shape[1:]) for part in values]
-            for row, part in zip(rows, values, strict=True):
-                row[: len(part)] = part
-            frames.append([rows[0] - 1, *rows[1:]])  # label -1: no element
-        names = ["labels", *Gaussians._fields]
-        return {
-            f"{PREFIX}{name}": torch.stack(parts)
-            for name, parts in zip(names, zip(*frames, strict=True), strict=True)
-        }
+    def remember(self, results: Sequence[InstanceData]) -> dict[str, Tensor]:
+        """Memory of the detections of a batch, by name; label -1 fills up. (B, max_num, ...)"""
+        frames: dict[str, list[Tensor]] = {}
+        for detections in results:
+            is_confident = detections.scores_3d >= self.min_score
+            labels = detections.labels_3d[is_confident]
+            gaussians = _select(detected_gaussians(detections), is_confident)
+            filled = labels.new_full((self.num,), -1)
+            filled[: len(labels)] = labels
+            frames.setdefault("labels", []).append(filled)
+            for name, values in gaussians._asdict().items():
+                filled = values.new_zeros((self.num, *values.shape[1:]))
+                filled[: len(values)] = values
+                frames.setdefault(name, []).append(filled)
+        return {f"{PREFIX}{name}": torch.stack(values) for name, values in frames.items()}
 
 
-def gaussians_of(found: InstanceData) -> Gaussians:
-    """Return the Gaussians of a sample's detections, in the plane. (N, P)"""
-    return Gaussians(found.pts[..., :2].float(), found.scales.float(), found.rotations.float())
+def detected_gaussians(detections: InstanceData) -> Gaussians:
+    """Gaussians of the detections of a sample, in the plane, float32. (N, P, ...)"""
+    return Gaussians(
+        means=detections.pts[..., :2].float(),
+        scales=detections.scales.float(),
+        rotations=detections.rotations.float(),
+    )
+
+
+def _select(gaussians: Gaussians, index: Any) -> Gaussians:
+    """Index the first dimension of the fields."""
+    return Gaussians(
+        means=gaussians.means[index],
+        scales=gaussians.scales[index],
+        rotations=gaussians.rotations[index],
+    )

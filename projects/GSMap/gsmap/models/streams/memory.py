@@ -1,4 +1,4 @@
-"""A detector's memory: what its streams have left enters a batch, and what the batch leaves."""
+"""Memory of a detector: recall of the previous frames of a batch, and storage for the next ones."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -22,53 +22,54 @@ from gsmap.structures.streams import Frame, MapStream, Scenes, Slots, StreamStat
 from gsmap.structures.tensors import uploaded
 from gsmap.utils.errors import InputError
 
-# beginnings of names: half precision would move a point by centimetres
+# Prefixes of names that keep single precision: half precision would move points by centimetres.
 _EXACT = ("references", "targets", PREFIX)
 
 
 @dataclass
-class Remembering:
-    """A batch of a detector with memory, from its encoder to what it leaves.
+class BatchMemory:
+    """A batch of a detector with memory, from the encoder to the end of the frame.
 
     Args:
-        outputs: What the encoder returns, ``bev_feats`` of all frames so far. (B, C, H, W)
-        past: What the streams have left, None without memory.
-        propagation: The memory of queries, None without.
-        elements_left: What the detections leave, by name. (B, ...) each
+        outputs: Outputs of the encoder; ``bev_feats`` are fused with the memory. (B, C, H, W)
+        past: Memory of the streams and the ego motion, or None without memory.
+        propagation: Memory of queries, or None.
+        elements: Memory of the detections for the next frame, by name. (B, ...) each
     """
 
     outputs: dict[str, Any]
     past: Past | None = None
     propagation: Propagation | None = None
-    elements_left: dict[str, Tensor] = field(default_factory=dict)
+    elements: dict[str, Tensor] = field(default_factory=dict)
 
     @property
     def hooks(self) -> dict[str, tuple[FlowHook, ...]]:
-        """The argument ``hooks`` of a head, none for a head without memory of queries."""
+        """Keyword argument ``hooks`` of the head; empty without memory of queries."""
         return {} if self.propagation is None else {"hooks": (self.propagation,)}
 
 
 class StreamMemory(BaseModule):
-    """The memory of a `MapDetector`, one state per stream, moved by the poses of the samples.
+    """Memory of a `MapDetector`: one state per stream, transformed by the poses of the samples.
 
-    In training a stream is a place in the batch (`Slots`), in testing a scene (`Scenes`), whose
-    memories are empty at the start of each. Samples have ``scene``, ``timestamp_ns`` and
-    ``lidar2global`` in their metainfo.
+    In training a stream is a position in the batch (`Slots`). In testing it is a scene (`Scenes`);
+    every scene starts with an empty memory. The metainfo of a sample needs ``scene``,
+    ``timestamp_ns`` and ``lidar2global``.
 
     Args:
-        head: The detector's head, for queries a `MapHead`.
-        bev: Settings of `BEVMemory`, or None without memory of the map's features.
+        head: Head of the detector; a memory of queries needs a `MapHead`.
+        bev: Settings of `BEVMemory`, or None without memory of BEV features.
         queries: Settings of `QueryMemory`, or None without memory of queries.
         elements: Settings of `ElementMemory`, or None without memory of elements.
-        embed_dims: Channels of the map's features.
-        max_gap_s: A longer pause between two frames, in seconds, starts a stream anew.
-        half: Keep what is no place in half precision.
+        embed_dims: Channels of the BEV features.
+        max_gap_s: Longest pause between two frames of a stream, in seconds. After a longer one the
+            stream restarts.
+        half: Store features in half precision; coordinates keep single precision.
 
     Attributes:
-        name: The model's, for errors.
+        name: Name of the model in error messages.
 
     Raises:
-        ValueError: If there is no memory, one does not fit the head, or the pause is not > 0.
+        ValueError: If there is no memory, one does not fit the head, or ``max_gap_s`` is not > 0.
     """
 
     def __init__(
@@ -88,7 +89,8 @@ class StreamMemory(BaseModule):
             )
         if not max_gap_s > 0:
             raise InputError(f"temporal.max_gap_s must be seconds > 0, got {max_gap_s}.")
-        self.max_gap_s, self.half = max_gap_s, half
+        self.max_gap_s = max_gap_s
+        self.half = half
         self.name = f"a model with {type(head).__name__}"
         self.bev: BEVMemory | None = None
         if bev is not None:
@@ -113,106 +115,139 @@ class StreamMemory(BaseModule):
         return self.name
 
     def train(self, mode: bool = True) -> "StreamMemory":
-        """Switch between training and testing, and forget all streams."""
+        """Set the mode, and clear the memory of all streams."""
         self.streams = Slots(self.max_gap_s) if mode else self.new_scenes()
         return super().train(mode)
 
     def new_scenes(self) -> Scenes:
-        """Return empty memories of scenes."""
+        """Create an empty memory of scenes."""
         return Scenes(self.max_gap_s)
 
     def new_stream(self) -> MapStream:
-        """Return the empty memory of one scene, which a caller keeps."""
+        """Create an empty memory of one scene, which the caller owns."""
         stream = MapStream(self.max_gap_s)
         stream.claim(self)
         return stream
 
     @contextmanager
     def using(self, stream: Scenes) -> Iterator[None]:
-        """Take a caller's own stream for a while; ValueError if it is another model's."""
+        """Use a stream of the caller in this context.
+
+        Args:
+            stream: Memory of `new_stream` or `new_scenes`.
+
+        Raises:
+            ValueError: If the stream belongs to another model.
+        """
         stream.claim(self)
-        own, self.streams = self.streams, stream
+        model_streams = self.streams
+        self.streams = stream
         try:
             yield
         finally:
-            self.streams = own
+            self.streams = model_streams
 
     @contextmanager
-    def over(
+    def remember_batch(
         self, outputs: dict[str, Any], metas: Sequence[Mapping[str, Any]]
-    ) -> Iterator[Remembering]:
-        """Give a batch its memory, and keep what it leaves if nothing fails.
+    ) -> Iterator[BatchMemory]:
+        """Recall the memory of a batch, and store the new one when the context ends without error.
 
         Args:
-            outputs: What the encoder returns; ``bev_feats`` (B, C, H, W) is fused.
+            outputs: Outputs of the encoder, with ``bev_feats`` (B, C, H, W).
             metas: Metainfo of each sample.
 
         Yields:
             The batch with its memory.
         """
         if self.training and self.bev is None and self.queries is None:
-            yield Remembering(outputs)  # elements take no part in training, so need no poses
+            yield BatchMemory(outputs)  # elements are not part of training, so need no poses
             return
         frames = [Frame.of(meta) for meta in metas]
-        before = self.streams.previous(frames)
-        batch = self.enter(outputs, recalled(frames, before, outputs["bev_feats"].device))
+        states = self.streams.previous(frames)
+        past = stack_past(frames, states=states, device=outputs["bev_feats"].device)
+        batch = self.recall(outputs, past)
         yield batch
-        left = self.left(batch)
-        self.streams.keep(
-            [
-                StreamState(frame, {name: values[index] for name, values in left.items()})
-                for index, frame in enumerate(frames)
-            ]
-        )
+        memory = self.collect_memory(batch)
+        new_states = []
+        for index, frame in enumerate(frames):
+            values = {name: stacked[index] for name, stacked in memory.items()}
+            new_states.append(StreamState(frame, values))
+        self.streams.keep(new_states)
 
-    def enter(self, outputs: dict[str, Any], past: Past) -> Remembering:
-        """Return a batch with its memory, as `over` yields it."""
+    def recall(self, outputs: dict[str, Any], past: Past) -> BatchMemory:
+        """Fuse the outputs of the encoder with the memory.
+
+        Args:
+            outputs: Outputs of the encoder, with ``bev_feats`` (B, C, H, W).
+            past: Memory of the streams and the ego motion.
+        """
         feats = outputs["bev_feats"]
         if self.bev is not None:
             with torch.autocast(feats.device.type, enabled=False):
                 feats = self.bev(feats.float(), past)
         propagation = None if self.queries is None else Propagation(self.queries, past)
-        return Remembering({**outputs, "bev_feats": feats}, past, propagation)
+        return BatchMemory(
+            outputs={**outputs, "bev_feats": feats}, past=past, propagation=propagation
+        )
 
-    def updated(
-        self, batch: Remembering, results: Sequence[InstanceData]
+    def update_detections(
+        self, batch: BatchMemory, results: Sequence[InstanceData]
     ) -> Sequence[InstanceData]:
-        """Return a batch's detections, updated by those of the frame before, which they replace."""
+        """Update the detections of a batch by the memory of elements, and remember the result.
+
+        Args:
+            batch: The batch; its ``elements`` are set.
+            results: Detections of each sample.
+        """
         if self.elements is None or batch.past is None:
             return results
-        results = self.elements.updated(results, batch.past)
-        batch.elements_left = self.elements.left(results)
+        results = self.elements.update_detections(results, batch.past)
+        batch.elements = self.elements.remember(results)
         return results
 
-    def left(self, batch: Remembering) -> dict[str, Tensor]:
-        """Return what a batch leaves after its head, by name, without gradient. (B, ...) each"""
-        left = dict(batch.elements_left)
+    def collect_memory(self, batch: BatchMemory) -> dict[str, Tensor]:
+        """Memory of a batch for the next frame, by name, without gradient. (B, ...) each"""
+        memory = dict(batch.elements)
         if self.bev is not None:
-            left["bev_feats"] = self.bev.kept(batch.outputs["bev_feats"])
+            memory["bev_feats"] = self.bev.remember(batch.outputs["bev_feats"])
         if batch.propagation is not None:
-            left |= batch.propagation.left()
-        return {
-            name: values.half() if self.half and not name.startswith(_EXACT) else values
-            for name, values in left.items()
-        }
+            memory |= batch.propagation.collect_memory()
+        if self.half:
+            for name, values in memory.items():
+                if not name.startswith(_EXACT):
+                    memory[name] = values.half()
+        return memory
 
 
-def recalled(
-    frames: Sequence[Frame], before: Sequence[StreamState | None], device: torch.device
+def stack_past(
+    frames: Sequence[Frame], states: Sequence[StreamState | None], device: torch.device
 ) -> Past:
-    """Return what the frames' streams have left, on a device."""
-    pairs = list(zip(frames, before, strict=True))
-    motions = [np.eye(4) if s is None else frame.motion_from(s.frame) for frame, s in pairs]
-    seconds = [0.0 if s is None else frame.seconds_after(s.frame) for frame, s in pairs]
-    like = next((state.values for state in before if state is not None), {})
-    memory = {
-        name: torch.stack([torch.zeros_like(v) if s is None else s.values[name] for s in before])
-        for name, v in like.items()
-    }
-    moves = [
-        torch.from_numpy(np.stack(motions)),
-        torch.tensor(seconds, dtype=torch.float64),
-        torch.tensor([state is not None for state in before]),
-    ]
-    remembered = {name: values.to(device) for name, values in memory.items()}
-    return Past(remembered, *uploaded(moves, device))
+    """Stack the memory of the streams of a batch.
+
+    Args:
+        frames: The frames of the batch.
+        states: State of the stream of each frame, or None where a stream starts.
+        device: Device of the result.
+    """
+    motions = []
+    seconds = []
+    for frame, state in zip(frames, states, strict=True):
+        motions.append(np.eye(4) if state is None else frame.motion_from(state.frame))
+        seconds.append(0.0 if state is None else frame.seconds_after(state.frame))
+    now_from_then, elapsed, continues = uploaded(
+        [
+            torch.from_numpy(np.stack(motions)),
+            torch.tensor(seconds, dtype=torch.float64),
+            torch.tensor([state is not None for state in states]),
+        ],
+        device,
+    )
+    template = next((state.values for state in states if state is not None), {})
+    memory = {}
+    for name, example in template.items():
+        values = []
+        for state in states:
+            values.append(torch.zeros_like(example) if state is None else state.values[name])
+        memory[name] = torch.stack(values).to(device)
+    return Past(memory, now_from_then=now_from_then, seconds=elapsed, continues=continues)
