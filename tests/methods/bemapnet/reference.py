@@ -157,7 +157,7 @@ def check_decoder(golden: Golden, name: str) -> Iterator[Row]:
             scalar = scalar + weight * (value * noise).sum()
     code = decoder.position(torch.zeros(1, 12, 8))[0, ::8]
     yield Row(name, "pe", largest_difference(code, data["pe"]), 1e-5)
-    blocked = torch.stack([decoder.blocked(layer) for layer in outputs])
+    blocked = torch.stack([decoder.attention_mask(layer) for layer in outputs])
     packed = np.packbits(blocked.numpy().ravel())
     wrong = np.unpackbits(packed ^ data["attn_blocked"]).sum()
     yield Row(name, "blocked cells", wrong, 0)

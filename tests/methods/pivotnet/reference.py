@@ -100,7 +100,7 @@ def check_decoder(golden: Golden, name: str) -> Iterator[Row]:
     logits = [torch.cat([own.logits for own in layer], 1) for layer in outputs]
     masks = [torch.cat([own.masks for own in layer], 1) for layer in outputs]
     states = [torch.cat([own.states.flatten(1, 2) for own in layer], 1) for layer in outputs]
-    blocked = [decoder.blocked(layer) for layer in outputs]
+    blocked = [decoder.attention_mask(layer) for layer in outputs]
     ours = {
         "pred_logits": (torch.stack(logits), 3e-4),
         "mask_sub": (torch.stack(masks)[:, :, ::6, ::4, ::4], 3e-4),

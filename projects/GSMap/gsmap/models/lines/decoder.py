@@ -1,4 +1,4 @@
-"""PivotNet's and BeMapNet's line-aware decoder: points look at the cells of their line's mask."""
+"""Line-aware decoder: the points of a line attend to the cells of its mask."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -13,21 +13,34 @@ from gsmap.models.base.layers import feed_forward, init_matrices, mlp
 
 
 class ClassLines(NamedTuple):
-    """What a layer says of the lines of one map class."""
+    """Predictions of one decoder layer for the lines of one map class.
 
-    states: Tensor  # of their points (B, n, p, C)
-    logits: Tensor  # of a line and of none (B, n, 2)
-    masks: Tensor  # logits (B, n, H, W)
+    Attributes:
+        states: States of the points. (B, n, p, C)
+        logits: Logits of a line and of no line. (B, n, 2)
+        masks: Logits of the masks of the lines. (B, n, H, W)
+    """
+
+    states: Tensor
+    logits: Tensor
+    masks: Tensor
 
 
 class AttentionLayer(nn.Module):
-    """Attentions, one after another, and a feed-forward network; post-norm.
+    """Transformer layer with normalisation after each residual.
 
     Args:
-        embed_dims: Channels C; ``num_heads``, ``ffn_dims`` and ``dropout`` as everywhere.
-        to_memory: Whether there is attention to a memory beside that of the tokens.
-        memory_first: Whether it comes before.
+        embed_dims: Channels C.
+        num_heads: Heads of each attention.
+        ffn_dims: Hidden channels of the feed-forward network.
+        dropout: Probability to drop a value in training.
+        to_memory: Add cross-attention to a memory.
+        memory_first: Apply the cross-attention before the self-attention.
     """
+
+    self_attn: nn.MultiheadAttention
+    cross_attn: nn.MultiheadAttention
+    attentions: tuple[str, ...]  # names in the order of application
 
     def __init__(
         self,
@@ -39,15 +52,18 @@ class AttentionLayer(nn.Module):
         memory_first: bool = False,
     ) -> None:
         super().__init__()
-        self.crosses = sorted((False, True)[: 1 + to_memory], reverse=memory_first)
-        for cross in self.crosses:
-            attn = nn.MultiheadAttention(embed_dims, num_heads, dropout, batch_first=True)
-            if cross:
-                self.cross_attn = attn
-            else:
-                self.self_attn = attn
+        if not to_memory:
+            self.attentions = ("self_attn",)
+        elif memory_first:
+            self.attentions = ("cross_attn", "self_attn")
+        else:
+            self.attentions = ("self_attn", "cross_attn")
+        for name in self.attentions:
+            attention = nn.MultiheadAttention(embed_dims, num_heads, dropout, batch_first=True)
+            self.add_module(name, attention)
         self.ffn = feed_forward(embed_dims, ffn_dims, dropout)
-        self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in (*self.crosses, "ffn"))
+        num_norms = len(self.attentions) + 1
+        self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in range(num_norms))
         self.dropout = nn.Dropout(dropout)
 
     def forward(
@@ -58,31 +74,44 @@ class AttentionLayer(nn.Module):
         memory: Tensor | None = None,
         **masks: Tensor | None,
     ) -> Tensor:
-        """Update tokens by themselves, and by a memory (B, S, C) with keys of its own. (B, Q, C)
+        """Update the tokens.
 
-        Positions are part of queries and keys. ``masks``, as `nn.MultiheadAttention` has them, are
-        of the memory, without one of the tokens.
+        Args:
+            tokens: Tokens. (B, Q, C)
+            position: Positional encoding of the tokens, added to queries and keys. (B, Q, C)
+            key: Keys of the memory, positional encoding included. (B, S, C)
+            memory: Values of the memory. (B, S, C)
+            masks: ``attn_mask`` or ``key_padding_mask`` of `nn.MultiheadAttention`, for the
+                cross-attention, or for the self-attention if there is no memory.
+
+        Returns:
+            The updated tokens. (B, Q, C)
         """
-        own = masks if memory is None else {}
-        *norms, last = self.norms
-        for cross, norm in zip(self.crosses, norms, strict=True):
+        self_masks = masks if memory is None else {}
+        for index, name in enumerate(self.attentions):
             query = tokens + position
-            if cross:
-                seen, _ = self.cross_attn(query, key, memory, need_weights=False, **masks)
+            if name == "cross_attn":
+                update, _ = self.cross_attn(query, key, memory, need_weights=False, **masks)
             else:
-                seen, _ = self.self_attn(query, query, tokens, need_weights=False, **own)
-            tokens = norm(tokens + self.dropout(seen))
-        return last(self.ffn(tokens))
+                update, _ = self.self_attn(query, query, tokens, need_weights=False, **self_masks)
+            tokens = self.norms[index](tokens + self.dropout(update))
+        return self.norms[-1](self.ffn(tokens))
 
 
 @MODELS.register_module()
 class PointLineDecoder(BaseModule):
-    """Layers of points, each with lines' classes and masks that say what the next one may see.
+    """Decoder of point queries with masked cross-attention.
+
+    After each layer, classes and masks of the lines are predicted. In the next layer, the points of
+    a line attend to the cells of its mask.
 
     Args:
-        queries: Lines, and points of each, of every map class.
-        line_masks: Whether a point sees the cells of its line alone, as in the paper.
-        embed_dims: Channels C; ``num_layers``, ``num_heads`` and ``ffn_dims`` are the layers'.
+        queries: Number of lines n, and of points p per line, for every map class.
+        embed_dims: Channels C.
+        num_layers: Number of layers.
+        num_heads: Heads of each attention.
+        ffn_dims: Hidden channels of the feed-forward networks.
+        line_masks: Restrict cross-attention to the mask of the line, as in the paper.
     """
 
     def __init__(
@@ -95,9 +124,11 @@ class PointLineDecoder(BaseModule):
         line_masks: bool = True,
     ) -> None:
         super().__init__()
-        self.queries, self.line_masks = [(int(n), int(p)) for n, p in queries], line_masks
+        self.queries = [(int(n), int(p)) for n, p in queries]
+        self.line_masks = line_masks
         self.num_heads = num_heads
-        total = sum(n * p for n, p in self.queries)
+        self.points_per_class = [n * p for n, p in self.queries]
+        total = sum(self.points_per_class)
         self.query = nn.Embedding(total, embed_dims)
         self.query_pos = nn.Embedding(total, embed_dims)
         self.level = nn.Embedding(1, embed_dims)
@@ -107,47 +138,72 @@ class PointLineDecoder(BaseModule):
             for _ in range(num_layers)
         )
         self.norm = nn.LayerNorm(embed_dims)
-        joined, dims = [p * embed_dims for _, p in self.queries], [embed_dims] * 3
-        self.cls_branches = nn.ModuleList(nn.Linear(inputs, 2) for inputs in joined)
-        self.mask_branches = nn.ModuleList(mlp(inputs, *dims) for inputs in joined)
+        self.cls_branches = nn.ModuleList()
+        self.mask_branches = nn.ModuleList()
+        for _, p in self.queries:
+            line_dims = p * embed_dims
+            self.cls_branches.append(nn.Linear(line_dims, 2))
+            self.mask_branches.append(mlp(line_dims, embed_dims, embed_dims, embed_dims))
 
     def init_weights(self) -> None:
-        """Initialise the layers' matrices (Xavier)."""
+        """Initialise the matrices of the layers from Xavier's uniform distribution."""
         super().init_weights()
         init_matrices(self.layers)
 
     def forward(self, bev: Tensor) -> list[list[ClassLines]]:
-        """Return the lines of every class, before the first layer and after each. (B, C, H, W)"""
-        memory = bev.flatten(2).transpose(1, 2) + self.level.weight
-        nowhere = bev.new_zeros(1, *bev.shape[-2:])
-        key = memory + self.position(nowhere).flatten(2).transpose(1, 2)
-        states = self.query.weight.expand(len(bev), -1, -1)
+        """Decode BEV features.
+
+        Args:
+            bev: BEV features, row 0 at the front. (B, C, H, W)
+
+        Returns:
+            Lines of every class, before the first layer and after each layer.
+        """
+        memory = bev.flatten(2).transpose(1, 2) + self.level.weight  # (B, S, C)
+        height, width = bev.shape[-2:]
+        no_padding = bev.new_zeros((1, height, width))
+        key = memory + self.position(no_padding).flatten(2).transpose(1, 2)
+        states = self.query.weight.expand(len(bev), -1, -1)  # (B, Q, C)
         outputs = [self.lines(states, bev)]
         for layer in self.layers:
-            blocked = None
+            mask = None
             if self.line_masks:
-                blocked = self.blocked(outputs[-1]).repeat_interleave(self.num_heads, 0)
-            states = layer(states, self.query_pos.weight, key, memory, attn_mask=blocked)
+                mask = self.attention_mask(outputs[-1]).repeat_interleave(self.num_heads, 0)
+            states = layer(states, self.query_pos.weight, key=key, memory=memory, attn_mask=mask)
             outputs.append(self.lines(states, bev))
         return outputs
 
     def lines(self, states: Tensor, bev: Tensor) -> list[ClassLines]:
-        """Return what the states of all points (B, Q, C) say."""
-        found = []
-        points = self.norm(states).split([n * p for n, p in self.queries], 1)
-        parts = zip(points, self.queries, self.cls_branches, self.mask_branches, strict=True)
-        for own, (_, p), cls_branch, mask_branch in parts:
-            by_line = own.unflatten(1, (-1, p))
-            joined = by_line.flatten(2)
-            masks = torch.einsum("bnc,bchw->bnhw", mask_branch(joined), bev)
-            found.append(ClassLines(by_line, cls_branch(joined), masks))
-        return found
+        """Predict the lines of every class.
 
-    def blocked(self, lines: Sequence[ClassLines]) -> Tensor:
-        """Return which cells no point of a line may see; a line without any sees all. (B, Q, S)"""
-        by_class = []
-        for (_, p), own in zip(self.queries, lines, strict=True):
-            hidden = own.masks.detach().flatten(2) < 0
-            hidden &= ~hidden.all(-1, keepdim=True)
-            by_class.append(hidden.repeat_interleave(p, 1))
-        return torch.cat(by_class, 1)
+        Args:
+            states: States of all points. (B, Q, C)
+            bev: BEV features. (B, C, H, W)
+        """
+        states_by_class = self.norm(states).split(self.points_per_class, 1)
+        lines = []
+        for index, (_, p) in enumerate(self.queries):
+            point_states = states_by_class[index].unflatten(1, (-1, p))  # (B, n, p, C)
+            line_states = point_states.flatten(2)
+            logits = self.cls_branches[index](line_states)
+            kernels = self.mask_branches[index](line_states)  # (B, n, C)
+            masks = torch.einsum("bnc,bchw->bnhw", kernels, bev)
+            lines.append(ClassLines(point_states, logits=logits, masks=masks))
+        return lines
+
+    def attention_mask(self, lines: Sequence[ClassLines]) -> Tensor:
+        """Cross-attention mask of all points, from the masks of their lines.
+
+        Args:
+            lines: Lines of every class.
+
+        Returns:
+            True where attention is blocked; a line with an empty mask attends to all cells.
+            (B, Q, S)
+        """
+        masks = []
+        for (_, p), class_lines in zip(self.queries, lines, strict=True):
+            blocked = class_lines.masks.detach().flatten(2) < 0  # (B, n, S)
+            blocked &= ~blocked.all(-1, keepdim=True)
+            masks.append(blocked.repeat_interleave(p, 1))
+        return torch.cat(masks, 1)

@@ -1,4 +1,4 @@
-"""BEV features and masks as PivotNet sees them: rows from the front, columns from the left."""
+"""Rasters in the order of the line methods: rows from the front, columns from the left."""
 
 from collections.abc import Sequence
 
@@ -9,22 +9,47 @@ from gsmap.structures.grid import BEVGrid
 
 
 def front_size(grid: BEVGrid) -> tuple[int, int]:
-    """Return the numbers of a raster's pixels along the direction of travel and across it."""
-    return (grid.height, grid.width) if grid.forward == "y" else (grid.width, grid.height)
+    """Number of pixels of a raster along the direction of travel and across it."""
+    if grid.forward == "y":
+        return (grid.height, grid.width)
+    return (grid.width, grid.height)
 
 
 def turned(feats: Tensor, grid: BEVGrid) -> Tensor:
-    """Turn a raster with row 0 at the smallest y to the front, or back again. (..., H, W)"""
-    return feats.flip(-2) if grid.forward == "y" else feats.transpose(-1, -2).flip(-2, -1)
+    """Convert between row 0 at the smallest y and row 0 at the front, in both directions.
+
+    Args:
+        feats: Raster. (..., H, W)
+        grid: Extent of the map and its direction of travel.
+
+    Returns:
+        Raster of the other order. (..., H, W), or (..., W, H) if the direction of travel is x
+    """
+    if grid.forward == "y":
+        return feats.flip(-2)
+    return feats.transpose(-1, -2).flip(-2, -1)
 
 
 def centres(shapes: Sequence[tuple[int, int]], device: torch.device) -> Tensor:
-    """Return the centres (x, y) of maps' cells, [0, 1] over each, row-major. (all cells, 2)"""
-    grids = [BEVGrid((0.0, 1.0), (0.0, 1.0), *shape) for shape in shapes]
-    return torch.cat([grid.pixel_centres(device).flatten(0, 1) for grid in grids])
+    """Centres of the cells of feature maps, as points (x, y) in [0, 1].
+
+    Args:
+        shapes: Rows and columns of each map.
+        device: Device of the points.
+
+    Returns:
+        Centres map after map, row by row. (all cells, 2)
+    """
+    points = []
+    for height, width in shapes:
+        grid = BEVGrid((0.0, 1.0), (0.0, 1.0), height=height, width=width)
+        points.append(grid.pixel_centres(device).flatten(0, 1))
+    return torch.cat(points)
 
 
 def ahead(points: Tensor, grid: BEVGrid) -> Tensor:
-    """Return points (x, y) in metres as (ahead, to the left). (..., 2)"""
+    """Convert points (x, y) to distances ahead and to the left, in metres. (..., 2)"""
     x, y = points.unbind(-1)
-    return torch.stack([y, -x] if grid.forward == "y" else [x, y], -1)
+    if grid.forward == "y":
+        return torch.stack([y, -x], -1)
+    return torch.stack([x, y], -1)

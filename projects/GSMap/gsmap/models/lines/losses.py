@@ -1,8 +1,7 @@
-"""What the losses of lines of one map class share: matching, the lines' class, masks."""
+"""Base class of the losses of lines of one map class: matching, classification, masks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import islice
 from typing import Any, NamedTuple
 
 import torch
@@ -11,79 +10,169 @@ from torch import Tensor
 
 from gsmap.structures.tensors import constant, uploaded
 
-LINE = 0  # the place of a line's logit; the other one is of none
+LINE = 0  # index of the logit of a line; the other logit is that of no line
 
 
 class Case(NamedTuple):
-    """Lines of one class in one sample."""
+    """Lines of one class in one sample.
 
-    lines: Any  # as predicted (n, ...)
-    truth: Any  # as annotated, among them ``masks`` (K, ...)
-    apart: Tensor  # distances of their masks (n, K)
+    Attributes:
+        lines: Predicted lines, tensors (n, ...).
+        truth: Annotated lines, tensors (K, ...), with ``masks``.
+        apart: Distances between the masks. (n, K)
+        token: Token of the sample.
+    """
+
+    lines: Any
+    truth: Any
+    apart: Tensor
     token: str
 
 
 @dataclass(frozen=True)
 class LineLosses:
-    """What the losses of one map class share: matching, the lines' class, masks."""
+    """Base class of the losses of one map class.
 
-    cls: float = 2.0  # class, of matching too
-    mask: float = 5.0  # masks of lines, of matching too
-    semantic: float = 3.0  # masks of whole classes
-    none_weight: float = 0.5  # predictions of no line in ``cls``
+    Args:
+        cls: Weight of the classification, in losses and in matching.
+        mask: Weight of the masks of lines, in losses and in matching.
+        semantic: Weight of the masks of whole classes.
+        none_weight: Weight of predictions without a match in the classification.
+    """
+
+    cls: float = 2.0
+    mask: float = 5.0
+    semantic: float = 3.0
+    none_weight: float = 0.5
 
     def distances(self, masks: Sequence[Tensor], truths: Sequence[Tensor]) -> list[Tensor]:
-        """Return distances of all masks of each sample. (n, K) each"""
-        return [mask_distances(*pair) for pair in zip(masks, truths, strict=True)]
+        """Distances between the masks of each sample.
+
+        Args:
+            masks: Logits of the predicted masks of each sample. (n, H, W) each
+            truths: Annotated masks of each sample. (K, H, W) each
+
+        Returns:
+            Distances of each sample. (n, K) each
+        """
+        distances = []
+        for sample_masks, sample_truths in zip(masks, truths, strict=True):
+            distances.append(mask_distances(sample_masks, sample_truths))
+        return distances
 
     def mask_losses(self, masks: Tensor, truths: Tensor) -> Tensor:
-        """Return the distances of masks from what they should be. (M, H, W) each -> (M,)"""
+        """Distances between matched masks.
+
+        Args:
+            masks: Logits of the predicted masks. (M, H, W)
+            truths: Annotated masks. (M, H, W)
+
+        Returns:
+            Distance of each pair. (M,)
+        """
         return mask_distances(masks, truths).diagonal()
 
     @torch.no_grad()
     def match(self, cases: Sequence[Case]) -> list[Any]:
-        """Match the lines of each case; FloatingPointError if a cost is not a number.
+        """Match the lines of all cases.
 
-        All costs are read from the device in one copy, and all pairs return in one.
+        The costs of all cases are copied from the device at once, and so are the pairs to it.
+
+        Args:
+            cases: Lines of one class in one sample each.
+
+        Returns:
+            The result of `pairs` for each case, on the device.
+
+        Raises:
+            FloatingPointError: If a cost is not a number.
         """
-        parts = [self.costs(case) for case in cases]
-        flat = torch.cat([part.flatten() for own in parts for part in own])
-        values = iter(flat.cpu().split([part.numel() for own in parts for part in own]))
-        read = ([next(values).view(part.shape) for part in own] for own in parts)
-        matched = [self.pairs(*each) for each in zip(cases, read, strict=True)]
-        there = iter(uploaded([part for own in matched for part in own], flat.device))
-        return [own._make(islice(there, len(own))) for own in matched]
+        costs_by_case = [self.costs(case) for case in cases]
+        shapes: list[torch.Size] = []
+        values: list[Tensor] = []
+        for costs in costs_by_case:
+            shapes += [cost.shape for cost in costs]
+            values += [cost.flatten() for cost in costs]
+        flat = torch.cat(values)
+        chunks = flat.cpu().split([value.numel() for value in values])
+        on_cpu = [chunk.view(shape) for chunk, shape in zip(chunks, shapes, strict=True)]
+        matches = []
+        for case, costs in zip(cases, costs_by_case, strict=True):
+            case_costs = on_cpu[: len(costs)]
+            on_cpu = on_cpu[len(costs) :]
+            matches.append(self.pairs(case, case_costs))
+        return _uploaded_tuples(matches, flat.device)
 
     def costs(self, case: Case) -> tuple[Tensor, ...]:
-        """Return what the matching of a case reads; all cases are read in one copy."""
+        """Costs of the matching of a case, of any shapes, on the device."""
         raise NotImplementedError
 
     def pairs(self, case: Case, costs: list[Tensor]) -> Any:
-        """Match a case by its `costs`, on the CPU; return a NamedTuple of tensors there."""
+        """Match a case.
+
+        Args:
+            case: Lines of one class in one sample.
+            costs: The result of `costs`, on the CPU.
+
+        Returns:
+            A NamedTuple of tensors on the CPU.
+        """
         raise NotImplementedError
 
     def __call__(self, cases: Sequence[Case], matches: Sequence[Any]) -> dict[str, Tensor]:
-        """Return the weighted losses of a layer and class, from the cases of all samples."""
+        """Weighted losses of a layer and class, by name.
+
+        Args:
+            cases: Lines of the class in each sample.
+            matches: The result of `match`.
+        """
         raise NotImplementedError
 
     def line_costs(self, case: Case) -> Tensor:
-        """Return the weighted costs of class and masks. (2, n, K)"""
+        """Weighted costs of classification and masks. (2, n, K)"""
         score = case.lines.logits.softmax(-1)[:, LINE, None].expand_as(case.apart)
         return torch.stack([-self.cls * score, self.mask * case.apart])
 
     def class_loss(self, cases: Sequence[Case], rows: Sequence[Tensor]) -> Tensor:
-        """Return the weighted cross-entropy of lines, the matched rows of each case, and none."""
+        """Weighted cross-entropy of the classification.
+
+        Args:
+            cases: Lines of the class in each sample.
+            rows: Indices of the matched predictions of each case.
+        """
         logits = torch.cat([case.lines.logits for case in cases])
-        labels = [torch.full_like(case.lines.logits[:, 0], 1 - LINE).long() for case in cases]
-        for label, own in zip(labels, rows, strict=True):
-            label[own] = LINE
+        labels = []
+        for case, matched_rows in zip(cases, rows, strict=True):
+            case_labels = torch.full_like(case.lines.logits[:, 0], 1 - LINE).long()
+            case_labels[matched_rows] = LINE
+            labels.append(case_labels)
         weights = constant(logits, [1.0, self.none_weight])
         return self.cls * F.cross_entropy(logits, torch.cat(labels), weights)
 
 
+def _uploaded_tuples(tuples: Sequence[Any], device: torch.device) -> list[Any]:
+    """Copy NamedTuples of tensors to a device at once."""
+    tensors = [tensor for fields in tuples for tensor in fields]
+    on_device = uploaded(tensors, device)
+    result = []
+    for fields in tuples:
+        result.append(fields._make(on_device[: len(fields)]))
+        on_device = on_device[len(fields) :]
+    return result
+
+
 def mask_distances(logits: Tensor, masks: Tensor) -> Tensor:
-    """Return mean cross-entropy + dice of all pairs of masks. (n, H, W), (K, H, W) -> (n, K)"""
-    logits, masks = logits.flatten(1), masks.flatten(1)
+    """Mean binary cross-entropy plus dice distance of all pairs of masks.
+
+    Args:
+        logits: Logits of predicted masks. (n, H, W)
+        masks: Target masks in {0, 1}. (K, H, W)
+
+    Returns:
+        Distances. (n, K)
+    """
+    logits = logits.flatten(1)
+    masks = masks.flatten(1)
     shares = logits.sigmoid()
     entropy = F.softplus(logits).sum(1, keepdim=True) - logits @ masks.T
     sizes = shares.sum(1, keepdim=True) + masks.sum(1)
