@@ -1,4 +1,4 @@
-"""A head of lines whose classes have queries of their own: scores, masks, losses."""
+"""Base class of heads with separate line queries for each map class: scores, masks, losses."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -19,53 +19,68 @@ from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import tensor_versions
 from gsmap.utils.errors import InputError
 
-# of the losses of decoder layers; of fewer, the last ones
+# Weights of the losses of the decoder layers. A decoder with fewer layers uses the last ones.
 LAYER_WEIGHTS = (0.4, 0.4, 0.4, 0.8, 1.2, 1.6)
 
 
 class LinePredictions(NamedTuple):
-    """What the head says after a layer."""
+    """Predictions of the head after one decoder layer.
 
-    scores: Tensor  # logits, -inf but for a query's own class (B, N, classes)
-    references: Tensor  # points of each line (B, N, P, D)
-    lines: list[Any]  # by class, a tuple of (B, n, ...), among them ``logits`` and ``masks``
+    Attributes:
+        scores: Logits of the classes, -inf except for the class of the query. (B, N, classes)
+        references: Points of each line. (B, N, P, D)
+        lines: For every class a NamedTuple of tensors (B, n, ...), with ``logits`` and ``masks``.
+    """
+
+    scores: Tensor
+    references: Tensor
+    lines: list[Any]
 
 
 def class_scores(logits: Sequence[Tensor]) -> Tensor:
-    """Join what is said of each class's lines (B, n, 2): logits, -inf but for their own class.
+    """Class logits of all queries, from the logits of the lines of every class.
 
-    (B, N, classes)
+    Args:
+        logits: Logits of a line and of no line, for every class. (B, n, 2) each
+
+    Returns:
+        Their difference at the class of a query, -inf elsewhere. (B, N, classes)
     """
-    scores = [
-        F.pad(
-            own[..., LINE, None] - own[..., 1 - LINE, None],
-            (label, len(logits) - 1 - label),
-            value=-torch.inf,
-        )
-        for label, own in enumerate(logits)
-    ]
+    scores = []
+    for label, class_logits in enumerate(logits):
+        score = class_logits[..., LINE, None] - class_logits[..., 1 - LINE, None]
+        padding = (label, len(logits) - 1 - label)
+        scores.append(F.pad(score, padding, value=-torch.inf))
     return torch.cat(scores, 1)
 
 
 class LineHead(DetectionHead):
-    """A head of lines by class, with masks.
+    """Head of lines with masks, where every class has its queries.
 
     Args:
-        grid: The map's extent.
+        grid: Extent of the map.
         classes: Names of the classes.
-        numbers: Lines of each class.
-        decoder: Settings of `PointLineDecoder`; ValueError if there are more layers than weights.
-        losses: The losses of one class.
-        mask_pixel_m: Side of a pixel of the losses' masks in metres; the targets take it.
-        score_threshold: Lines of at most this score are dropped: 0.5 as long as there are just
-            lines and none.
+        numbers: Number of lines of each class.
+        decoder: Settings of `PointLineDecoder`.
+        losses: Losses of one class.
+        mask_pixel_m: Side of a pixel of the training masks in metres; also for the targets.
+        score_threshold: Lines of at most this score are dropped. With 0.5, a line remains if it is
+            more likely than no line.
         embed_dims: Channels C.
-        hidden_dims: Hidden channels of the map's coordinates.
+        hidden_dims: Hidden channels of the network of map coordinates.
         point_dims: Channels of each coordinate of a point.
+
+    Attributes:
+        targets: Description of the targets of the transform, for error messages.
+        level_weights: Weights of the class masks of the BEV levels. With fewer levels, the last
+            weights are used.
+
+    Raises:
+        ValueError: If the decoder has no layer or more than ``LAYER_WEIGHTS``.
     """
 
-    targets: str  # what the transform adds, in words
-    level_weights: Sequence[float]  # of the class masks of BEV levels; of fewer, the last ones
+    targets: str
+    level_weights: Sequence[float]
 
     def __init__(
         self,
@@ -82,8 +97,11 @@ class LineHead(DetectionHead):
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(init_cfg)
-        self.grid, self.classes, self.losses = grid, tuple(classes), losses
-        self.mask_size, self.point_dims = front_size(grid.rasterized(mask_pixel_m)), point_dims
+        self.grid = grid
+        self.classes = tuple(classes)
+        self.losses = losses
+        self.mask_size = front_size(grid.rasterized(mask_pixel_m))
+        self.point_dims = point_dims
         settings = {"type": "PointLineDecoder", "embed_dims": embed_dims}
         self.decoder = MODELS.build(settings | decoder)
         num_layers = len(self.decoder.layers)
@@ -95,50 +113,73 @@ class LineHead(DetectionHead):
         self.layer_weights = LAYER_WEIGHTS[-num_layers:]
         self.coder = MapCoder(grid, sum(numbers), None, score_threshold)
         self.semantic_branches = nn.ModuleList(nn.Conv2d(embed_dims, 2, 1) for _ in classes)
-        dims = (2, hidden_dims), (hidden_dims, hidden_dims), (hidden_dims, point_dims)
-        convs = [nn.Conv2d(*pair, 1) for pair in dims]
-        self.coordinates = nn.Sequential(convs[0], nn.ReLU(), convs[1], nn.ReLU(), convs[2])
-        self._kept: tuple[Any, Tensor] | None = None  # state of the weights, their feature
+        self.coordinates = nn.Sequential(
+            nn.Conv2d(2, hidden_dims, 1),
+            nn.ReLU(),
+            nn.Conv2d(hidden_dims, hidden_dims, 1),
+            nn.ReLU(),
+            nn.Conv2d(hidden_dims, point_dims, 1),
+        )
+        self._cache: tuple[Any, Tensor] | None = None  # versions of the weights, and the feature
 
     @classmethod
     def target_settings(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the settings of the transform that follow from those of the head."""
+        """Settings of the transform that follow from the settings of the head."""
         return {"pixel_m": settings["mask_pixel_m"]}
 
     def forward(self, bev_outputs: Tensors) -> list[LinePredictions]:
-        """Predict the lines after every decoder layer, from ``bev_feats`` (B, C, H, W)."""
+        """Predict the lines after every decoder layer.
+
+        Args:
+            bev_outputs: Outputs of the encoder, with ``bev_feats`` (B, C, H, W).
+        """
         layers = self.decoder(self.front(bev_outputs["bev_feats"]))[1:]
         mean = self.coordinate_feature()
         return [self.predictions(layer, mean) for layer in layers]
 
     def predictions(self, layer: Sequence[Any], mean: Tensor) -> LinePredictions:
-        """Return the lines and scores of what the decoder says after a layer."""
+        """Lines and scores of one decoder layer.
+
+        Args:
+            layer: Lines of every class (`ClassLines`).
+            mean: Result of `coordinate_feature`. (D,)
+        """
         raise NotImplementedError
 
     def coordinate_feature(self) -> Tensor:
-        """Return the mean of the coordinates' features over the map, kept in inference. (D,)
+        """Mean over the map of the features of its coordinates, cached in inference. (D,)
 
-        Differs from the paper, as released: points see the map's coordinates through this mean.
+        Differs from the paper, as in the released code: points are compared with this mean instead
+        of with the features of single cells.
         """
         if torch.is_grad_enabled() or torch.compiler.is_compiling():
-            self._kept = None  # fused optimizers change weights without a new version
+            self._cache = None  # fused optimizers change weights without a new version
             return self._mean_feature()
-        state = tensor_versions(self.coordinates)
-        if self._kept is None or self._kept[0] != state:
-            self._kept = state, self._mean_feature()
-        return self._kept[1]
+        versions = tensor_versions(self.coordinates)
+        if self._cache is None or self._cache[0] != versions:
+            self._cache = (versions, self._mean_feature())
+        return self._cache[1]
 
     def _mean_feature(self) -> Tensor:
-        """Return the mean of the coordinates' features over the map. (D,)"""
+        """Mean over the map of the features of its coordinates. (D,)"""
         device = self.decoder.query.weight.device
-        rows, cols = (torch.arange(n, device=device) / n for n in self.mask_size)
-        places = torch.stack(torch.meshgrid(cols, rows, indexing="xy"))  # (2, H, W)
-        hidden = self.coordinates[:-1](places[None]).mean((2, 3), keepdim=True)
+        height, width = self.mask_size
+        rows = torch.arange(height, device=device) / height
+        cols = torch.arange(width, device=device) / width
+        points = torch.stack(torch.meshgrid(cols, rows, indexing="xy"))  # (2, H, W)
+        # The last convolution is linear, so it may follow the mean.
+        hidden = self.coordinates[:-1](points[None]).mean((2, 3), keepdim=True)
         return self.coordinates[-1](hidden).flatten().float()
 
     def loss(self, bev_outputs: Tensors, batch_data_samples: Samples) -> Tensors:
-        """Run the head and return its losses, sums of all layers."""
-        outputs, feats = self(bev_outputs), bev_outputs["bev_feats"]
+        """Losses by name, summed over the layers.
+
+        Args:
+            bev_outputs: Outputs of the encoder, with ``bev_feats`` (B, C, H, W).
+            batch_data_samples: Samples with the targets of the transform.
+        """
+        outputs = self(bev_outputs)
+        feats = bev_outputs["bev_feats"]
         tokens = [str(sample.metainfo.get("token")) for sample in batch_data_samples]
         with torch.autocast(feats.device.type, enabled=False):
             truths = [self.truth(sample) for sample in batch_data_samples]
@@ -148,36 +189,53 @@ class LineHead(DetectionHead):
         return {f"loss_{name}": value for name, value in losses.items()}
 
     def annotated(self, sample: Det3DDataSample) -> InstanceData:
-        """Return a sample's annotated lines; ValueError if they are not of this head."""
-        instances, transform = sample.get("gt_instances_3d", InstanceData()), self.transforms[0]
+        """Annotated lines of a sample.
+
+        Raises:
+            ValueError: If the targets are of another transform or mask size.
+        """
+        instances = sample.get("gt_instances_3d", InstanceData())
+        transform = self.transforms[0]
         if "num_pts" not in instances or "masks" not in instances:
             raise InputError(
                 f"sample {sample.metainfo.get('token')!r} has no {self.targets}: put {transform} "
                 "in place of FormatMapTargets into the training pipeline."
             )
-        found = tuple(instances.masks.shape[1:])
-        if found != self.mask_size:
+        mask_size = tuple(instances.masks.shape[1:])
+        if mask_size != self.mask_size:
             raise InputError(
-                f"masks of {transform} are {found}, the head's {self.mask_size}: set pixel_m there "
-                "to the head's mask_pixel_m."
+                f"masks of {transform} are {mask_size}, the head's {self.mask_size}: set pixel_m "
+                "there to the head's mask_pixel_m."
             )
         return instances
 
     def truth(self, sample: Det3DDataSample) -> list[Any]:
-        """Return a sample's annotated lines, by class; ValueError if they are not of this head."""
+        """Annotated lines of a sample for every class, see `annotated`."""
         raise NotImplementedError
 
     def cases(self, lines: Any, truths: Sequence[Any], tokens: Sequence[str]) -> Iterator[Case]:
-        """Yield a layer's lines of a class by sample, with what is annotated."""
+        """Pair the lines of a class with the annotated ones, sample by sample.
+
+        Args:
+            lines: Lines of one layer and class, a NamedTuple of tensors (B, n, ...).
+            truths: Annotated lines of the class in each sample.
+            tokens: Token of each sample.
+        """
         lines = lines._replace(masks=self.enlarged(lines.masks))
-        apart = self.losses.distances(lines.masks, [truth.masks for truth in truths])
-        for own, *further in zip(zip(*lines, strict=True), truths, apart, tokens, strict=True):
-            yield Case(type(lines)(*own), *further)
+        distances = self.losses.distances(lines.masks, [truth.masks for truth in truths])
+        for index, token in enumerate(tokens):
+            sample_lines = lines._make([values[index] for values in lines])
+            yield Case(sample_lines, truth=truths[index], apart=distances[index], token=token)
 
     def semantic_loss(self, levels: Sequence[Tensor], truths: Sequence[Sequence[Any]]) -> Tensor:
-        """Return the loss of the class masks of all BEV levels (B, classes, H, W).
+        """Weighted loss of the class masks.
 
-        ValueError if there are more levels than weights.
+        Args:
+            levels: Logits of the class masks of each BEV level. (B, classes, H, W) each
+            truths: Annotated lines of each sample, for every class.
+
+        Raises:
+            ValueError: If there are more levels than ``level_weights``.
         """
         if len(levels) > len(self.level_weights):
             raise InputError(
@@ -185,13 +243,14 @@ class LineHead(DetectionHead):
                 f"weights for the class masks of {len(self.level_weights)}: give the encoder fewer "
                 "layers."
             )
-        drawn = [torch.stack([own.masks.sum(0).clamp(max=1) for own in truth]) for truth in truths]
-        by_class = torch.stack(drawn, 1)  # (classes, B, H, W)
-        terms = [
-            weight * self.losses.mask_losses(masks, own).mean()
-            for weight, level in zip(self.level_weights[-len(levels) :], levels, strict=True)
-            for masks, own in zip(level.transpose(0, 1), by_class, strict=True)
-        ]
+        targets = []
+        for label in range(len(self.classes)):
+            masks = [truth[label].masks.sum(0).clamp(max=1) for truth in truths]
+            targets.append(torch.stack(masks))  # (B, H, W)
+        terms = []
+        for weight, level in zip(self.level_weights[-len(levels) :], levels, strict=True):
+            for label, target in enumerate(targets):
+                terms.append(weight * self.losses.mask_losses(level[:, label], target).mean())
         return self.losses.semantic * torch.stack(terms).sum() / len(levels)
 
     def line_losses(
@@ -200,29 +259,44 @@ class LineHead(DetectionHead):
         truths: Sequence[Sequence[Any]],
         tokens: Sequence[str],
     ) -> tuple[Tensors, list[list[Any]]]:
-        """Return the losses of all layers and classes, and the pairs of each and every sample."""
-        groups = [
-            list(self.cases(lines, [truth[label] for truth in truths], tokens))
-            for layer in outputs
-            for label, lines in enumerate(layer.lines)
-        ]
-        pairs = iter(self.losses.match([case for group in groups for case in group]))
-        matches = [[next(pairs) for _ in group] for group in groups]
+        """Match all lines, and sum the weighted losses of all layers and classes.
+
+        Args:
+            outputs: Predictions of each layer.
+            truths: Annotated lines of each sample, for every class.
+            tokens: Token of each sample.
+
+        Returns:
+            Losses by name; and the matches of each layer and class, with one entry per sample.
+        """
+        groups: list[list[Case]] = []
+        weights: list[float] = []
+        num_groups = len(outputs) * len(self.classes)
+        for layer, layer_weight in zip(outputs, self.layer_weights, strict=True):
+            for label, lines in enumerate(layer.lines):
+                class_truths = [truth[label] for truth in truths]
+                groups.append(list(self.cases(lines, class_truths, tokens)))
+                weights.append(layer_weight / num_groups)
+        all_matches = self.losses.match([case for group in groups for case in group])
         totals: Tensors = {}
-        weights = [w / len(groups) for w in self.layer_weights for _ in self.classes]
-        for weight, group, matched in zip(weights, groups, matches, strict=True):
-            for name, value in self.losses(group, matched).items():
+        matches = []
+        for weight, group in zip(weights, groups, strict=True):
+            group_matches = all_matches[: len(group)]
+            all_matches = all_matches[len(group) :]
+            for name, value in self.losses(group, group_matches).items():
                 totals[name] = totals.get(name, 0) + weight * value
+            matches.append(group_matches)
         return totals, matches
 
     def class_masks(self, bev_feats: Tensor) -> Tensor:
-        """Return the logits of the classes' masks. (B, C, H, W) -> (B, classes, rows, columns)"""
+        """Logits of the class masks. (B, C, H, W) -> (B, classes, rows, columns)"""
         front = self.front(bev_feats)
-        # of the two channels of each class, the release trains the second alone
-        return self.enlarged(torch.cat([conv(front)[:, 1:] for conv in self.semantic_branches], 1))
+        # Each class has two channels, of which the released code trains the second only.
+        logits = [branch(front)[:, 1:] for branch in self.semantic_branches]
+        return self.enlarged(torch.cat(logits, 1))
 
     def front(self, bev_feats: Tensor) -> Tensor:
-        """Return BEV features from the front, as the decoder reads them. (B, C, H, W)"""
+        """BEV features with row 0 at the front, the input of the decoder. (B, C, H, W)"""
         return turned(bev_feats, self.grid)
 
     def enlarged(self, masks: Tensor) -> Tensor:

@@ -1,20 +1,28 @@
-"""Rules between state keys that releases of lines with one query each share: their code is one."""
+"""State keys that the releases of line methods have in common, and their names here."""
 
 import torch
 
 from gsmap.checkpoints.key_rules import Rules, rules_of
 
 LINE_DECODER = "ins_decoder.bev_decoder."
-"""What keys of these releases begin with, and of no other."""
+"""Prefix of keys in these releases only."""
 
 BEV = "bev_decoder.bev_encoder."
 LINEAR = "linear1.=ffn.layers.0.0. linear2.=ffn.layers.1. "
-_MLP = ((0, 0), (1, 2), (2, 4))  # matrices of an MLP, theirs and ours
+_MLP = ((0, 0), (1, 2), (2, 4))  # index of each matrix of an MLP: in the releases, here
 
 
 def mlps(theirs: str, ours: str) -> Rules:
-    """Return the rules of an MLP."""
-    return tuple((f"{theirs}layers.{old}.", f"{ours}{new}.") for old, new in _MLP)
+    """Rules of the keys of an MLP.
+
+    Args:
+        theirs: Prefix of its keys in a release.
+        ours: Prefix of its keys here.
+    """
+    rules = []
+    for old, new in _MLP:
+        rules.append((f"{theirs}layers.{old}.", f"{ours}{new}."))
+    return tuple(rules)
 
 
 LINE_DECODER_RULES = (
@@ -38,5 +46,5 @@ HEAD_RULES = (
     *mlps("output_head.coords_head.", "map_head.coordinates."),
     ("output_head.semantic_heads.{i}.0.", "map_head.semantic_branches.{i}."),
 )
-# settings: class weights of a loss
+# Not weights but a setting: class weights of a loss.
 CLASS_WEIGHTS = {"post_processor.criterion.empty_weight": torch.tensor((1.0, 0.5))}
