@@ -11,11 +11,11 @@ from reference.report import Row, largest_difference
 
 from gsmap.models.hdmapnet.vectorizing import (
     VectorizeConfig,
-    along_longer_side,
     clean_mask,
     cluster_pixels,
     order_by_distance,
     ridge_pixels,
+    sort_along_longer_side,
     top_directions,
     vectorize,
 )
@@ -51,7 +51,7 @@ def step_rows(name: str, chosen: str, maps: tuple, own: dict) -> Iterator[Row]:
         ridge = ridge_pixels(np.where(found > 0, probs[label], 0), config.ridge_tolerance)
         clusters.append(found)
         for number in range(1, found.max() + 1):
-            points = along_longer_side(found == number, ridge)
+            points = sort_along_longer_side(found == number, ridge)
             if len(points):  # a cluster without ridge makes no line
                 ridges.append(points)
                 ordered.append(order_by_distance(points))

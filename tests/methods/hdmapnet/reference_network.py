@@ -20,7 +20,7 @@ from torch import Tensor
 from gsmap.datasets.annotations.record import MapInstance
 from gsmap.models.base.layers import enlarged
 from gsmap.models.hdmapnet.decoder import LineMapDecoder, LineMaps
-from gsmap.models.hdmapnet.encoder import ViewTransformEncoder, sampled
+from gsmap.models.hdmapnet.encoder import ViewTransformEncoder, sample_maps
 from gsmap.models.hdmapnet.keys import HDMAPNET
 from gsmap.models.hdmapnet.losses import LineMapLosses
 from gsmap.models.hdmapnet.targets import MakeLineMaps
@@ -78,10 +78,10 @@ def check_view(golden: Golden, name: str) -> Iterator[Row]:
     feats = parts.normal("hd_view_feat", (2, 6, 8, 4, 6)).requires_grad_()
     matrices = torch.stack([parts.cam_from_ground(), parts.cam_from_ground((0.5, -0.3, 0.1))])
     yield Row(name, "RTs", largest_difference(matrices, data["RTs"]), 1e-5)
-    plane = encoder.plane(matrices.device).flatten(0, 1).T[:, ::7]
+    plane = encoder.cell_coordinates(matrices.device).flatten(0, 1).T[:, ::7]
     yield Row(name, "planes_sub", largest_difference(plane, data["planes_sub"][:2]), 1e-5)
-    views, places = encoder.from_above(feats), encoder.places(matrices)
-    laid = sampled(views.flatten(0, 1), places.flatten(0, 1))
+    views, places = encoder.transform_views(feats), encoder.cell_positions(matrices)
+    laid = sample_maps(views.flatten(0, 1), places.flatten(0, 1))
     topdown = encoder.encode(feats, {"cam_from_ground": matrices}, (64, 96))["bev_feats"]
     up = enlarged(topdown, (50, 100))
     ours = {
@@ -100,7 +100,7 @@ def check_view(golden: Golden, name: str) -> Iterator[Row]:
     gradients = parts.gradients_of(encoder, "bev_encoder.")
     yield from parts.gradient_rows(name, "", data, gradients, norm=1e-3)
     image = parts.normal("hd_bil_img", (1, 5, 6, 2)).movedim(-1, 1)
-    taken = sampled(image, torch.from_numpy(data["bil_pix"])).movedim(1, -1)
+    taken = sample_maps(image, torch.from_numpy(data["bil_pix"])).movedim(1, -1)
     yield Row(name, "bil_out", largest_difference(taken, data["bil_out"]), 1e-5)
 
 
@@ -264,7 +264,7 @@ def check_forward(golden: Golden, name: str) -> Iterator[Row]:
     maps = LineMaps(*(own[0] for own in model.map_head(outputs)))
     ours = {
         "cam_feat": (feats[0][:, ::8], 1e-3),
-        "bv_feat": (encoder.from_above(feats)[0][:, ::16, ::4, ::4], 1e-3),
+        "bv_feat": (encoder.transform_views(feats)[0][:, ::16, ::4, ::4], 1e-3),
         "topdown": (outputs["bev_feats"][0, ::16, ::4, ::4], 1e-3),
         "seg": (maps.semantic[:, ::4, ::4], 2e-4),
         "emb": (maps.embedding[:, ::8, ::8], 2e-4),

@@ -13,10 +13,10 @@ from gsmap.checkpoints.key_map import find_key_map
 from gsmap.datasets.annotations.record import MapInstance
 from gsmap.datasets.elements import elements_of_predictions
 from gsmap.models.hdmapnet.decoder import LineMaps
-from gsmap.models.hdmapnet.encoder import ViewTransformEncoder, sampled
+from gsmap.models.hdmapnet.encoder import ViewTransformEncoder, sample_maps
 from gsmap.models.hdmapnet.head import HDMapNetHead
 from gsmap.models.hdmapnet.keys import HDMAPNET
-from gsmap.models.hdmapnet.layout import metres_from_pixels, pixels_from_metres, turned
+from gsmap.models.hdmapnet.layout import metres_from_pixels, orient_forward, pixels_from_metres
 from gsmap.models.hdmapnet.losses import LineMapLosses
 from gsmap.models.hdmapnet.targets import MakeLineMaps
 from gsmap.structures.grid import BEVGrid
@@ -62,7 +62,7 @@ def test_both_frames_see_the_same_map():
         marked = torch.zeros(grid.height, grid.width)
         column, row = np.floor(grid.px_from_metres(point - 1e-6)).astype(int)
         marked[row, column] = 1
-        seen = turned(marked, grid)
+        seen = orient_forward(marked, grid)
         assert seen.shape == (24, 48)
         assert abs(seen.nonzero()[0].numpy()[::-1] + 0.5 - pixels[0]).max() <= 0.5
 
@@ -183,16 +183,18 @@ def test_the_cameras_see_ahead_and_a_sample_does_not_depend_on_its_batch():
 def test_places_of_cameras_in_metres_or_in_cells():
     moved = cameras()
     moved[..., 2, 3] = 3.0  # 3 m behind the origin
-    released, right = (encoder(released_units=flag).places(moved) for flag in (True, False))
+    released, right = (encoder(released_units=flag).cell_positions(moved) for flag in (True, False))
     torch.testing.assert_close(right[..., 0] - released[..., 0], torch.full((1, 2, 40, 20), 0.0))
-    halves = [encoder(released_units=f, bev_pixel_m=0.3).places(moved) for f in (True, False)]
+    halves = [
+        encoder(released_units=f, bev_pixel_m=0.3).cell_positions(moved) for f in (True, False)
+    ]
     torch.testing.assert_close(halves[1] - halves[0], torch.tensor([3.0, 0.0]).expand_as(halves[0]))
 
 
 def test_the_border_of_a_map_counts_as_outside():
     values = torch.arange(6.0).view(1, 1, 2, 3)
     places = torch.tensor([[[[0.0, 0.0], [1.5, 0.5], [2.0, 0.5], [-0.1, 0.0], [1.0, 1.0]]]])
-    assert sampled(values, places).flatten().tolist() == [0.0, 3.0, 0.0, 0.0, 0.0]
+    assert sample_maps(values, places).flatten().tolist() == [0.0, 3.0, 0.0, 0.0, 0.0]
 
 
 @pytest.mark.parametrize(
@@ -209,7 +211,7 @@ def test_the_border_of_a_map_counts_as_outside():
         (lambda: MakeLineMaps(num_directions=7), "num_directions must divide 360"),
         (lambda: sample([MapInstance(2, LINES[0].points)]), "label 2 of an element"),
         (lambda: sample(None), "'token-0' has no ground truth"),
-        (lambda: encoder().from_above(torch.zeros(1, 3, 1, 2, 4)), "built for 2 cameras"),
+        (lambda: encoder().transform_views(torch.zeros(1, 3, 1, 2, 4)), "built for 2 cameras"),
         (lambda: head().target(Det3DDataSample(), "gt_lines"), "put MakeLineMaps into"),
         (lambda: head(pixel_m=0.6).target(sample([]), "gt_lines"), "the head's maps are"),
         (

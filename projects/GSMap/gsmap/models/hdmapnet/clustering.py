@@ -1,10 +1,10 @@
-"""DBSCAN of many points that lie close together, in little memory."""
+"""DBSCAN of many points that lie close together, with little memory."""
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-import gsmap.utils.compilation  # noqa: F401 - says that kernels are compiled
+import gsmap.utils.compilation  # noqa: F401 - prints a notice when kernels are compiled
 
 Points = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -12,90 +12,109 @@ _NOISE = -1
 
 
 def dense_clusters(points: Points, eps: float, min_neighbours: int) -> Indices:
-    """Cluster points as DBSCAN does (Ester et al., 1996).
+    """Cluster points with DBSCAN (Ester et al., KDD 1996).
 
-    Points are sorted along their first principal axis, so that neighbours are near in this order;
-    a cluster grows over the points that no cluster has yet, so each is reached once.
-    `sklearn.cluster.DBSCAN` keeps the neighbours of all points, which are gigabytes where a
-    network that is not trained yet gives every pixel the same embedding.
+    Points are sorted along their first principal axis, which bounds the search for neighbours. A
+    cluster grows over unlabelled points only, so that each point is reached once. In contrast,
+    `sklearn.cluster.DBSCAN` stores the neighbours of all points, which takes gigabytes when an
+    untrained network predicts equal embeddings for all pixels.
 
     Args:
-        points: Float64. (n, E)
-        eps: Largest distance of neighbours.
-        min_neighbours: Neighbours that make a point the core of a cluster, itself included.
+        points: Points in E dimensions, float64. (n, E)
+        eps: Largest distance of two neighbours.
+        min_neighbours: Smallest number of neighbours of a core point, itself included.
 
     Returns:
-        The number of each point's cluster, from 0 on in the order of their first cores, -1 for
-        none. (n,)
+        Cluster number of each point, from 0 on in the order of the clusters' first core points; -1
+        for noise. (n,)
     """
     if not len(points):
-        return np.zeros(0, np.int64)
-    _, axes = np.linalg.eigh(np.cov(points, rowvar=False, bias=True).reshape(points.shape[1], -1))
-    points = points @ axes[:, ::-1]  # the axis along which they differ most first
+        return np.zeros(0, dtype=np.int64)
+    covariance = np.cov(points, rowvar=False, bias=True).reshape(points.shape[1], -1)
+    _, axes = np.linalg.eigh(covariance)
+    points = points @ axes[:, ::-1]  # in descending order of variance
     order = np.argsort(points[:, 0], kind="stable")
-    points = np.ascontiguousarray(points[order].T)  # few points are compared in all dimensions
+    points = np.ascontiguousarray(points[order].T)  # (E, n): most pairs differ in the first axes
     low = np.searchsorted(points[0], points[0] - eps)
-    high = np.searchsorted(points[0], points[0] + eps, "right")
-    labels = np.empty(len(order), np.int64)
-    labels[order] = _clusters(points, np.argsort(order), low, high, eps**2, min_neighbours)
+    high = np.searchsorted(points[0], points[0] + eps, side="right")
+    seeds = np.argsort(order)
+    labels = np.empty(len(order), dtype=np.int64)
+    labels[order] = _clusters(points, seeds, low, high, eps**2, min_neighbours)
     return labels
 
 
 @njit(cache=True)
 def _clusters(
-    points: Points, firsts: Indices, low: Indices, high: Indices, eps2: float, least: int
+    points: Points,
+    seeds: Indices,
+    low: Indices,
+    high: Indices,
+    eps2: float,
+    min_neighbours: int,
 ) -> Indices:
-    """Return the clusters of points whose neighbours lie between low and high; see above.
+    """Cluster points that are sorted along the first axis.
 
     Args:
-        points: (E, n)
-        firsts: In which order clusters begin. (n,)
-        low: First place that may be a neighbour's. (n,)
-        high: Place after the last that may be. (n,)
-        eps2: Largest squared distance of neighbours.
-        least: Neighbours of a core.
+        points: Sorted points. (E, n)
+        seeds: Points in the order in which clusters start from them. (n,)
+        low: First candidate neighbour of each point. (n,)
+        high: End (exclusive) of the candidate neighbours of each point. (n,)
+        eps2: Largest squared distance of two neighbours.
+        min_neighbours: Smallest number of neighbours of a core point, itself included.
+
+    Returns:
+        Cluster number of each point, -1 for noise. (n,)
     """
-    count, found = len(firsts), 0
-    core = np.array([_is_core(points, i, low[i], high[i], eps2, least) for i in range(count)])
-    labels, stack = np.full(count, _NOISE), np.empty(count, np.int64)
-    free = np.arange(count + 1)  # from each place, the next point of no cluster, by jumps
-    for first in firsts:
-        if not core[first] or labels[first] != _NOISE:
+    count = len(seeds)
+    is_core = np.zeros(count, np.bool_)
+    for i in range(count):
+        is_core[i] = _is_core(points, i, low[i], high[i], eps2, min_neighbours)
+    labels = np.full(count, _NOISE)
+    stack = np.empty(count, np.int64)  # points whose neighbours are still to be visited
+    unlabelled = np.arange(count + 1)  # jumps from each point towards the next unlabelled one
+    num_clusters = 0
+    for seed in seeds:
+        if not is_core[seed] or labels[seed] != _NOISE:
             continue
-        labels[first], free[first] = found, first + 1
-        stack[0], depth = first, 1
+        labels[seed] = num_clusters
+        unlabelled[seed] = seed + 1
+        stack[0] = seed
+        depth = 1
         while depth:
             depth -= 1
-            own = stack[depth]
-            other = _end(free, low[own])
-            while other < high[own]:
-                if _near(points, own, other, eps2):
-                    labels[other], free[other] = found, other + 1
-                    if core[other]:
+            point = stack[depth]
+            other = _follow_jumps(unlabelled, low[point])
+            while other < high[point]:
+                if _are_neighbours(points, point, other, eps2):
+                    labels[other] = num_clusters
+                    unlabelled[other] = other + 1
+                    if is_core[other]:
                         stack[depth] = other
                         depth += 1
-                other = _end(free, other + 1)
-        found += 1
+                other = _follow_jumps(unlabelled, other + 1)
+        num_clusters += 1
     return labels
 
 
 @njit(cache=True)
-def _is_core(points: Points, own: int, low: int, high: int, eps2: float, least: int) -> bool:
-    """Return whether a point has enough neighbours, itself included; the nearest places first."""
+def _is_core(
+    points: Points, point: int, low: int, high: int, eps2: float, min_neighbours: int
+) -> bool:
+    """Check whether a point has enough neighbours; candidates are tested from the nearest on."""
     number = 1
-    for step in range(1, max(own - low, high - 1 - own) + 1):
-        if own - step >= low:
-            number += _near(points, own, own - step, eps2)
-        if own + step < high:
-            number += _near(points, own, own + step, eps2)
-        if number >= least:
+    for step in range(1, max(point - low, high - 1 - point) + 1):
+        if point - step >= low:
+            number += _are_neighbours(points, point, point - step, eps2)
+        if point + step < high:
+            number += _are_neighbours(points, point, point + step, eps2)
+        if number >= min_neighbours:
             return True
-    return number >= least
+    return number >= min_neighbours
 
 
 @njit(cache=True)
-def _near(points: Points, i: int, j: int, eps2: float) -> bool:
-    """Return whether two points are neighbours; stops at the first dimension that says no."""
+def _are_neighbours(points: Points, i: int, j: int, eps2: float) -> bool:
+    """Check whether two points are neighbours; stops at the first axis that exceeds the limit."""
     total = 0.0
     for axis in points:
         total += (axis[i] - axis[j]) ** 2
@@ -105,11 +124,13 @@ def _near(points: Points, i: int, j: int, eps2: float) -> bool:
 
 
 @njit(cache=True)
-def _end(jumps: Indices, start: int) -> int:
-    """Return where the jumps from a place end, and shorten them."""
+def _follow_jumps(jumps: Indices, start: int) -> int:
+    """Return the end of the jumps from a point, and shorten these jumps."""
     end = start
     while jumps[end] != end:
         end = jumps[end]
     while jumps[start] != end:
-        jumps[start], start = end, jumps[start]
+        following = jumps[start]
+        jumps[start] = end
+        start = following
     return end

@@ -10,36 +10,42 @@ from gsmap.models.hdmapnet.encoder import JoinedMaps, conv_block
 
 
 class LineMaps(NamedTuple):
-    """What the network says of each pixel."""
+    """Predictions for each pixel."""
 
     semantic: Tensor  # logits of the background and the classes (B, 1 + classes, H, W)
-    embedding: Tensor  # alike on one element (B, E, H, W)
-    direction: Tensor  # logits of none and of the directions (B, 1 + K, H, W)
+    embedding: Tensor  # instance embeddings, similar within an element (B, E, H, W)
+    direction: Tensor  # logits of no direction and of K directions (B, 1 + K, H, W)
 
 
 class FineMaps(nn.Sequential):
-    """Enlarge a map of half the size, and say something of each pixel."""
+    """Prediction branch that enlarges a map to the resolution of the pixels.
+
+    Args:
+        inputs: Channels C of the map.
+        outputs: Channels D of the predictions.
+    """
 
     def __init__(self, inputs: int, outputs: int) -> None:
         hidden = inputs // 2
-        super().__init__(*conv_block(inputs, hidden), nn.Conv2d(hidden, outputs, 1))
+        projection = nn.Conv2d(hidden, outputs, kernel_size=1)
+        super().__init__(*conv_block(inputs, hidden), projection)
 
     def forward(self, feats: Tensor, like: Tensor) -> Tensor:  # type: ignore[override]
-        """Return a map as large as ``like``. (B, C, h, w), (B, _, H, W) -> (B, outputs, H, W)"""
+        """Predict at the size of ``like``. (B, C, h, w), (B, _, H, W) -> (B, D, H, W)"""
         return super().forward(enlarged(feats, like.shape[-2:]))
 
 
 class LineMapDecoder(nn.Module):
-    """Three stages of ResNet-18, and three decoders on the first and the last (HDMapNet, III-C).
+    """Three stages of ResNet-18, and three branches on the first and the last (HDMapNet, III-C).
 
     Args:
-        embed_dims: Channels of the BEV features.
+        embed_dims: Channels C of the BEV features.
         num_classes: Number of classes.
-        embedding_dims: Channels E of the embedding.
-        num_directions: Directions K.
-        shared_direction_block: Whether directions share the first block of the embeddings, as
-            released; its own was meant.
-        base_channels: Channels of the first stage; each further one has twice as many.
+        embedding_dims: Channels E of the instance embedding.
+        num_directions: Number K of directions.
+        shared_direction_block: Whether the directions share the first block of the embeddings, as
+            in the released code; the paper has a separate block.
+        base_channels: Channels of the first stage, doubled in each further stage.
     """
 
     def __init__(
@@ -52,41 +58,45 @@ class LineMapDecoder(nn.Module):
         base_channels: int = 64,
     ) -> None:
         super().__init__()
-        widths = base_channels, 2 * base_channels, 4 * base_channels
-        self.stem, self.stages = resnet_stages(BasicBlock, embed_dims, widths)
-        number = 2 if shared_direction_block else 3
-        blocks = [JoinedMaps(widths[0] + widths[2], widths[2]) for _ in range(number)]
-        self.joined = nn.ModuleList(blocks)
-        if shared_direction_block:  # the release runs it twice, so its statistics learn faster
-            for part in blocks[1]:
-                if isinstance(part, nn.BatchNorm2d):
-                    part.momentum = 1 - (1 - cast(float, part.momentum)) ** 2
-        outputs = 1 + num_classes, embedding_dims, 1 + num_directions
-        self.maps = nn.ModuleList(FineMaps(widths[2], channels) for channels in outputs)
+        widths = (base_channels, 2 * base_channels, 4 * base_channels)
+        self.stem, self.stages = resnet_stages(BasicBlock, embed_dims, widths=widths)
+        self.joined = nn.ModuleList()
+        for _ in range(2 if shared_direction_block else 3):
+            self.joined.append(JoinedMaps(widths[0] + widths[2], widths[2]))
+        if shared_direction_block:
+            # The release runs the shared block twice per step, which updates its running
+            # statistics twice.
+            for module in self.joined[1].modules():
+                if isinstance(module, nn.BatchNorm2d):
+                    module.momentum = 1 - (1 - cast(float, module.momentum)) ** 2
+        self.maps = nn.ModuleList()
+        for channels in (1 + num_classes, embedding_dims, 1 + num_directions):
+            self.maps.append(FineMaps(widths[2], channels))
 
     def init_weights(self) -> None:
-        """Initialise the stages as ResNets are; the last normalisation of a block begins at 0."""
-        for part in self.stages.modules():
-            if isinstance(part, nn.Conv2d):
-                nn.init.kaiming_normal_(part.weight, mode="fan_out", nonlinearity="relu")
-            elif isinstance(part, BasicBlock):
-                nn.init.zeros_(part.norm2.weight)
+        """Initialise the stages with Kaiming's method and each block's last normalisation at 0."""
+        for module in self.stages.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+            elif isinstance(module, BasicBlock):
+                nn.init.zeros_(module.norm2.weight)
 
     def forward(self, bev_feats: Tensor) -> LineMaps:
-        """Return maps of the features' size. (B, C, H, W)"""
+        """Predict maps of the size of the BEV features. (B, C, H, W)"""
         first, _, last = self.stage_maps(bev_feats)
         blocks = [block(first, last) for block in self.joined]
-        semantic, embedding, direction = self.maps
+        semantic_branch, embedding_branch, direction_branch = self.maps
         return LineMaps(
-            semantic(blocks[0], bev_feats),
-            embedding(blocks[1], bev_feats),
-            direction(blocks[-1], bev_feats),
+            semantic=semantic_branch(blocks[0], like=bev_feats),
+            embedding=embedding_branch(blocks[1], like=bev_feats),
+            direction=direction_branch(blocks[-1], like=bev_feats),
         )
 
     def stage_maps(self, bev_feats: Tensor) -> list[Tensor]:
-        """Return what the stages make: a half, a quarter and an eighth of the size."""
-        feats, found = self.stem(bev_feats), []
+        """Compute the features of the stages, at 1/2, 1/4 and 1/8 of the size. (B, C, H, W)"""
+        feats = self.stem(bev_feats)
+        outputs = []
         for stage in self.stages:
             feats = stage(feats)
-            found.append(feats)
-        return found
+            outputs.append(feats)
+        return outputs

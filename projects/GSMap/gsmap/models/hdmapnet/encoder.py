@@ -1,4 +1,4 @@
-"""HDMapNet's image neck and BEV encoder: each camera's map from above, learned, on one plane."""
+"""HDMapNet's image neck and BEV encoder, which learns a view transformation for each camera."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from gsmap.models.base.layers import enlarged
 from gsmap.models.encoders.camera_encoder import CameraEncoder
-from gsmap.models.hdmapnet.layout import ahead_size
+from gsmap.models.hdmapnet.layout import forward_size
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import constant
 from gsmap.utils.errors import InputError
@@ -19,28 +19,36 @@ from gsmap.utils.errors import InputError
 
 def conv_block(inputs: int, outputs: int) -> list[nn.Module]:
     """Return a 3x3 convolution, its normalisation and a ReLU."""
-    conv = nn.Conv2d(inputs, outputs, 3, padding=1, bias=False)
+    conv = nn.Conv2d(inputs, outputs, kernel_size=3, padding=1, bias=False)
     return [conv, nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)]
 
 
 class JoinedMaps(nn.Sequential):
-    """Enlarge a coarse map, and mix it with a fine one by two convolutions."""
+    """Fusion of a fine map and an enlarged coarse map by two convolutions.
+
+    Args:
+        inputs: Sum of the channels C and D of both maps.
+        outputs: Channels E of the result.
+    """
 
     def __init__(self, inputs: int, outputs: int) -> None:
-        super().__init__(*conv_block(inputs, outputs), *conv_block(outputs, outputs))
+        blocks = conv_block(inputs, outputs) + conv_block(outputs, outputs)
+        super().__init__(*blocks)
 
     def forward(self, fine: Tensor, coarse: Tensor) -> Tensor:  # type: ignore[override]
-        """Return a map as large as the fine one. (B, C, H, W), (B, D, h, w) -> (B, E, H, W)"""
-        return super().forward(torch.cat([fine, enlarged(coarse, fine.shape[-2:])], 1))
+        """Fuse two maps. (B, C, H, W), (B, D, h, w) -> (B, E, H, W)"""
+        coarse = enlarged(coarse, fine.shape[-2:])
+        return super().forward(torch.cat([fine, coarse], dim=1))
 
 
 @MODELS.register_module()
 class JoinLevels(BaseModule):
-    """An image neck: the backbone's two levels as one map, of the finer one's size (HDMapNet).
+    """Image neck that fuses two levels of the backbone at the size of the finer one (HDMapNet).
 
     Args:
-        in_channels: Channels of both levels, the finer first.
+        in_channels: Channels of both levels, the finer one first.
         out_channels: Channels of the result.
+        init_cfg: Initialisation config of mmengine.
     """
 
     def __init__(
@@ -53,28 +61,33 @@ class JoinLevels(BaseModule):
         self.joined = JoinedMaps(sum(in_channels), out_channels)
 
     def forward(self, feats: Sequence[Tensor]) -> tuple[Tensor]:
-        """Return the map. Two (n, C, h, w) -> (n, out_channels, h, w)"""
+        """Fuse both levels. Two (n, C, h, w) -> one (n, out_channels, h, w)"""
         fine, coarse = feats
         return (self.joined(fine, coarse),)
 
 
 @MODELS.register_module()
 class ViewTransformEncoder(CameraEncoder):
-    """Learn what each camera sees from above, and lay these maps on the ground (HDMapNet, III-B).
+    """BEV encoder with a learned view transformation for each camera (HDMapNet, III-B).
 
-    A camera has a network of its own that makes a map from above of all its pixels, the same for
-    each channel: 2/3 of the BEV's length and width, a sixth of that length behind the camera. Cells
-    take the maximum over the cameras. Intrinsics are not read, so weights fit one set of cameras
-    and one image size.
+    For each camera, a fully connected network transforms the pixels of a feature channel to a
+    top-down camera map, with weights shared by all channels. The camera map has 2/3 of the length
+    and width of the BEV and begins a sixth of that length behind the camera. A BEV cell has the
+    maximum of all camera maps. Intrinsics are not used, so the weights fit one set of cameras and
+    one image size.
 
     Args:
-        grid: The map's extent.
+        grid: Extent of the map, in metres.
         image_size: Rows and columns of the (padded) images.
         stride: Image pixels per feature pixel.
-        bev_pixel_m: Side of a BEV cell in metres; a cell of a camera's map is 5/3 of it.
-        num_cams: Number of cameras.
-        released_units: Whether places of cameras stay in metres, as released, where those of cells
-            are counted in cells of the cameras' maps.
+        bev_pixel_m: Side of a BEV cell in metres; a cell of a camera map is 5/3 as long.
+        num_cams: Number V of cameras.
+        released_units: Whether camera positions are in metres while cell positions are in cells of
+            the camera maps, as in the released code. Otherwise both are in cells.
+        init_cfg: Initialisation config of mmengine.
+
+    Raises:
+        ValueError: If the features or the camera maps would be empty.
     """
 
     calibration = ("cam_from_ground",)
@@ -90,79 +103,118 @@ class ViewTransformEncoder(CameraEncoder):
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(init_cfg)
-        self.grid, self.released_units = grid.rasterized(bev_pixel_m), released_units
+        self.grid = grid.rasterized(bev_pixel_m)
+        self.released_units = released_units
         self.view_pixel_m = bev_pixel_m / 0.6
-        self.feature_size = image_size[0] // stride, image_size[1] // stride
-        across, ahead = ahead_size(self.grid)
-        self.view_size = 2 * across // 5, 2 * ahead // 5
-        if min(*self.feature_size, *self.view_size) < 1:
-            raise InputError(
+        self.feature_size = (image_size[0] // stride, image_size[1] // stride)
+        num_rows, num_columns = forward_size(self.grid)
+        self.view_size = (2 * num_rows // 5, 2 * num_columns // 5)
+        if min(self.feature_size + self.view_size) < 1:
+            raise ValueError(
                 f"image_size {tuple(image_size)} by stride {stride} makes {self.feature_size} "
                 f"feature pixels, and the map a camera's map of {self.view_size} cells: neither "
                 "may be empty."
             )
         inputs = self.feature_size[0] * self.feature_size[1]
         cells = self.view_size[0] * self.view_size[1]
-        self.views = nn.ModuleList(
-            nn.Sequential(nn.Linear(inputs, cells), nn.ReLU(), nn.Linear(cells, cells), nn.ReLU())
-            for _ in range(num_cams)
-        )
+        self.views = nn.ModuleList()
+        for _ in range(num_cams):
+            view = nn.Sequential(
+                nn.Linear(inputs, cells), nn.ReLU(), nn.Linear(cells, cells), nn.ReLU()
+            )
+            self.views.append(view)
 
     def encode(
         self, feats: Tensor, calibration: Mapping[str, Tensor], img_shape: tuple[int, int]
     ) -> dict[str, Any]:
-        """Encode features (B, V, C, h, w), with ``cam_from_ground`` (B, V, 4, 4)."""
-        views, places = self.from_above(feats), self.places(calibration["cam_from_ground"])
-        laid_out = sampled(views.flatten(0, 1), places.flatten(0, 1)).unflatten(0, views.shape[:2])
-        return {"bev_feats": laid_out.amax(1)}  # the largest of any camera; 0 where none has one
+        """Encode image features to BEV features.
 
-    def from_above(self, feats: Tensor) -> Tensor:
-        """Return each camera's map, rows from its left, columns from near to far. (B, V, C, h, w)
+        Args:
+            feats: Image features. (B, V, C, h, w)
+            calibration: ``cam_from_ground``, transforms from the ground frame to the camera frames,
+                in metres. (B, V, 4, 4)
+            img_shape: Rows and columns of the padded images; unused.
 
-        ValueError if there are other cameras or feature pixels than the encoder is built for.
+        Returns:
+            ``bev_feats``, 0 where no camera map covers a cell. (B, C, H, W)
         """
-        found = feats.shape[1], *feats.shape[-2:]
-        if found != (len(self.views), *self.feature_size):
-            raise InputError(
+        views = self.transform_views(feats)
+        positions = self.cell_positions(calibration["cam_from_ground"])
+        samples = sample_maps(views.flatten(0, 1), positions.flatten(0, 1))  # (B * V, C, H, W)
+        return {"bev_feats": samples.unflatten(0, views.shape[:2]).amax(dim=1)}
+
+    def transform_views(self, feats: Tensor) -> Tensor:
+        """Transform the features of each camera to its top-down camera map.
+
+        Args:
+            feats: Image features. (B, V, C, h, w)
+
+        Returns:
+            Camera maps: rows from the camera's left to its right, columns from near to far.
+            (B, V, C, rows, columns)
+
+        Raises:
+            ValueError: If the number of cameras or the size of the features differs from the
+                settings.
+        """
+        num_cams = feats.shape[1]
+        size = tuple(feats.shape[-2:])
+        if num_cams != len(self.views) or size != self.feature_size:
+            raise ValueError(
                 f"the encoder is built for {len(self.views)} cameras of {self.feature_size} "
-                f"feature pixels, got {found[0]} of {found[1:]}: set num_cams, image_size and "
+                f"feature pixels, got {num_cams} of {size}: set num_cams, image_size and "
                 "stride of ViewTransformEncoder to those of the images."
             )
-        flat = feats.flatten(3).unbind(1)  # (B, C, h * w) each
-        maps = [view(own) for view, own in zip(self.views, flat, strict=True)]
-        return torch.stack(maps, 1).unflatten(-1, self.view_size)
+        pixels = feats.flatten(3).unbind(dim=1)  # (B, C, h * w) for each camera
+        maps = [view(values) for view, values in zip(self.views, pixels, strict=True)]
+        return torch.stack(maps, dim=1).unflatten(-1, self.view_size)
 
-    def places(self, cam_from_ground: Tensor) -> Tensor:
-        """Return where the BEV cells lie in the cameras' maps: column, row. (B, V, H, W, 2)"""
-        unit = self.view_pixel_m
+    def cell_positions(self, cam_from_ground: Tensor) -> Tensor:
+        """Compute the positions of the BEV cells in the camera maps.
+
+        Args:
+            cam_from_ground: Transforms from the ground frame to the camera frames, in metres.
+                (B, V, 4, 4)
+
+        Returns:
+            Continuous column and row of each cell. (B, V, H, W, 2)
+        """
         with torch.autocast(cam_from_ground.device.type, enabled=False):
             matrices = cam_from_ground.float()
-            plane = self.plane(matrices.device)
-            seen = torch.einsum("bvij,hwj->bvhwi", matrices[..., [0, 2], :2], plane)
-            camera = matrices[..., [0, 2], 3] / (1.0 if self.released_units else unit)
-            right, depth = (seen + camera[:, :, None, None]).unbind(-1)
+            cells = self.cell_coordinates(matrices.device)
+            rotations = matrices[..., [0, 2], :2]  # right and forward axis of the camera
+            rotated = torch.einsum("bvij,hwj->bvhwi", rotations, cells)
+            unit = 1.0 if self.released_units else self.view_pixel_m
+            offsets = matrices[..., [0, 2], 3] / unit  # (B, V, 2)
+            right, depth = (rotated + offsets[:, :, None, None]).unbind(dim=-1)
         height, width = self.view_size
-        return torch.stack([depth - width / 8, right + height / 2], -1)
+        return torch.stack([depth - width / 8, right + height / 2], dim=-1)
 
-    def plane(self, device: torch.device) -> Tensor:
-        """Return the place (x, y) of each BEV cell, in cells of the cameras' maps. (H, W, 2)
+    def cell_coordinates(self, device: torch.device) -> Tensor:
+        """Return x and y of each BEV cell in the ground frame, in cells of a camera map.
 
-        As released, the centres of the outer cells lie on the border of the map.
+        As in the released code, the centres of the outer cells lie on the border of the map.
+        (H, W, 2)
         """
-        grid, unit = self.grid, self.view_pixel_m
-        axes = (
-            torch.linspace(low / unit, high / unit, number, device=device)
-            for (low, high), number in ((grid.x_range, grid.width), (grid.y_range, grid.height))
-        )
-        return torch.stack(torch.meshgrid(*axes, indexing="xy"), -1)
+        unit = self.view_pixel_m
+        x_low, x_high = self.grid.x_range
+        y_low, y_high = self.grid.y_range
+        x = torch.linspace(x_low / unit, x_high / unit, steps=self.grid.width, device=device)
+        y = torch.linspace(y_low / unit, y_high / unit, steps=self.grid.height, device=device)
+        return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
 
 
-def sampled(maps: Tensor, places: Tensor) -> Tensor:
-    """Take values of maps between their pixels; 0 from the last row or column on, as released.
+def sample_maps(maps: Tensor, positions: Tensor) -> Tensor:
+    """Sample maps bilinearly; 0 from the last row or column on, as in the released code.
 
-    (n, C, h, w), columns and rows (n, H, W, 2) -> (n, C, H, W)
+    Args:
+        maps: Maps. (n, C, h, w)
+        positions: Continuous columns and rows. (n, H, W, 2)
+
+    Returns:
+        Sampled values. (n, C, H, W)
     """
-    last = constant(places, [maps.shape[-1] - 1, maps.shape[-2] - 1])
-    inside = ((places >= 0) & (places < last)).all(-1)
-    values = F.grid_sample(maps, 2 * places / last - 1, align_corners=True)
+    last = constant(positions, [maps.shape[-1] - 1, maps.shape[-2] - 1])
+    inside = ((positions >= 0) & (positions < last)).all(dim=-1)
+    values = F.grid_sample(maps, 2 * positions / last - 1, align_corners=True)
     return values * inside[:, None]

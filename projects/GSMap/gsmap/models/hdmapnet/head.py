@@ -1,7 +1,7 @@
-"""HDMapNet's head: a segmentation of any BEV features, and lines of its pixels."""
+"""HDMapNet's head: a segmentation of BEV features, and lines traced from its pixels."""
 
 import random
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -14,35 +14,36 @@ from gsmap.models.base.coder import DetectionHead, Samples, Tensors
 from gsmap.models.base.layers import enlarged
 from gsmap.models.base.parts import PARTS
 from gsmap.models.hdmapnet.decoder import LineMapDecoder, LineMaps
-from gsmap.models.hdmapnet.layout import ahead_size, metres_from_pixels, turned
+from gsmap.models.hdmapnet.layout import forward_size, metres_from_pixels, orient_forward
 from gsmap.models.hdmapnet.losses import LineMapLosses
 from gsmap.models.hdmapnet.vectorizing import VectorizeConfig, vectorize
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import padded
 from gsmap.utils.errors import InputError
 
-TARGETS = ("gt_lines", "gt_directions")
-
 
 @MODELS.register_module()
 class HDMapNetHead(DetectionHead):
-    """Segment BEV features into lines, tell their elements apart, and trace them (HDMapNet).
+    """Head that segments BEV features, clusters the pixels to elements and traces their lines.
 
     Args:
-        grid: The map's extent.
+        grid: Extent of the map, in metres.
         classes: Names of the classes.
-        embed_dims: Channels of the BEV features, from any encoder; they are resized to the pixels.
+        embed_dims: Channels C of the BEV features. Features of another size than the raster are
+            resized.
         pixel_m: Side of a pixel in metres, as in `MakeLineMaps`.
-        embedding_dims: Channels of the embedding that tells elements apart.
-        num_directions: Directions that a line may have, as in `MakeLineMaps`.
-        decoder: Settings of `LineMapDecoder`: ``shared_direction_block``, ``base_channels``.
+        embedding_dims: Channels E of the instance embedding.
+        num_directions: Number K of line directions, as in `MakeLineMaps`; a divisor of 360.
+        decoder: Settings ``shared_direction_block`` and ``base_channels`` of `LineMapDecoder`.
         losses: Settings of `LineMapLosses`.
         vectorizing: Settings of `VectorizeConfig`.
-        random_start: Whether tracing begins at a point taken by chance, as released; by default at
-            the first, so that the same features give the same lines.
+        random_start: Whether tracing starts from a random point, as in the released code. By
+            default it starts from the first point, so that predictions are reproducible.
+        init_cfg: Initialisation config of mmengine.
 
     Raises:
-        ValueError: If directions are no whole numbers of degrees apart.
+        ValueError: If ``num_directions`` does not divide 360, or differs from the angle in
+            ``vectorizing``.
     """
 
     transforms = ("MakeLineMaps",)
@@ -66,54 +67,87 @@ class HDMapNetHead(DetectionHead):
     ) -> None:
         super().__init__(init_cfg)
         if num_directions < 1 or 360 % num_directions:
-            raise InputError(f"num_directions must divide 360, got {num_directions}.")
-        self.grid, self.classes = grid.rasterized(pixel_m), tuple(classes)
-        self.map_size, self.random_start = ahead_size(self.grid), random_start
+            raise ValueError(f"num_directions must divide 360, got {num_directions}.")
+        self.grid = grid.rasterized(pixel_m)
+        self.classes = tuple(classes)
+        self.map_size = forward_size(self.grid)
+        self.random_start = random_start
         self.losses = LineMapLosses(**(losses or {}))
-        self.num_directions, degrees = num_directions, 360 // num_directions
+        self.num_directions = num_directions
+        degrees = 360 // num_directions
         self.vectorizing = VectorizeConfig(**{"degrees": degrees, **(vectorizing or {})})
         if self.vectorizing.degrees != degrees:
             raise InputError(
                 f"vectorizing.degrees is {self.vectorizing.degrees}, but {num_directions} "
                 f"directions are {degrees} degrees apart: leave it out, num_directions decides it."
             )
-        sizes = embed_dims, len(classes), embedding_dims, num_directions
-        self.decoder = LineMapDecoder(*sizes, **(decoder or {}))
+        self.decoder = LineMapDecoder(
+            embed_dims=embed_dims,
+            num_classes=len(classes),
+            embedding_dims=embedding_dims,
+            num_directions=num_directions,
+            **(decoder or {}),
+        )
 
     @classmethod
     def target_settings(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the settings of the transform that follow from those of the head."""
-        return {name: settings[name] for name in ("pixel_m", "num_directions")}
+        """Return the settings of `MakeLineMaps` that follow from the head's settings."""
+        return {"pixel_m": settings["pixel_m"], "num_directions": settings["num_directions"]}
 
     def forward(self, bev_outputs: Tensors) -> LineMaps:
-        """Return maps of all pixels, from ``bev_feats`` (B, C, H, W)."""
-        feats = turned(bev_outputs["bev_feats"], self.grid)
+        """Predict maps of all pixels from ``bev_feats``. (B, C, H, W)"""
+        feats = orient_forward(bev_outputs["bev_feats"], self.grid)
         if feats.shape[-2:] != self.map_size:
             feats = enlarged(feats, self.map_size)
-        return LineMaps(*(values.float() for values in self.decoder(feats)))
+        maps = self.decoder(feats)
+        return LineMaps(
+            semantic=maps.semantic.float(),
+            embedding=maps.embedding.float(),
+            direction=maps.direction.float(),
+        )
 
     def loss(self, bev_outputs: Tensors, batch_data_samples: Samples) -> Tensors:
-        """Run the head and return its losses."""
+        """Compute the losses of `LineMapLosses`.
+
+        Args:
+            bev_outputs: Outputs of the BEV encoder: ``bev_feats``. (B, C, H, W)
+            batch_data_samples: Samples with the targets of `MakeLineMaps`.
+
+        Raises:
+            ValueError: If a sample has no targets, or targets that do not fit the head.
+        """
         maps = self(bev_outputs)
-        numbers, directions = (
-            torch.stack([self.target(sample, name) for sample in batch_data_samples])
-            for name in TARGETS
-        )
-        with torch.autocast(maps.semantic.device.type, enabled=False):
-            return self.losses(maps, *(t.to(maps.semantic.device) for t in (numbers, directions)))
+        device = maps.semantic.device
+        numbers = [self.target(sample, "gt_lines") for sample in batch_data_samples]
+        directions = [self.target(sample, "gt_directions") for sample in batch_data_samples]
+        with torch.autocast(device.type, enabled=False):
+            return self.losses(
+                maps,
+                numbers=torch.stack(numbers).to(device),
+                directions=torch.stack(directions).to(device),
+            )
 
     def target(self, sample: Det3DDataSample, name: str) -> Tensor:
-        """Return a sample's target; ValueError if there is none, or it is not of this head."""
+        """Return a target of a sample.
+
+        Args:
+            sample: Training sample.
+            name: ``gt_lines`` (classes, rows, columns) or ``gt_directions`` (2, rows, columns).
+
+        Raises:
+            ValueError: If the sample has no such target, or if it does not fit the head.
+        """
         if name not in sample:
             raise InputError(
                 f"sample {sample.metainfo.get('token')!r} has no {name}: put MakeLineMaps into the "
                 "training pipeline."
             )
         target = sample.get(name).long()
-        wanted = {"gt_lines": len(self.classes), "gt_directions": 2}[name], *self.map_size
-        if tuple(target.shape) != wanted:
-            raise InputError(
-                f"{name} is {tuple(target.shape)}, the head's maps are {wanted}: give MakeLineMaps "
+        channels = len(self.classes) if name == "gt_lines" else 2
+        shape = (channels, *self.map_size)
+        if tuple(target.shape) != shape:
+            raise ValueError(
+                f"{name} is {tuple(target.shape)}, the head's maps are {shape}: give MakeLineMaps "
                 "the head's pixel_m and number of classes, and the grid's forward."
             )
         if name == "gt_directions" and target.max() > self.num_directions:
@@ -124,23 +158,41 @@ class HDMapNetHead(DetectionHead):
         return target
 
     def predict(self, bev_outputs: Tensors, batch_data_samples: Samples) -> list[InstanceData]:
-        """Run the head and return its lines, as `DetectionHead` its detections.
+        """Predict the lines of each sample, the highest score first.
 
-        ``pts`` (M, P, 2) has the last point of each line repeated, ``num_pts`` (M,) their numbers.
+        Args:
+            bev_outputs: Outputs of the BEV encoder: ``bev_feats``. (B, C, H, W)
+            batch_data_samples: Samples of the batch.
+
+        Returns:
+            For each sample ``pts`` in metres (M, P, 2), filled with the last point of a line,
+            ``num_pts`` (M,), ``labels_3d`` (M,) and ``scores_3d`` (M,).
         """
-        return [self.lines(LineMaps(*own)) for own in zip(*self(bev_outputs), strict=True)]
+        maps = self(bev_outputs)
+        results = []
+        for semantic, embedding, direction in zip(*maps, strict=True):
+            results.append(self.lines(LineMaps(semantic, embedding, direction=direction)))
+        return results
 
     def lines(self, maps: LineMaps) -> InstanceData:
-        """Return the lines of a sample's maps, (channels, H, W) each, best first."""
-        choose_start: Any = random.randrange if self.random_start else None
-        found = vectorize(*maps, self.vectorizing, choose_start)
-        found = [line for line in found if len(line.pixels) > 1]
-        found.sort(key=lambda line: -line.score)
-        pts = padded([metres_from_pixels(line.pixels + 0.5, self.grid) for line in found])
-        lines = InstanceData(
-            scores_3d=torch.tensor([line.score for line in found]),
-            labels_3d=torch.tensor([line.label for line in found], dtype=torch.long),
-            pts=torch.from_numpy(pts).float(),
-            num_pts=torch.tensor([len(line.pixels) for line in found], dtype=torch.long),
+        """Trace the lines of one sample's maps, the highest score first. (channels, H, W) each"""
+        choose_start: Callable[[int], int] | None = None
+        if self.random_start:
+            choose_start = random.randrange
+        traced_lines = vectorize(
+            maps.semantic,
+            maps.embedding,
+            direction=maps.direction,
+            config=self.vectorizing,
+            choose_start=choose_start,
         )
-        return lines.to(maps.semantic.device)
+        lines = [line for line in traced_lines if len(line.pixels) > 1]
+        lines.sort(key=lambda line: -line.score)
+        pts = padded([metres_from_pixels(line.pixels + 0.5, self.grid) for line in lines])
+        instances = InstanceData(
+            scores_3d=torch.tensor([line.score for line in lines]),
+            labels_3d=torch.tensor([line.label for line in lines], dtype=torch.long),
+            pts=torch.from_numpy(pts).float(),
+            num_pts=torch.tensor([len(line.pixels) for line in lines], dtype=torch.long),
+        )
+        return instances.to(maps.semantic.device)

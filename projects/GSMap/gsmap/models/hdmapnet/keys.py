@@ -1,4 +1,4 @@
-"""The table between the state keys of HDMapNet's release and ours."""
+"""Mapping between the state keys of the released HDMapNet and of this project."""
 
 from gsmap.checkpoints.efficientnet_keys import (
     efficientnet_rules,
@@ -31,7 +31,7 @@ HDMAPNET = KeyMap(
     ),
     {
         **unused_classifier(_TRUNK),
-        # the directions' own first block: they take that of the embeddings
+        # an unused first block of the directions, which share the block of the embeddings
         **zeros(
             f"{_BEV}up1_direction.conv.",
             {

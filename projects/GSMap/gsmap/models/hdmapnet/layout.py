@@ -1,4 +1,4 @@
-"""Maps as HDMapNet sees them: columns from rear to front, rows from right to left."""
+"""HDMapNet's raster layout: columns from rear to front, rows from right to left."""
 
 from typing import Any
 
@@ -9,28 +9,42 @@ from torch import Tensor
 from gsmap.structures.grid import BEVGrid
 
 
-def ahead_size(grid: BEVGrid) -> tuple[int, int]:
-    """Return the numbers of a raster's pixels across the direction of travel and along it."""
-    return (grid.height, grid.width) if grid.forward == "x" else (grid.width, grid.height)
+def forward_size(grid: BEVGrid) -> tuple[int, int]:
+    """Return the number of rows (across the direction of travel) and of columns (along it)."""
+    if grid.forward == "x":
+        return grid.height, grid.width
+    return grid.width, grid.height
 
 
-def turned(feats: Tensor, grid: BEVGrid) -> Tensor:
-    """Turn a map with row 0 at the smallest y to this layout. (..., H, W)"""
-    return feats if grid.forward == "x" else feats.transpose(-1, -2).flip(-2)
+def orient_forward(feats: Tensor, grid: BEVGrid) -> Tensor:
+    """Rotate a map with row 0 at the smallest y to this layout.
+
+    (..., H, W) -> (..., rows, columns)
+    """
+    if grid.forward == "x":
+        return feats
+    return feats.transpose(-1, -2).flip(-2)
 
 
 def pixels_from_metres(points: NDArray[Any], grid: BEVGrid) -> NDArray[np.float64]:
-    """Return continuous pixels (column, row) of points (x, y); centres are at + 0.5. (..., 2)"""
-    low, size = np.array([grid.x_range[0], grid.y_range[0]]), np.array([grid.width, grid.height])
-    pixels = (points.astype(np.float64) - low) * (size / np.array(grid.extent_m))
+    """Convert points (x, y) in metres to continuous pixels (column, row), centres at + 0.5.
+
+    (..., 2) -> (..., 2)
+    """
+    low = np.array([grid.x_range[0], grid.y_range[0]])
+    scale = np.array([grid.width, grid.height]) / np.array(grid.extent_m)
+    pixels = (points.astype(np.float64) - low) * scale
     if grid.forward == "x":
         return pixels
-    return np.stack([pixels[..., 1], grid.width - pixels[..., 0]], -1)
+    return np.stack([pixels[..., 1], grid.width - pixels[..., 0]], axis=-1)
 
 
 def metres_from_pixels(pixels: NDArray[Any], grid: BEVGrid) -> NDArray[np.float64]:
-    """Return the points (x, y) of continuous pixels (column, row). (..., 2)"""
+    """Convert continuous pixels (column, row) to points (x, y) in metres. (..., 2) -> (..., 2)"""
     column, row = np.moveaxis(pixels.astype(np.float64), -1, 0)
-    across = (column, row) if grid.forward == "x" else (grid.width - row, column)
+    if grid.forward == "x":
+        grid_pixels = np.stack([column, row], axis=-1)
+    else:
+        grid_pixels = np.stack([grid.width - row, column], axis=-1)
     low = np.array([grid.x_range[0], grid.y_range[0]])
-    return np.stack(across, -1) * np.array(grid.pixel_size_m) + low
+    return grid_pixels * np.array(grid.pixel_size_m) + low

@@ -1,4 +1,4 @@
-"""HDMapNet's losses: of classes, of instance embeddings, and of directions."""
+"""HDMapNet's losses of classes, instance embeddings and directions."""
 
 from dataclasses import dataclass
 
@@ -13,16 +13,19 @@ from gsmap.utils.errors import InputError
 
 @dataclass(frozen=True)
 class LineMapLosses:
-    """Weights of the losses, and their settings, as in the release.
+    """HDMapNet's losses with their weights, by default as in the released code.
 
     Args:
-        semantic: Weight of the classes' cross-entropy.
+        semantic: Weight of the classification loss, a binary cross-entropy.
         pull: Weight of the distance of an instance's pixels from its mean embedding.
-        push: Weight of the nearness of different instances.
-        direction: Weight of the directions' cross-entropy.
-        pos_weight: Weight of a class's own pixels in its cross-entropy.
-        pull_margin: Distance from the mean that costs nothing.
-        push_margin: Distance of two means that costs nothing.
+        push: Weight of the proximity of different instances' mean embeddings.
+        direction: Weight of the direction loss, a binary cross-entropy.
+        pos_weight: Weight of positive pixels in the classification loss.
+        pull_margin: Distance from the mean embedding below which the pull loss is 0.
+        push_margin: Distance of two mean embeddings above which the push loss is 0.
+
+    Raises:
+        ValueError: If a setting is negative.
     """
 
     semantic: float = 1.0
@@ -39,57 +42,81 @@ class LineMapLosses:
                 raise InputError(f"losses.{name} must not be negative.")
 
     def __call__(self, maps: LineMaps, numbers: Tensor, directions: Tensor) -> dict[str, Tensor]:
-        """Return the weighted losses.
+        """Compute the weighted losses.
 
         Args:
-            maps: What the network says, of a batch.
-            numbers: Which instance of a class a pixel belongs to, 0 for none. (B, classes, H, W)
-            directions: Direction 1 to K forward and backward, 0 for none. (B, 2, H, W)
+            maps: Predictions of a batch.
+            numbers: Number of each pixel's instance of a class, 0 for none. (B, classes, H, W)
+            directions: Forward and backward direction 1 to K of each pixel, 0 for none.
+                (B, 2, H, W)
+
+        Returns:
+            ``loss_semantic``, ``loss_pull``, ``loss_push`` and ``loss_direction``.
         """
-        classes = torch.cat([(numbers == 0).all(1, keepdim=True), numbers > 0], 1)
+        background = (numbers == 0).all(dim=1, keepdim=True)
+        classes = torch.cat([background, numbers > 0], dim=1)  # (B, 1 + classes, H, W)
         weight = constant(numbers, self.pos_weight, torch.float)
         semantic = F.binary_cross_entropy_with_logits(
             maps.semantic, classes.to(maps.semantic), pos_weight=weight
         )
-        pairs = zip(maps.embedding, numbers.amax(1), strict=True)
-        embeddings = [self.embedding_losses(*pair) for pair in pairs]
-        pull, push = (torch.stack(parts).mean() for parts in zip(*embeddings, strict=True))
+        instances = numbers.amax(dim=1)  # (B, H, W)
+        pull_terms = []
+        push_terms = []
+        for i, embedding in enumerate(maps.embedding):
+            pull, push = self.embedding_losses(embedding, instances[i])
+            pull_terms.append(pull)
+            push_terms.append(push)
         return {
             "loss_semantic": self.semantic * semantic,
-            "loss_pull": self.pull * pull,
-            "loss_push": self.push * push,
+            "loss_pull": self.pull * torch.stack(pull_terms).mean(),
+            "loss_push": self.push * torch.stack(push_terms).mean(),
             "loss_direction": self.direction * direction_loss(maps.direction, directions),
         }
 
     def embedding_losses(self, embedding: Tensor, numbers: Tensor) -> tuple[Tensor, Tensor]:
-        """Return how far pixels are from their instance's mean, and how near means are.
+        """Compute the pull loss and the push loss of one sample.
 
-        De Brabandere et al., 2017, Eqs. 1 and 2, with the mean of unordered pairs halved. Both are
-        0 without an instance. (E, H, W), (H, W) -> (), ()
+        De Brabandere et al., 2017, Eqs. 1 and 2, where the push loss is half the mean over
+        unordered pairs. Both are 0 without an instance.
+
+        Args:
+            embedding: Instance embeddings. (E, H, W)
+            numbers: Instance number of each pixel, 0 for none. (H, W)
+
+        Returns:
+            Two unweighted scalars.
         """
-        drawn = numbers > 0
-        pixels = embedding[:, drawn].T  # (n, E)
-        _, index, counts = numbers[drawn].unique(return_inverse=True, return_counts=True)
+        is_instance = numbers > 0
+        pixels = embedding[:, is_instance].T  # (n, E)
+        _, index, counts = numbers[is_instance].unique(return_inverse=True, return_counts=True)
         if not len(counts):
             return embedding.sum() * 0, embedding.sum() * 0
         sums = pixels.new_zeros(len(counts), len(embedding)).index_add(0, index, pixels)
-        means = sums / counts[:, None]
-        away = ((pixels - means[index]).norm(dim=1) - self.pull_margin).clamp(min=0) ** 2
-        pull = (away / counts[index]).sum() / len(counts)
+        means = sums / counts[:, None]  # (instances, E)
+        distance = (pixels - means[index]).norm(dim=1)
+        excess = (distance - self.pull_margin).clamp(min=0) ** 2
+        pull = (excess / counts[index]).sum() / len(counts)
         if len(counts) == 1:
             return pull, means.sum() * 0
-        one, other = torch.triu_indices(len(counts), len(counts), 1, device=means.device)
-        near = (self.push_margin - (means[one] - means[other]).norm(dim=1)).clamp(min=0) ** 2
-        return pull, near.mean() / 2
+        first, second = torch.triu_indices(len(counts), len(counts), offset=1, device=means.device)
+        separation = (means[first] - means[second]).norm(dim=1)
+        overlap = (self.push_margin - separation).clamp(min=0) ** 2
+        return pull, overlap.mean() / 2
 
 
 def direction_loss(logits: Tensor, directions: Tensor) -> Tensor:
-    """Return the cross-entropy of each direction by itself, a mean over the pixels of lines.
+    """Compute the binary cross-entropy of the directions, averaged over the pixels of lines.
 
-    (B, 1 + K, H, W), (B, 2, H, W)
+    Args:
+        logits: Logits of no direction and of K directions. (B, 1 + K, H, W)
+        directions: Forward and backward direction 1 to K of each pixel, 0 for none. (B, 2, H, W)
+
+    Returns:
+        Unweighted scalar.
     """
-    classes = logits.shape[1]
-    target = F.one_hot(directions, classes).sum(1).movedim(-1, 1).to(logits) / 2
-    drawn = 1 - target[:, :1]
-    each = F.binary_cross_entropy(logits.softmax(1), target, reduction="none")
-    return (each * drawn).sum() / (drawn.sum() * classes).clamp(min=1)
+    num_classes = logits.shape[1]
+    counts = F.one_hot(directions, num_classes).sum(dim=1).movedim(-1, 1)  # (B, 1 + K, H, W)
+    target = counts.to(logits) / 2
+    is_line = 1 - target[:, :1]
+    loss = F.binary_cross_entropy(logits.softmax(dim=1), target, reduction="none")
+    return (loss * is_line).sum() / (is_line.sum() * num_classes).clamp(min=1)

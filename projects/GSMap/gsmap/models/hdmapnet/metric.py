@@ -1,4 +1,4 @@
-"""HDMapNet's metric: AP per sample of lines drawn five pixels thick."""
+"""HDMapNet's metric: AP per sample of lines that are drawn with a thickness of five pixels."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from gsmap.evaluation.core.sample_ap import SampleAP
 @register_metric
 @dataclass(frozen=True)
 class HDMapNetAP(SampleAP):
-    """AP per sample by the rules of HDMapNet's released evaluator."""
+    """AP per sample with the rules of HDMapNet's released evaluator."""
 
     name: ClassVar[str] = "hdmapnet"
     line_px: ClassVar[int] = 5

@@ -1,4 +1,4 @@
-"""HDMapNet's targets: which element each pixel belongs to, and its two directions."""
+"""HDMapNet's targets: the element and the two directions of each pixel."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from mmcv.transforms import BaseTransform
 from mmdet3d.registry import TRANSFORMS
 from numpy.typing import NDArray
 
-from gsmap.models.hdmapnet.layout import ahead_size, pixels_from_metres
+from gsmap.models.hdmapnet.layout import forward_size, pixels_from_metres
 from gsmap.structures.elements import annotated
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import parts_inside, sampled
@@ -24,23 +24,23 @@ Pixels = NDArray[np.int32]
 @TRANSFORMS.register_module()
 @dataclass(eq=False)
 class MakeLineMaps(BaseTransform):
-    """Add ``gt_lines`` and ``gt_directions``: elements drawn as lines, from ``map_instances``.
+    """Add rasters of the elements, ``gt_lines`` and ``gt_directions``, from ``map_instances``.
 
-    ``gt_lines`` (classes, H, W) has the number of a line, from 1 on over all classes, and 0 for
-    none; ``gt_directions`` (2, H, W) its direction 1 to K, forward and backward. Rows lie from the
-    right to the left, columns from the rear to the front.
+    ``gt_lines`` (classes, H, W) holds the number of each pixel's line, from 1 on over all classes,
+    and 0 for none. ``gt_directions`` (2, H, W) holds the forward and the backward direction of the
+    line, 1 to K, and 0 for none. Rows lie from right to left, columns from rear to front.
 
     Args:
         num_classes: Number of classes.
-        pixel_m: Side of a pixel in metres; a config has it in the head.
-        thickness_px: Width of the lines.
-        gap_px: Width around lines of later classes in which earlier ones are erased.
-        step_m: Lines are sampled at this distance first.
-        num_directions: Directions K, likewise.
+        pixel_m: Side of a pixel in metres. A config sets it in the head.
+        thickness_px: Width of the lines, in pixels.
+        gap_px: Width around a line in which lines of earlier classes are erased, in pixels.
+        step_m: Distance at which lines are sampled before they are drawn, in metres.
+        num_directions: Number K of directions, a divisor of 360. A config sets it in the head.
         forward: Axis of the direction of travel, by default the longer side, as in `BEVGrid`.
 
     Raises:
-        ValueError: If a setting is not positive.
+        ValueError: If a setting is not positive, or if ``num_directions`` does not divide 360.
     """
 
     num_classes: int = 3
@@ -58,48 +58,80 @@ class MakeLineMaps(BaseTransform):
             raise InputError(f"num_directions must divide 360, got {self.num_directions}.")
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Add the targets; ValueError without ground truth or for an unknown class."""
+        """Add the targets to a sample.
+
+        Raises:
+            ValueError: If the sample has no ground truth, or an element of an unknown class.
+        """
         elements = annotated(results, self)
         grid = BEVGrid(results["x_range"], results["y_range"], forward=self.forward)
-        grid = grid.rasterized(self.pixel_m)
-        numbers, directions = self.drawn(elements, grid)
+        numbers, directions = self.draw(elements, grid.rasterized(self.pixel_m))
         results["gt_lines"] = torch.from_numpy(numbers)
         results["gt_directions"] = torch.from_numpy(directions)
         return results
 
-    def drawn(self, instances: Any, grid: BEVGrid) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
-        """Draw lines class by class; they give way to lines of later classes beside them.
+    def draw(self, instances: Any, grid: BEVGrid) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
+        """Draw the elements class by class, and erase earlier classes around each line.
 
-        -> (classes, H, W), (2, H, W)
+        Args:
+            instances: Elements with ``label`` and ``points``.
+            grid: Raster of the pixels.
+
+        Returns:
+            Line numbers (classes, H, W) and directions (2, H, W).
         """
-        size = ahead_size(grid)
-        numbers = np.zeros((self.num_classes, *size), np.int16)
-        ways = np.zeros((2, self.num_classes, *size), np.int16)
-        for number, (label, line) in enumerate(self.lines(instances, grid), 1):
-            cv2.polylines(numbers[label], [line], False, (number,), self.thickness_px)
-            for way, points in zip(ways[:, label], (line, line[::-1]), strict=True):
-                self.draw_directions(way, points)
-            gap = cv2.polylines(np.zeros(size, np.uint8), [line], False, (1,), self.gap_px) > 0
-            numbers[:label, gap] = 0
-            ways[:, :label, gap] = 0
-        return numbers, ways.max(1)
+        size = forward_size(grid)
+        numbers = np.zeros((self.num_classes, *size), dtype=np.int16)
+        directions = np.zeros((2, self.num_classes, *size), dtype=np.int16)
+        for number, (label, line) in enumerate(self.lines(instances, grid), start=1):
+            cv2.polylines(
+                numbers[label],
+                pts=[line],
+                isClosed=False,
+                color=(number,),
+                thickness=self.thickness_px,
+            )
+            self.draw_directions(directions[0, label], line)
+            self.draw_directions(directions[1, label], line[::-1])
+            gap = np.zeros(size, dtype=np.uint8)
+            cv2.polylines(gap, pts=[line], isClosed=False, color=(1,), thickness=self.gap_px)
+            numbers[:label, gap > 0] = 0
+            directions[:, :label, gap > 0] = 0
+        return numbers, directions.max(axis=1)
 
-    def draw_directions(self, way: NDArray[np.int16], points: Pixels) -> None:
-        """Draw the direction of each step of a line, later ones over earlier ones."""
-        for (x0, y0), (x1, y1) in zip(points[:-1].tolist(), points[1:].tolist(), strict=True):
-            angle = np.degrees(np.arctan2(y1 - y0, x1 - x0)) % 360
-            direction = int(angle / (360 / self.num_directions) + 0.5) % self.num_directions + 1
-            cv2.line(way, (x0, y0), (x1, y1), (direction,), self.thickness_px)
+    def draw_directions(self, raster: NDArray[np.int16], points: Pixels) -> None:
+        """Draw the direction of each segment of a line, later segments over earlier ones.
+
+        Args:
+            raster: Raster to draw on. (H, W)
+            points: Vertices (column, row) of the line. (n, 2)
+        """
+        for start, end in zip(points[:-1].tolist(), points[1:].tolist(), strict=True):
+            angle = np.degrees(np.arctan2(end[1] - start[1], end[0] - start[0])) % 360
+            step = int(angle / (360 / self.num_directions) + 0.5)
+            direction = step % self.num_directions + 1
+            cv2.line(raster, start, end, color=(direction,), thickness=self.thickness_px)
 
     def lines(self, instances: Any, grid: BEVGrid) -> Iterator[tuple[int, Pixels]]:
-        """Yield class and pixels (column, row) of each part of an element on the map, by class."""
+        """Yield the class and the pixels of each part of an element on the map, sorted by class.
+
+        Args:
+            instances: Elements with ``label`` and ``points``.
+            grid: Raster of the pixels.
+
+        Yields:
+            Class index and vertices (column, row) of a part. (n, 2)
+
+        Raises:
+            ValueError: If an element has an unknown class.
+        """
         for element in sorted(instances, key=lambda element: element.label):
             if not 0 <= element.label < self.num_classes:
                 raise InputError(
                     f"label {element.label} of an element, but num_classes={self.num_classes} in "
                     "MakeLineMaps."
                 )
-            # as released without its end, and so nothing of a line below one step
+            # As in the released code, sampling drops the end of a line, and lines below one step.
             points = sampled(element.points[:, :2].astype(np.float64), self.step_m)
-            for part in parts_inside(points, grid.x_range, grid.y_range):
+            for part in parts_inside(points, grid.x_range, y_range=grid.y_range):
                 yield element.label, pixels_from_metres(part, grid).astype(np.int32)

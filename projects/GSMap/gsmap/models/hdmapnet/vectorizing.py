@@ -1,4 +1,4 @@
-"""HDMapNet's vectorising: lines from maps of classes, instance embeddings and directions.
+"""HDMapNet's vectorisation: lines from maps of classes, instance embeddings and directions.
 
 Li et al., "HDMapNet: An Online HD Map Construction and Evaluation Framework", ICRA 2022, III-D.
 Pixels are (column, row) here.
@@ -14,7 +14,7 @@ import torch
 from numba import njit
 from torch import Tensor, from_numpy
 
-import gsmap.utils.compilation  # noqa: F401 - says that kernels are compiled
+import gsmap.utils.compilation  # noqa: F401 - prints a notice when kernels are compiled
 from gsmap.models.hdmapnet.clustering import dense_clusters
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 from gsmap.utils.errors import InputError
@@ -26,16 +26,20 @@ NONE = -1  # no direction
 
 @dataclass(frozen=True)
 class VectorizeConfig:
-    """What decides about lines; the defaults are the release's.
+    """Settings of `vectorize`, by default as in the released code.
 
     Args:
-        min_area_px: Components of a class that are not larger are left out, in pixels.
-        eps: Largest distance of neighbours in the standardised embedding space.
-        min_neighbours: Neighbours that make a pixel the core of a cluster, itself included.
-        ridge_tolerance: What a ridge pixel may have less than the largest probability beside it.
+        min_area_px: Largest area of a class's components that are removed, in pixels, >= 0.
+        eps: Largest distance of two neighbours in the standardised embedding space.
+        min_neighbours: Smallest number of neighbours of a cluster's core pixel, itself included.
+        ridge_tolerance: Largest difference of a ridge pixel's probability from the largest
+            probability beside it.
         step_px: Length of a step along the direction, in pixels.
         jump_px: Largest distance of the next point from the end of a step, in pixels.
-        degrees: Angle of one direction class, in degrees.
+        degrees: Angle between neighbouring directions, in degrees.
+
+    Raises:
+        ValueError: If ``min_area_px`` is negative, or if another setting is not positive.
     """
 
     min_area_px: int = 100
@@ -47,19 +51,19 @@ class VectorizeConfig:
     degrees: int = 10
 
     def __post_init__(self) -> None:
-        check_positive(
-            **{name: value for name, value in vars(self).items() if name != "min_area_px"}
-        )
+        positive = dict(vars(self))
+        del positive["min_area_px"]
+        check_positive(**positive)
         if not self.min_area_px >= 0:
             raise InputError(f"min_area_px must not be negative, got {self.min_area_px}.")
 
 
 class TracedLine(NamedTuple):
-    """A line: pixels (column, row) (n, 2) in order, class, and mean probability of its pixels."""
+    """Line of pixels with its class and its score."""
 
-    pixels: IntArray
-    label: int
-    score: float
+    pixels: IntArray  # (column, row) from one end to the other (n, 2)
+    label: int  # class index
+    score: float  # mean probability of the pixels in [0, 1]
 
 
 def vectorize(
@@ -69,67 +73,76 @@ def vectorize(
     config: VectorizeConfig | None = None,
     choose_start: Callable[[int], int] | None = None,
 ) -> list[TracedLine]:
-    """Turn the outputs of a segmentation network into lines.
+    """Trace lines in the outputs of a segmentation network.
 
     Args:
         semantic: Logits of the background and C classes. (1 + C, H, W)
-        embedding: Pixels of one element have similar embeddings. (E, H, W)
+        embedding: Instance embeddings, similar within an element. (E, H, W)
         direction: Logits of no direction and of K directions: direction k >= 1 points
             ``(k - 1) * degrees`` from +column towards +row. (1 + K, H, W)
-        config: What decides about lines.
-        choose_start: Takes a number of points and returns the one that a line is traced from.
-            None: the first, so that the same maps give the same lines. The release takes one by
-            chance: ``lambda count: random.randrange(count)``.
+        config: Settings, by default `VectorizeConfig()`.
+        choose_start: Function from a number of points to the index of the point at which tracing
+            starts. By default the first point, so that results are reproducible. The released code
+            chooses at random: ``lambda count: random.randrange(count)``.
 
     Returns:
-        The lines, class after class; labels are 0 to C - 1.
+        Lines in the order of their labels 0 to C - 1.
 
     Raises:
-        ValueError: If the maps have other sizes or values that are not finite, or there is no class
-            beside the background.
+        ValueError: If the sizes of the maps differ, if a value is not finite, or if there is no
+            class in addition to the background.
     """
     config = config or VectorizeConfig()
-    _check(semantic, embedding, direction, config)
-    probs = semantic.detach().cpu().float().softmax(0).numpy()
-    best = probs.argmax(0)
+    _check(semantic, embedding, direction=direction, config=config)
+    probs = semantic.detach().cpu().float().softmax(dim=0).numpy()
+    best = probs.argmax(axis=0)
     embeddings = embedding.detach().cpu().float().numpy()
     direction = direction.detach().cpu()
-    directions = np.full((*best.shape, 2), NONE)
+    directions = np.full((*best.shape, 2), fill_value=NONE)
     lines = []
     for label in range(1, len(probs)):
         mask = clean_mask(best == label, config.min_area_px)
-        clusters = cluster_pixels(mask, embeddings, config)
+        clusters = cluster_pixels(mask, embeddings, config=config)
         ridge = ridge_pixels(np.where(clusters > 0, probs[label], 0), config.ridge_tolerance)
         directions[ridge] = top_directions(direction[:, from_numpy(ridge)])
         for number in range(1, clusters.max() + 1):
-            own = clusters == number
-            points = order_by_distance(along_longer_side(own, ridge))
-            if len(points):
-                start = choose_start(len(points)) if choose_start else 0
-                pixels = trace(points, directions, start, config)
-                lines.append(TracedLine(pixels, label - 1, float(probs[label][own].mean())))
+            cluster = clusters == number
+            points = order_by_distance(sort_along_longer_side(cluster, ridge))
+            if not len(points):
+                continue
+            start = choose_start(len(points)) if choose_start else 0
+            pixels = trace(points, directions, start=start, config=config)
+            score = float(probs[label][cluster].mean())
+            lines.append(TracedLine(pixels, label=label - 1, score=score))
     return lines
 
 
 def elements_of_lines(
     lines: Sequence[TracedLine], first_m: tuple[float, float], pixel_m: tuple[float, float]
 ) -> MapElements:
-    """Return lines in metres, as metrics and results files take them; single pixels are left out.
+    """Convert lines to elements in metres; lines of a single pixel are dropped.
 
     Args:
-        lines: From `vectorize`.
+        lines: Lines from `vectorize`.
         first_m: Centre of pixel (0, 0), x and y in metres in the frame of the annotations.
-        pixel_m: What x grows with a column, and y with a row, in metres; negative if it falls.
+        pixel_m: Increase of x from a column to the next, and of y from a row to the next, in
+            metres; negative for a decrease.
     """
-    lines = [line for line in lines if len(line.pixels) > 1]
-    points = [np.array(first_m) + line.pixels * np.array(pixel_m) for line in lines]
-    labels, scores = [line.label for line in lines], [line.score for line in lines]
-    return MapElements.from_polylines(points, labels, scores)
+    polylines = []
+    labels = []
+    scores = []
+    for line in lines:
+        if len(line.pixels) > 1:
+            polylines.append(np.array(first_m) + line.pixels * np.array(pixel_m))
+            labels.append(line.label)
+            scores.append(line.score)
+    return MapElements.from_polylines(polylines, labels, scores=scores)
 
 
 def _check(semantic: Tensor, embedding: Tensor, direction: Tensor, config: VectorizeConfig) -> None:
-    """Check the shapes of the maps."""
-    shapes = [tuple(values.shape) for values in (semantic, embedding, direction)]
+    """Raise ValueError if the maps do not fit each other or the settings."""
+    maps = {"semantic": semantic, "embedding": embedding, "direction": direction}
+    shapes = [tuple(values.shape) for values in maps.values()]
     if any(len(shape) != 3 or shape[1:] != shapes[0][1:] for shape in shapes):
         raise InputError(f"the maps must be (channels, H, W) of one size, got {shapes}.")
     if len(semantic) < 2:
@@ -139,82 +152,89 @@ def _check(semantic: Tensor, embedding: Tensor, direction: Tensor, config: Vecto
             f"{len(direction)} channels of direction are none and {len(direction) - 1} directions, "
             f"which make no circle in steps of {config.degrees} degrees."
         )
-    named = {"semantic": semantic, "embedding": embedding, "direction": direction}
-    broken = [
-        name for name, values in named.items() if not torch.stack(values.aminmax()).isfinite().all()
-    ]
-    if broken:
-        raise InputError(f"{' and '.join(broken)} have values that are not finite.")
+    not_finite = []
+    for name, values in maps.items():
+        bounds = torch.stack(values.aminmax())
+        if not bounds.isfinite().all():
+            not_finite.append(name)
+    if not_finite:
+        raise ValueError(f"{' and '.join(not_finite)} have values that are not finite.")
 
 
 def top_directions(direction: Tensor) -> IntArray:
-    """Return two directions of each pixel: the best, and the best that is not beside it.
+    """Return the most probable direction of each pixel, and the most probable one not next to it.
+
+    The second direction is more than two steps away from the first. As in the released code, K - 1
+    and 0 do not count as neighbours.
 
     Args:
         direction: Logits of no direction and of K directions. (1 + K, ...)
 
     Returns:
-        Directions 0 to K - 1, or -1 for none. The two before and after the best are left out for
-        the second, and as in the release K - 1 and 0 do not count as neighbours. (..., 2)
+        Directions 0 to K - 1, or -1 for none. (..., 2)
     """
-    probs = direction.detach().cpu().float().softmax(0).numpy()
-    first = probs.argmax(0)
-    numbers = np.arange(len(probs)).reshape(-1, *[1] * first.ndim)
-    beside = np.abs(numbers - first) <= 2
-    second = np.where(beside, 0, probs).argmax(0)
+    probs = direction.detach().cpu().float().softmax(dim=0).numpy()
+    first = probs.argmax(axis=0)
+    numbers = np.arange(len(probs)).reshape((-1,) + (1,) * first.ndim)  # (1 + K, 1, ...)
+    is_near = np.abs(numbers - first) <= 2
+    second = np.where(is_near, 0, probs).argmax(axis=0)
     return np.stack([first, second], axis=-1) - 1
 
 
 def clean_mask(mask: BoolArray, min_area_px: int) -> BoolArray:
     """Close the gaps of a class's mask, and remove its small components. (H, W) -> (H, W)"""
-    ellipse = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
-    closed = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, ellipse)
+    ellipse = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, ksize=(5, 5))
+    closed = cv2.morphologyEx(mask.astype(np.uint8), op=cv2.MORPH_CLOSE, kernel=ellipse)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
-    large = stats[:, cv2.CC_STAT_AREA] > min_area_px
-    large[0] = False  # the background
-    return large[labels]
+    is_large = stats[:, cv2.CC_STAT_AREA] > min_area_px
+    is_large[0] = False  # the background
+    return is_large[labels]
 
 
 def cluster_pixels(mask: BoolArray, embedding: FloatArray, config: VectorizeConfig) -> IntArray:
-    """Cluster the pixels of a class by their embeddings, scaled to mean 0 and deviation 1.
+    """Cluster the pixels of a class by their standardised embeddings.
 
     Args:
-        mask: Its pixels. (H, W)
-        embedding: Of all pixels. (E, H, W)
-        config: Distance and neighbours of a cluster.
+        mask: Pixels of the class. (H, W)
+        embedding: Instance embeddings. (E, H, W)
+        config: Settings ``eps`` and ``min_neighbours`` of the clusters.
 
     Returns:
-        Number of each pixel's cluster, from 1 on in the order of rows; 0 for none. (H, W)
+        Cluster number of each pixel, from 1 on in the order of rows; 0 for none. (H, W)
     """
-    from sklearn.preprocessing import StandardScaler  # takes a second
+    from sklearn.preprocessing import StandardScaler  # the import takes a second
 
     clusters = np.zeros(mask.shape, dtype=np.int64)
     if mask.any():
-        scaled = StandardScaler().fit_transform(embedding[:, mask].T)
-        found = dense_clusters(scaled.astype(np.float64), config.eps, config.min_neighbours)
-        clusters[mask] = found + 1
+        scaled = StandardScaler().fit_transform(embedding[:, mask].T).astype(np.float64)
+        labels = dense_clusters(scaled, config.eps, min_neighbours=config.min_neighbours)
+        clusters[mask] = labels + 1
     return clusters
 
 
 def ridge_pixels(probs: FloatArray, tolerance: float) -> BoolArray:
-    """Return which pixels are the most probable ones across their line.
+    """Find the pixels with the largest probability across their line.
 
-    A line is upright where the mean over 9 rows and 5 columns is more than that over 5 rows and 9
-    columns; then a pixel must be the largest of 5 in its row, else of 5 in its column.
+    A line counts as vertical where the mean over 9 rows and 5 columns exceeds the mean over 5 rows
+    and 9 columns. There a ridge pixel is the largest of 5 in its row, elsewhere of 5 in its column.
 
     Args:
         probs: Probability of a class, 0 outside its clusters. (H, W)
-        tolerance: What a pixel may have less than the largest.
+        tolerance: Largest difference of a ridge pixel from the largest probability.
+
+    Returns:
+        True for ridge pixels. (H, W)
     """
     return _ridge(probs.astype(Float32), np.argwhere(probs > 0), Float32(tolerance))
 
 
 @njit(cache=True)
 def _ridge(probs: FloatArray, pixels: IntArray, tolerance: Float32) -> BoolArray:
-    """Return which of some pixels (row, column) (n, 2) are on a ridge. (H, W) -> (H, W)"""
+    """Test candidate pixels (row, column) (n, 2) for `ridge_pixels`. (H, W) -> (H, W)"""
     ridge = np.zeros(probs.shape, np.bool_)
     for i in range(len(pixels)):
-        row, column = pixels[i, 0], pixels[i, 1]
+        row = pixels[i, 0]
+        column = pixels[i, 1]
         if _mean(probs, row, column, 4, 2) > _mean(probs, row, column, 2, 4):
             largest = probs[row, max(column - 2, 0) : column + 3].max()
         else:
@@ -224,62 +244,81 @@ def _ridge(probs: FloatArray, pixels: IntArray, tolerance: Float32) -> BoolArray
 
 
 @njit(cache=True)
-def _mean(values: FloatArray, row: int, column: int, down: int, aside: int) -> Float32:
-    """Return the mean around a pixel, with zeros beyond the map; summed as the release does."""
+def _mean(values: FloatArray, row: int, column: int, num_rows: int, num_columns: int) -> Float32:
+    """Average the rows and columns around a pixel, with zeros beyond the map.
+
+    The sum is computed in the order of the released code.
+    """
     total = Float32(0)
-    for i in range(max(row - down, 0), min(row + down + 1, values.shape[0])):
-        for j in range(max(column - aside, 0), min(column + aside + 1, values.shape[1])):
+    for i in range(max(row - num_rows, 0), min(row + num_rows + 1, values.shape[0])):
+        for j in range(
+            max(column - num_columns, 0), min(column + num_columns + 1, values.shape[1])
+        ):
             total += values[i, j]
-    return total / Float32((2 * down + 1) * (2 * aside + 1))
+    return total / Float32((2 * num_rows + 1) * (2 * num_columns + 1))
 
 
-def along_longer_side(cluster: BoolArray, ridge: BoolArray) -> IntArray:
-    """Return the ridge pixels of a cluster, sorted along its longer side. (H, W) -> (n, 2)"""
-    extent = [np.ptp(found) for found in np.nonzero(cluster)]  # rows, columns
+def sort_along_longer_side(cluster: BoolArray, ridge: BoolArray) -> IntArray:
+    """Sort the ridge pixels of a cluster along its longer side.
+
+    Args:
+        cluster: Pixels of the cluster. (H, W)
+        ridge: Ridge pixels of the class. (H, W)
+
+    Returns:
+        Pixels (column, row). (n, 2)
+    """
+    cluster_rows, cluster_columns = np.nonzero(cluster)
+    is_wide = np.ptp(cluster_columns) > np.ptp(cluster_rows)
     rows, columns = np.nonzero(cluster & ridge)
-    order = np.argsort(columns if extent[1] > extent[0] else rows, kind="stable")
+    order = np.argsort(columns if is_wide else rows, kind="stable")
     return np.stack([columns, rows], axis=1)[order]
 
 
 def order_by_distance(points: IntArray) -> IntArray:
-    """Order points from nearest to nearest, beginning with the first.
+    """Order points greedily by the distance from their predecessor, starting with the first one.
 
-    A point that is more than 3 px from the last, but within 5 px of an earlier one, is left out: it
-    belongs to a place that has been passed. When nine tenths are done, a gap of 10 px is the end.
+    A point more than 3 px from the last one, but less than 5 px from an earlier one, is dropped as
+    part of a section that is already covered. After nine tenths of the points, a gap of more than
+    10 px ends the line.
 
     Args:
         points: Pixels. (n, 2)
 
     Returns:
-        The points that are kept, in order. (m, 2)
+        Remaining points in order. (m, 2)
     """
     return points[_order(points)] if len(points) else points
 
 
 @njit(cache=True)
 def _order(points: IntArray) -> IntArray:
-    """Return which points are kept, in order: saturated maps have thousands. (n, 2) -> (m,)"""
-    left, chosen, kept = np.ones(len(points), np.bool_), np.zeros(len(points), np.int64), 1
-    left[0] = False
+    """Return the indices of the remaining points of `order_by_distance`. (n, 2) -> (m,)"""
+    is_free = np.ones(len(points), np.bool_)
+    is_free[0] = False
+    order = np.zeros(len(points), np.int64)
+    count = 1
     for step in range(len(points) - 1):
-        nearest, gap = -1, 0
+        nearest = -1
+        gap = 0
         for i in range(len(points)):
-            if left[i]:
-                apart = _squared_distance(points[i], points[chosen[kept - 1]])
-                if nearest < 0 or apart < gap:
-                    nearest, gap = i, apart
-        left[nearest] = False
-        passed = False
+            if is_free[i]:
+                distance = _squared_distance(points[i], points[order[count - 1]])
+                if nearest < 0 or distance < gap:
+                    nearest = i
+                    gap = distance
+        is_free[nearest] = False
+        is_covered = False
         if gap > 3**2:
-            for i in chosen[:kept]:
-                passed |= _squared_distance(points[i], points[nearest]) < 5**2
-        if passed:
+            for i in order[:count]:
+                is_covered |= _squared_distance(points[i], points[nearest]) < 5**2
+        if is_covered:
             continue
         if gap > 10**2 and step > 0.9 * len(points):
             break
-        chosen[kept] = nearest
-        kept += 1
-    return chosen[:kept]
+        order[count] = nearest
+        count += 1
+    return order[:count]
 
 
 @njit(cache=True)
@@ -294,45 +333,59 @@ def trace(points: IntArray, directions: IntArray, start: int, config: VectorizeC
     Args:
         points: Pixels of the line. (n, 2)
         directions: Two directions of each pixel of the map, -1 for none. (H, W, 2)
-        start: Which point is the first.
-        config: Length of a step, largest jump.
+        start: Index of the first point.
+        config: Settings ``step_px``, ``jump_px`` and ``degrees``.
 
     Returns:
         Pixels from one end to the other. (m, 2)
     """
-    used = np.zeros(directions.shape, dtype=bool)
+    is_used = np.zeros(directions.shape, dtype=bool)
     line = [points[start]]
     for _ in range(2):
-        line.extend(_walk(line[-1], points, directions, used, config))
+        line.extend(_walk(line[-1], points, directions, is_used=is_used, config=config))
         line.reverse()
     return np.stack(line[::-1])
 
 
 def _walk(
-    last: IntArray, points: IntArray, directions: IntArray, used: BoolArray, config: VectorizeConfig
+    last: IntArray,
+    points: IntArray,
+    directions: IntArray,
+    is_used: BoolArray,
+    config: VectorizeConfig,
 ) -> Iterator[IntArray]:
-    """Yield the points after the last one; marks the directions that are used."""
+    """Yield the points after the last one, and mark their directions as used in place."""
     while True:
         column, row = last
-        free = np.flatnonzero(~used[row, column])
+        free = np.flatnonzero(~is_used[row, column])
         if not len(free):
             return
-        used[row, column, free[0]] = True
-        taken = directions[row, column, free[0]]
-        if taken == NONE:
+        is_used[row, column, free[0]] = True
+        direction = directions[row, column, free[0]]
+        if direction == NONE:
             continue
-        points = points[np.hypot(*(points - last).T) > config.step_px - 1]
+        points = points[_distances(points, last) > config.step_px - 1]
         if not len(points):
             return
-        angle = np.deg2rad(Float32(config.degrees * taken))  # float32 decides between equal pixels
+        # The released code computes the step in float32, which decides between pixels at equal
+        # distances.
+        angle = np.deg2rad(Float32(config.degrees * direction))
         step = Float32(config.step_px) * np.array([np.cos(angle), np.sin(angle)])
-        distances = np.hypot(*(points - (last + step)).T)
+        distances = _distances(points, last + step)
         nearest = distances.argmin()
         if distances[nearest] > config.jump_px:
             continue
-        last, back = points[nearest], last - points[nearest]
+        back = last - points[nearest]
+        last = points[nearest]
         column, row = last
-        angle = np.rad2deg(np.arctan2(back[1], back[0])) % 360
-        turn = np.abs(config.degrees * directions[row, column] - angle)
-        used[row, column, np.minimum(turn, 360 - turn).argmin()] = True  # the way back
+        back_angle = np.rad2deg(np.arctan2(back[1], back[0])) % 360
+        turn = np.abs(config.degrees * directions[row, column] - back_angle)
+        back_way = np.minimum(turn, 360 - turn).argmin()
+        is_used[row, column, back_way] = True
         yield last
+
+
+def _distances(points: IntArray, point: FloatArray | IntArray) -> FloatArray:
+    """Return the distances of points (n, 2) from one point (2,). (n,)"""
+    offsets = points - point
+    return np.hypot(offsets[:, 0], offsets[:, 1])
