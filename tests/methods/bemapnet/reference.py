@@ -186,7 +186,7 @@ def check_head(golden: Golden, name: str) -> Iterator[Row]:
     for layer in range(2):
         states = parts.normal(f"bm_head_q{layer}", (2, 9, 64)).split(queries, 1)
         for label, own in enumerate(states):
-            for key, value in zip(KEYS, head.raw(label, own, mean), strict=True):
+            for key, value in zip(KEYS, head.curve_logits(label, own, mean), strict=True):
                 wanted = data[f"{key}_l{layer}c{label}"]
                 off = largest_difference(value, wanted)
                 yield Row(name, f"{key}_l{layer}c{label}", off, 1e-5)

@@ -16,7 +16,7 @@ from reference.lines import elements
 from reference.registry import check
 from reference.report import Row, largest_difference
 
-from gsmap.models.bemapnet.curves import Curve, around, control_points, missed
+from gsmap.models.bemapnet.curves import Curve, control_points, neighbourhood, recovery_loss
 from gsmap.models.bemapnet.head import BezierHead
 from gsmap.models.bemapnet.targets import FormatBezierTargets
 from gsmap.models.lines.targets import Part, drawn
@@ -85,9 +85,9 @@ def check_curves(golden: Golden, name: str) -> Iterator[Row]:
     masks = torch.from_numpy(inputs.mask("bm_rec", (3, 40, 20), seed, 0.3))
     points = torch.from_numpy(inputs.uniform("bm_rec_pts", (3, 100, 2), -0.05, 1.05, seed))
     points.requires_grad_()
-    steps = -around(torch.zeros(1, 2) + 0.5, (40, 20)) + 0.5
+    steps = -neighbourhood(torch.zeros(1, 2) + 0.5, (40, 20)) + 0.5
     yield Row(name, "rec_kernel", largest_difference(steps, data["rec_kernel"][0, 0]), 1e-6)
-    losses = missed(point_sample(masks[:, None], around(points, (40, 20)))[:, 0])
+    losses = recovery_loss(point_sample(masks[:, None], neighbourhood(points, (40, 20)))[:, 0])
     losses.sum().backward()
     yield Row(name, "rec_loss", largest_difference(losses.detach(), data["rec_loss"]), 1e-5)
     yield Row(name, "rec_grad", largest_difference(points.grad, data["rec_grad"]), 1e-5)
@@ -150,7 +150,7 @@ def truth_rows(
 ) -> Iterator[Row]:
     """Compare what the losses read of each class."""
     for label, truth in enumerate(head.truth(sample_of(sample))):
-        used = head.curves[label].used(truth.pieces)
+        used = head.curves[label].control_mask(truth.pieces)
         ours = {
             "ctr_points": (truth.controls, 1e-5),
             "end": (truth.pieces, 0),

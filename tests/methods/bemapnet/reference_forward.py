@@ -63,7 +63,7 @@ def check_forward(golden: Golden, name: str) -> Iterator[Row]:
     by_class = [states[i][0].states[:, :, 0].split(list(head.queries), 1) for i in ENDS]
     last = head.predictions(states[-1], mean)
     for label, lines in enumerate(last.lines):
-        raw = [head.raw(label, own[label], mean) for own in by_class]
+        raw = [head.curve_logits(label, own[label], mean) for own in by_class]
         for key, values in zip(KEYS, zip(*raw, strict=True), strict=True):
             off = largest_difference(torch.cat(values), data[f"{key}{label}"])
             yield Row(name, f"{key}{label}", off, LOGITS)

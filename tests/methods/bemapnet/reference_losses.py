@@ -98,7 +98,7 @@ def loss_rows(
     for layer in range(LAYERS):
         own = [leaves[layer, label] for label in range(CLASSES)]
         lines = [
-            head.curved(label, *(leaf[key] for key in KEYS), leaf["obj"], leaf["mask"])
+            head.build_lines(label, *(leaf[key] for key in KEYS), leaf["obj"], leaf["mask"])
             for label, leaf in enumerate(own)
         ]
         outputs.append(LinePredictions(nothing, nothing, lines))

@@ -13,10 +13,10 @@ from mmengine.structures import InstanceData
 import gsmap.registered  # noqa: F401
 from gsmap.datasets.annotations.record import MapInstance
 from gsmap.datasets.transforms.images import CropImages
-from gsmap.models.bemapnet.curves import Curve, around, control_points, missed
+from gsmap.models.bemapnet.curves import Curve, control_points, neighbourhood, recovery_loss
 from gsmap.models.bemapnet.encoder import BezierBEVEncoder
 from gsmap.models.bemapnet.head import BezierHead
-from gsmap.models.bemapnet.neck import BiFPN, halved
+from gsmap.models.bemapnet.neck import BiFPN, downsample
 from gsmap.models.bemapnet.targets import FormatBezierTargets
 from gsmap.structures.grid import BEVGrid
 
@@ -79,7 +79,7 @@ def test_curves_have_a_hundred_points_of_the_pieces_that_count(to_end, last):
     assert points.shape == (100, 2)
     assert points[0].tolist() == [0, 0]
     assert points[-1].tolist() == pytest.approx(last, abs=0.02 if not to_end else 1e-6)
-    assert Curve(1, 3).used(torch.tensor(1)).tolist() == [True, True, True, False]
+    assert Curve(1, 3).control_mask(torch.tensor(1)).tolist() == [True, True, True, False]
 
 
 def test_a_curve_on_its_mask_misses_nothing_and_far_off_all():
@@ -87,7 +87,8 @@ def test_a_curve_on_its_mask_misses_nothing_and_far_off_all():
     mask[..., 10:30, 5:15] = 1
     points = torch.tensor([[[0.5, 0.5]]]).expand(1, 100, 2)
     inside, outside = (
-        missed(point_sample(mask, around(p, (40, 20)))[:, 0]) for p in (points, points * 0.1)
+        recovery_loss(point_sample(mask, neighbourhood(p, (40, 20)))[:, 0])
+        for p in (points, points * 0.1)
     )
     assert inside.item() == pytest.approx(0, abs=1e-6)
     assert outside.item() == pytest.approx(1 - 1 / 2501, abs=1e-6)
@@ -174,8 +175,8 @@ def test_targets_that_do_not_fit_are_refused():
 
 
 def test_pooling_keeps_half_of_the_pixels_rounded_up():
-    assert halved(torch.arange(12.0).view(1, 1, 3, 4)).shape == (1, 1, 2, 2)
-    assert halved(torch.arange(4.0).view(1, 1, 1, 4)).tolist() == [[[[2.0, 3.0]]]]
+    assert downsample(torch.arange(12.0).view(1, 1, 3, 4)).shape == (1, 1, 2, 2)
+    assert downsample(torch.arange(4.0).view(1, 1, 1, 4)).tolist() == [[[[2.0, 3.0]]]]
     neck = BiFPN((4, 8, 16), (3, 5), 6, 2).eval()
     feats = [torch.randn(1, 4 << i, 12 >> i, 20 >> i) for i in range(3)]  # P6 has 2 x 3 pixels
     (joined,) = neck(feats)

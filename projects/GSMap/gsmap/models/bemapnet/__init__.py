@@ -1,1 +1,1 @@
-"""BeMapNet (arXiv 2306.09700): elements as piecewise Bezier curves."""
+"""BeMapNet (arXiv 2306.09700), which predicts elements as piecewise Bezier curves."""

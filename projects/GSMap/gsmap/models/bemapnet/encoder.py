@@ -1,4 +1,4 @@
-"""BeMapNet's BEV encoder: attention of all cells to all pixels, placed on the ground."""
+"""BeMapNet's BEV encoder: global attention of BEV cells to pixels placed on the ground."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -19,22 +19,26 @@ from gsmap.utils.errors import InputError
 
 @MODELS.register_module()
 class BezierBEVEncoder(CameraEncoder):
-    """Mix the cameras side by side, then let BEV cells look at them, all at all (BeMapNet).
+    """BEV encoder with self-attention over all cameras and attention of BEV cells to all pixels.
 
-    A pixel's position is that of the point on the ground that it shows (IPM-PE); pixels above the
-    horizon are not looked at. Besides ``bev_feats`` there are ``bev_levels``, what each of the BEV
-    layers returns.
+    The positional encoding of a pixel is computed from its point on the ground (IPM-PE, BeMapNet).
+    Pixels above the horizon are masked. In addition to ``bev_feats``, the encoder returns
+    ``bev_levels``, the outputs of all BEV layers.
 
     Args:
-        grid: The map's extent.
-        in_channels: Channels of the feature map.
+        grid: Extent of the map, in metres.
+        in_channels: Channels of the image features.
         bev_pixel_m: Side of a BEV cell in metres.
-        num_layers: Layers over the cameras, and BEV layers.
-        layer_cfg: ``num_heads``, ``ffn_dims``, ``dropout`` of all layers.
-        position_dims: Hidden channels of the positions' network.
-        position_size: Rows and columns of the image over which positions of pixels are spread: as
-            released, of the one that is not cropped yet. None takes the images' own.
-        from_camera: Place points relative to their camera, as released, not to the vehicle.
+        embed_dims: Channels C of the BEV features.
+        num_layers: Number of layers over the cameras, and number of BEV layers.
+        layer_cfg: Settings ``num_heads``, ``ffn_dims`` and ``dropout`` of all layers.
+        position_dims: Hidden channels of the network of the positional encoding.
+        position_size: Rows and columns of the image over which pixel positions are spread. By
+            default the size before cropping, as in the released code; None for the size of the
+            images.
+        from_camera: Whether ground points are relative to their camera, as in the released code,
+            instead of to the vehicle.
+        init_cfg: Initialisation config of mmengine.
 
     Raises:
         ValueError: If ``num_layers`` are not two numbers, of which the second is 1 or more.
@@ -61,61 +65,92 @@ class BezierBEVEncoder(CameraEncoder):
                 "num_layers must be those over the cameras and those of the BEV cells, of which at "
                 f"least 1, got {tuple(num_layers)}."
             )
-        self.grid, self.from_camera = grid.rasterized(bev_pixel_m), from_camera
-        self.position_size, self.embed_dims = position_size, embed_dims
-        self.input_proj = nn.Conv2d(in_channels, embed_dims, 1)
+        self.grid = grid.rasterized(bev_pixel_m)
+        self.from_camera = from_camera
+        self.position_size = position_size
+        self.embed_dims = embed_dims
+        self.input_proj = nn.Conv2d(in_channels, embed_dims, kernel_size=1)
         settings = {"num_heads": 8, "ffn_dims": 1024, "dropout": 0.1, **(layer_cfg or {})}
-        self.source_layers, self.bev_layers = (
-            nn.ModuleList(
-                AttentionLayer(embed_dims, **settings, to_memory=memory) for _ in range(number)
-            )
-            for memory, number in zip((False, True), num_layers, strict=True)
+        num_source_layers, num_bev_layers = num_layers
+        self.source_layers = nn.ModuleList(
+            AttentionLayer(embed_dims, **settings, to_memory=False)
+            for _ in range(num_source_layers)
+        )
+        self.bev_layers = nn.ModuleList(
+            AttentionLayer(embed_dims, **settings, to_memory=True) for _ in range(num_bev_layers)
         )
         self.norm = nn.LayerNorm(embed_dims)
         self.bev_embedding = nn.Embedding(self.grid.height * self.grid.width, embed_dims)
         self.position = nn.Sequential(
-            nn.Conv2d(embed_dims, position_dims, 1),
+            nn.Conv2d(embed_dims, position_dims, kernel_size=1),
             nn.ReLU(),
-            nn.Conv2d(position_dims, embed_dims, 1),
+            nn.Conv2d(position_dims, embed_dims, kernel_size=1),
         )
 
     def init_weights(self) -> None:
-        """Initialise the matrices of the layers and the table of cells (Xavier)."""
+        """Initialise the matrices of the layers and the cell embeddings with Xavier's method."""
         super().init_weights()
-        for part in (self.source_layers, self.bev_layers, self.bev_embedding):
-            init_matrices(part)
+        for module in (self.source_layers, self.bev_layers, self.bev_embedding):
+            init_matrices(module)
 
     def encode(
         self, feats: Tensor, calibration: Mapping[str, Tensor], img_shape: tuple[int, int]
     ) -> dict[str, Any]:
-        """Encode features (B, V, C, h, w) with ``ground_from_img`` (B, V, 4, 4)."""
-        points, seen = self.ground_points(
-            calibration["ground_from_img"], feats.shape[-2:], img_shape
+        """Encode image features to BEV features.
+
+        Args:
+            feats: Image features, S = V * h * w pixels. (B, V, C', h, w)
+            calibration: ``ground_from_img``, transforms from pixels (u * d, v * d, d, 1) to the
+                ground frame, in metres. (B, V, 4, 4)
+            img_shape: Rows and columns of the padded images.
+
+        Returns:
+            ``bev_feats`` (B, C, H, W) and ``bev_levels``, one map (B, C, H, W) for each BEV layer.
+        """
+        points, on_ground = self.ground_points(
+            calibration["ground_from_img"], size=feats.shape[-2:], img_shape=img_shape
         )
         sources = self.input_proj(feats.flatten(0, 1)).unflatten(0, feats.shape[:2])
         sources = sources.permute(0, 1, 3, 4, 2).flatten(1, 3)  # (B, S, C)
-        position = self.positions(points, seen)
-        hidden = ~seen & seen.any(-1, keepdim=True)  # without any ground, all are looked at
+        source_pos = self.positions(points, on_ground)
+        # Images without any ground pixel are not masked at all.
+        hidden = ~on_ground & on_ground.any(dim=-1, keepdim=True)  # (B, S)
         for layer in self.source_layers:
-            sources = layer(sources, position, key_padding_mask=hidden)
+            sources = layer(sources, source_pos, key_padding_mask=hidden)
         shape = front_size(self.grid)
-        places = self.grid.metres_from_front(centres([shape], feats.device).flip(-1))
-        own = self.positions(ahead(places, self.grid)[None])
-        cells, bev = self.bev_embedding.weight.expand(len(feats), -1, -1), []
+        cell_centres = self.grid.metres_from_front(centres([shape], feats.device).flip(-1))
+        cell_pos = self.positions(ahead(cell_centres, self.grid)[None])
+        cells = self.bev_embedding.weight.expand(len(feats), -1, -1)  # (B, H * W, C)
+        levels = []
         for layer in self.bev_layers:
-            cells = layer(cells, own, sources + position, sources, key_padding_mask=hidden)
+            cells = layer(
+                cells,
+                cell_pos,
+                key=sources + source_pos,
+                memory=sources,
+                key_padding_mask=hidden,
+            )
             level = self.norm(cells).transpose(1, 2).unflatten(2, shape)
-            bev.append(turned(level, self.grid))
-        return {"bev_feats": bev[-1], "bev_levels": bev}
+            levels.append(turned(level, self.grid))
+        return {"bev_feats": levels[-1], "bev_levels": levels}
 
     def ground_points(
         self, ground_from_img: Tensor, size: Sequence[int], img_shape: tuple[int, int]
     ) -> tuple[Tensor, Tensor]:
-        """Return what point on the ground each pixel of maps of a size shows, and whether it does.
+        """Intersect the viewing rays of feature pixels with the ground.
 
-        Points are metres ahead and to the left. (B, S, 2), (B, S)
+        Args:
+            ground_from_img: Transforms from pixels (u * d, v * d, d, 1) to the ground frame, in
+                metres. (B, V, 4, 4)
+            size: Rows h and columns w of the image features, S = V * h * w pixels.
+            img_shape: Rows and columns of the padded images.
 
-        ValueError if ``position_size`` is not that of these images before rows were cut off.
+        Returns:
+            Points (ahead, to the left) in metres (B, S, 2), and True for pixels below the horizon.
+            (B, S)
+
+        Raises:
+            ValueError: If ``position_size`` is not the size of these images before cropping rows.
         """
         matrices = ground_from_img.float()
         image_size = self.position_size or img_shape
@@ -125,21 +160,32 @@ class BezierBEVEncoder(CameraEncoder):
                 f"{img_shape[0]} rows and {img_shape[1]} columns: set it to their size before rows "
                 "are cut off, or to None."
             )
-        rays = pixel_rays(matrices, (image_size[0], image_size[1]), (size[0], size[1]))
+        rays = pixel_rays(
+            matrices,
+            image_size=(image_size[0], image_size[1]),
+            feature_size=(size[0], size[1]),
+        )
         camera = matrices[:, :, None, None, :3, 3]
         depth = -camera[..., 2:] / rays[..., 2:]
-        points = rays[..., :2] * depth  # differs from the paper, as released
+        points = rays[..., :2] * depth  # Differs from the paper, as in the released code.
         if not self.from_camera:
             points = points + camera[..., :2]
-        return ahead(points, self.grid).flatten(1, 3), (depth[..., 0] > 0).flatten(1)
+        on_ground = depth[..., 0] > 0
+        return ahead(points, self.grid).flatten(1, 3), on_ground.flatten(1)
 
-    def positions(self, points: Tensor, seen: Tensor | None = None) -> Tensor:
-        """Return the positions of points (B, Q, 2); of those that are not seen, that of zeros.
+    def positions(self, points: Tensor, on_ground: Tensor | None = None) -> Tensor:
+        """Compute positional encodings of ground points.
 
-        (B, Q, C)
+        Args:
+            points: Points (ahead, to the left) in metres. (B, Q, 2)
+            on_ground: True for points on the ground; the code of other points is set to 0. None for
+                all points. (B, Q)
+
+        Returns:
+            Positional encodings. (B, Q, C)
         """
         with torch.autocast(points.device.type, enabled=False):
-            code = coordinate_to_encoding(points, self.embed_dims // 2, scale=1.0)  # of metres
-        if seen is not None:
-            code = torch.where(seen[..., None], code, 0.0)
+            code = coordinate_to_encoding(points, self.embed_dims // 2, scale=1.0)
+        if on_ground is not None:
+            code = torch.where(on_ground[..., None], code, 0.0)
         return self.position(code.transpose(1, 2)[..., None])[..., 0].transpose(1, 2)

@@ -1,4 +1,4 @@
-"""BeMapNet's head: lines as Bezier curves of several pieces."""
+"""BeMapNet's head, which predicts lines as Bezier curves of several pieces."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -27,36 +27,41 @@ from gsmap.utils.errors import InputError
 
 @dataclass(frozen=True)
 class CurveReference(Reference):
-    """What points are: (from the left, from the front) in [0, 1], along a curve."""
+    """References of points along curves: (from the left, from the front) in [0, 1].
+
+    Args:
+        grid: Extent of the map, in metres.
+    """
 
     grid: BEVGrid
 
     def decode(self, references: Tensor) -> Tensors:
-        """Return the points in metres. (N, P, 2)"""
+        """Decode references (N, P, 2) to ``pts`` in metres. (N, P, 2)"""
         return {"pts": self.grid.metres_from_front(references.flip(-1))}
 
 
 @MODELS.register_module()
 class BezierHead(LineHead):
-    """Predict lines of classes that have degrees and numbers of pieces of their own (BeMapNet).
+    """Head of Bezier curves with a degree and a largest number of pieces per class (BeMapNet).
 
     Args:
-        grid: The map's extent.
+        grid: Extent of the map, in metres.
         classes: Names of the classes.
-        queries: Lines of each class.
-        degrees: Degrees of the pieces of each class, as in `FormatBezierTargets`.
-        pieces: Most pieces of each class, likewise.
-        decoder: Settings of `PointLineDecoder`; here a line is one query.
-        bev_pixel_m: Side of a cell of the BEV features in metres, to which they are resized.
-        to_end: Whether curves of several pieces reach their last joint; as released they do not.
+        queries: Number of lines of each class.
+        degrees: Degree of the pieces of each class, as in `FormatBezierTargets`.
+        pieces: Largest number of pieces of each class, as in `FormatBezierTargets`.
+        decoder: Settings of `PointLineDecoder`, in which a line is one query.
+        bev_pixel_m: Side in metres of the cells to which BEV features are resized.
+        to_end: Whether curves of several pieces reach their last joint. In the released code they
+            end before it.
         losses: Settings of `BezierLosses`.
-        embed_dims: Channels C.
+        embed_dims: Channels C of the lines and of the BEV features.
         hidden_dims: Hidden channels of the branches and of the map's coordinates.
         kwargs: Further arguments of `LineHead`.
 
     Raises:
-        ValueError: If queries, degrees or pieces do not fit the classes, or there are more layers
-            than weights.
+        ValueError: If queries, degrees or pieces do not fit the classes, or if there are more
+            decoder layers than loss weights.
     """
 
     transforms = ("FormatBezierTargets",)
@@ -85,55 +90,103 @@ class BezierHead(LineHead):
                 f"queries (>= 1), degrees and pieces must be one for each of {list(classes)}, got "
                 f"{list(queries)}, {list(degrees)} and {list(pieces)}."
             )
-        own = {"queries": [(sum(queries), 1)], **(decoder or {})}, BezierLosses(**(losses or {}))
-        kwargs |= {"embed_dims": embed_dims, "hidden_dims": hidden_dims}
-        super().__init__(grid, classes, queries, *own, **kwargs)
-        self.reference, self.queries = CurveReference(grid), queries
-        self.bev_size = front_size(grid.rasterized(bev_pixel_m))
-        shapes = list(zip(degrees, pieces, strict=True))
-        self.curves = nn.ModuleList(Curve(*shape, to_end) for shape in shapes)
-        hidden = (embed_dims, hidden_dims, hidden_dims)
-        self.joint_branches, self.inner_branches, self.piece_branches = (
-            nn.ModuleList(mlp(*hidden, n) if n else nn.Identity() for n in numbers)
-            for numbers in (
-                [(k + 1) * 2 * self.point_dims for _, k in shapes],
-                [k * (d - 1) * 2 * self.point_dims for d, k in shapes],
-                [k for _, k in shapes],
-            )
+        super().__init__(
+            grid,
+            classes,
+            numbers=queries,
+            decoder={"queries": [(sum(queries), 1)], **(decoder or {})},
+            losses=BezierLosses(**(losses or {})),
+            embed_dims=embed_dims,
+            hidden_dims=hidden_dims,
+            **kwargs,
         )
+        self.reference = CurveReference(grid)
+        self.queries = queries
+        self.bev_size = front_size(grid.rasterized(bev_pixel_m))
+        self.curves = nn.ModuleList()
+        self.joint_branches = nn.ModuleList()
+        self.inner_branches = nn.ModuleList()
+        self.piece_branches = nn.ModuleList()
+        coordinates = 2 * self.point_dims
+        for degree, number in zip(degrees, pieces, strict=True):
+            self.curves.append(Curve(degree, number, to_end=to_end))
+            joint_dims = (number + 1) * coordinates
+            self.joint_branches.append(mlp(embed_dims, hidden_dims, hidden_dims, joint_dims))
+        for degree, number in zip(degrees, pieces, strict=True):
+            inner_branch: nn.Module = nn.Identity()  # curves of degree 1 have no inner points
+            if degree > 1:
+                inner_dims = number * (degree - 1) * coordinates
+                inner_branch = mlp(embed_dims, hidden_dims, hidden_dims, inner_dims)
+            self.inner_branches.append(inner_branch)
+        for number in pieces:
+            self.piece_branches.append(mlp(embed_dims, hidden_dims, hidden_dims, number))
 
     @classmethod
     def target_settings(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the settings of the transform that follow from those of the head."""
-        curves = {name: settings[name] for name in ("degrees", "pieces")}
+        """Return the settings of `FormatBezierTargets` that follow from the head's settings."""
+        curves = {"degrees": settings["degrees"], "pieces": settings["pieces"]}
         return {**curves, **super().target_settings(settings)}
 
     def predictions(self, layer: Sequence[ClassLines], mean: Tensor) -> LinePredictions:
-        """Return the curves and scores of a layer's lines of all classes."""
-        ((states, logits, masks),) = layer
-        parts = (part.split(list(self.queries), 1) for part in (states[:, :, 0], logits, masks))
-        lines = [
-            self.curved(label, *self.raw(label, own, mean), of_line.float(), mask.float())
-            for label, (own, of_line, mask) in enumerate(zip(*parts, strict=True))
-        ]
-        scores = class_scores([own.logits for own in lines])
-        return LinePredictions(scores, torch.cat([own.curves for own in lines], 1), lines)
+        """Predict the curves of all classes and their scores.
 
-    def raw(self, label: int, states: Tensor, mean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return logits of joints, of inner points and of numbers of pieces, from (B, n, C).
-
-        (B, n, k + 1, 2), (B, n, k, d - 1, 2), (B, n, k)
+        Args:
+            layer: Lines of all classes from one decoder layer, as one entry.
+            mean: Mean feature of the map's coordinates. (D,)
         """
-        curve, coordinates = cast(Curve, self.curves[label]), (2, self.point_dims)
-        joints = self.joint_branches[label](states).float().unflatten(-1, (-1, *coordinates)) @ mean
-        pieces = self.piece_branches[label](states).float()
-        shape = (pieces.shape[-1], curve.degree - 1)
-        if curve.degree == 1:
-            return joints, joints.new_zeros(*pieces.shape[:2], *shape, 2), pieces
-        features = self.inner_branches[label](states).float()
-        return joints, features.unflatten(-1, (*shape, *coordinates)) @ mean, pieces
+        ((states, logits, masks),) = layer
+        numbers = list(self.queries)
+        class_states = states[:, :, 0].split(numbers, dim=1)
+        class_logits = logits.split(numbers, dim=1)
+        class_masks = masks.split(numbers, dim=1)
+        lines = []
+        line_logits = []
+        curves = []
+        for label in range(len(numbers)):
+            joints, inner, pieces = self.curve_logits(label, class_states[label], mean=mean)
+            class_lines = self.build_lines(
+                label,
+                joints,
+                inner=inner,
+                pieces=pieces,
+                logits=class_logits[label].float(),
+                masks=class_masks[label].float(),
+            )
+            lines.append(class_lines)
+            line_logits.append(class_lines.logits)
+            curves.append(class_lines.curves)
+        return LinePredictions(
+            scores=class_scores(line_logits), references=torch.cat(curves, dim=1), lines=lines
+        )
 
-    def curved(
+    def curve_logits(
+        self, label: int, states: Tensor, mean: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Predict the logits of curves of one class, of degree d and at most k pieces.
+
+        Args:
+            label: Class index.
+            states: States of the lines. (B, n, C)
+            mean: Mean feature of the map's coordinates. (D,)
+
+        Returns:
+            Logits of the joints (B, n, k + 1, 2), of the inner points (B, n, k, d - 1, 2) and of
+            the numbers of pieces (B, n, k).
+        """
+        degree = cast(Curve, self.curves[label]).degree
+        coordinates = (2, self.point_dims)
+        joint_feats = self.joint_branches[label](states).float()
+        joints = joint_feats.unflatten(-1, (-1, *coordinates)) @ mean
+        pieces = self.piece_branches[label](states).float()
+        shape = (pieces.shape[-1], degree - 1)
+        if degree == 1:
+            inner = joints.new_zeros((*pieces.shape[:2], *shape, 2))
+        else:
+            inner_feats = self.inner_branches[label](states).float()
+            inner = inner_feats.unflatten(-1, (*shape, *coordinates)) @ mean
+        return joints, inner, pieces
+
+    def build_lines(
         self,
         label: int,
         joints: Tensor,
@@ -142,34 +195,65 @@ class BezierHead(LineHead):
         logits: Tensor,
         masks: Tensor,
     ) -> BezierLines:
-        """Return lines of a class from what `raw` says."""
-        curve, last = cast(Curve, self.curves[label]), pieces.argmax(-1)
+        """Compute the curves of one class from logits.
+
+        Args:
+            label: Class index.
+            joints: Logits of the joints. (B, n, k + 1, 2)
+            inner: Logits of the inner points. (B, n, k, d - 1, 2)
+            pieces: Logits of the numbers of pieces. (B, n, k)
+            logits: Logits of a line and of no line. (B, n, 2)
+            masks: Logits of the lines' masks. (B, n, H, W)
+        """
+        curve = cast(Curve, self.curves[label])
+        number = pieces.argmax(dim=-1)  # number of pieces less one (B, n)
         controls = control_points(joints, inner)
-        return BezierLines(logits, controls, curve.used(last), pieces, curve(controls, last), masks)
+        return BezierLines(
+            logits=logits,
+            controls=controls,
+            control_mask=curve.control_mask(number),
+            piece_logits=pieces,
+            curves=curve(controls, number),
+            masks=masks,
+        )
 
     def truth(self, sample: Det3DDataSample) -> list[TrueCurves]:
-        """Return a sample's annotated lines, by class; ValueError if they are not of this head."""
-        instances, found = self.annotated(sample), []
+        """Return the annotated lines of a sample for each class.
+
+        Raises:
+            ValueError: If the sample has no targets, or targets that do not fit the head.
+        """
+        instances = self.annotated(sample)
         points = self.grid.front_from_metres(instances.pts.float()).flip(-1)
+        truths = []
         for label, curve in enumerate(cast(Iterable[Curve], self.curves)):
-            own = instances.labels_3d == label
-            numbers, most = instances.num_pts[own], curve.weights.shape[-1]
-            if ((numbers > most) | ((numbers - 1) % curve.degree != 0)).any():
-                raise InputError(
+            is_class = instances.labels_3d == label
+            numbers = instances.num_pts[is_class]
+            largest = curve.weights.shape[-1]
+            if ((numbers > largest) | ((numbers - 1) % curve.degree != 0)).any():
+                raise ValueError(
                     f"lines of class {label} have {numbers.tolist()} control points, but the head "
-                    f"pieces of degree {curve.degree} and at most {most} points: set degrees and "
-                    "pieces of FormatBezierTargets to those of the head."
+                    f"pieces of degree {curve.degree} and at most {largest} points: set degrees "
+                    "and pieces of FormatBezierTargets to those of the head."
                 )
             pieces = (numbers - 1) // curve.degree - 1
-            controls = F.pad(points[own, :most], (0, 0, 0, max(most - points.shape[1], 0)))
-            controls = controls * curve.used(pieces)[..., None]
-            drawn = curve(controls, pieces)
+            missing = max(largest - points.shape[1], 0)
+            controls = F.pad(points[is_class, :largest], (0, 0, 0, missing))
+            controls = controls * curve.control_mask(pieces)[..., None]
+            curves = curve(controls, pieces)
             if self.losses.redrawn_in_px:
-                size = constant(drawn, self.mask_size).flip(0)
-                drawn = torch.where(instances.redrawn[own, None, None], drawn * size, drawn)
-            found.append(TrueCurves(controls, pieces, drawn, instances.masks[own].float()))
-        return found
+                size = constant(curves, self.mask_size).flip(0)
+                is_redrawn = instances.redrawn[is_class, None, None]
+                curves = torch.where(is_redrawn, curves * size, curves)
+            class_truth = TrueCurves(
+                controls=controls,
+                pieces=pieces,
+                curves=curves,
+                masks=instances.masks[is_class].float(),
+            )
+            truths.append(class_truth)
+        return truths
 
     def front(self, bev_feats: Tensor) -> Tensor:
-        """Return BEV features from the front, in the head's cells. (B, C, H, W)"""
+        """Rotate BEV features to the front and resize them to the head's cells. (B, C, H, W)"""
         return enlarged(super().front(bev_feats), self.bev_size)

@@ -1,6 +1,8 @@
-"""The table between the state keys of BeMapNet's release and ours."""
+"""Mapping between the state keys of the released BeMapNet and of this project."""
 
-from gsmap.checkpoints.key_rules import KeyMap, rules_of
+from collections.abc import Sequence
+
+from gsmap.checkpoints.key_rules import KeyMap, Rules, rules_of
 from gsmap.models.lines.keys import (
     BEV,
     CLASS_WEIGHTS,
@@ -13,7 +15,7 @@ from gsmap.models.lines.keys import (
 
 _NECK = "im_backbone.fpn.model."
 _CONVS = "depthwise_conv.conv.=depthwise. pointwise_conv.conv.=pointwise. bn.=norm."
-_PROJECTIONS = {  # ours of theirs; in each, their convolution has one name more
+_PROJECTIONS = {  # from the release to this project
     "p3_down_channel.": "inputs.0.",
     "p4_down_channel.": "inputs.1.",
     "p5_down_channel.": "inputs.2.",
@@ -21,26 +23,39 @@ _PROJECTIONS = {  # ours of theirs; in each, their convolution has one name more
     "p5_down_channel_2.": "again.1.",
     "p5_to_p6.": "coarser.",
 }
+
+
+def _path_rules(path: str, release_path: str, number: int, levels: Sequence[int]) -> Rules:
+    """Return the rules of one path of a BiFPN round.
+
+    Args:
+        path: Name of the path, ``down`` or ``up``.
+        release_path: Name of the path in the release.
+        number: Number of the path in the names of the release's weights.
+        levels: Levels in the order of the path.
+    """
+    rules = []
+    for i, level in enumerate(levels):
+        theirs = f"{_NECK}{{i}}."
+        ours = f"img_neck.rounds.{{i}}.{path}.{i}."
+        rules += rules_of(f"{theirs}conv{level}_{release_path}.", ours, names=_CONVS)
+        rules.append((f"{theirs}p{level}_w{number}", f"{ours}weights"))
+    return tuple(rules)
+
+
+def _projection_rules() -> Rules:
+    """Return the rules of the projections, whose convolutions the release nests deeper."""
+    rules = []
+    for theirs, ours in _PROJECTIONS.items():
+        rules.append((f"{_NECK}0.{theirs}0.conv.", f"img_neck.{ours}0."))
+        rules.append((f"{_NECK}0.{theirs}1.", f"img_neck.{ours}1."))
+    return tuple(rules)
+
+
 _NECK_RULES = (
-    *(
-        rule
-        for way, word, number, levels in (
-            ("down", "up", 1, (6, 5, 4, 3)),
-            ("up", "down", 2, (4, 5, 6, 7)),
-        )
-        for i, level in enumerate(levels)
-        for rule in (
-            *rules_of(
-                f"{_NECK}{{i}}.conv{level}_{word}.", f"img_neck.rounds.{{i}}.{way}.{i}.", _CONVS
-            ),
-            (f"{_NECK}{{i}}.p{level}_w{number}", f"img_neck.rounds.{{i}}.{way}.{i}.weights"),
-        )
-    ),
-    *(
-        (f"{_NECK}0.{theirs}{part}", f"img_neck.{ours}{number}.")
-        for theirs, ours in _PROJECTIONS.items()
-        for part, number in (("0.conv.", 0), ("1.", 1))
-    ),
+    *_path_rules("down", release_path="up", number=1, levels=(6, 5, 4, 3)),
+    *_path_rules("up", release_path="down", number=2, levels=(4, 5, 6, 7)),
+    *_projection_rules(),
 )
 BEMAPNET = KeyMap(
     "bemapnet",
@@ -78,7 +93,7 @@ BEMAPNET = KeyMap(
     ),
     CLASS_WEIGHTS,
     markers=((_NECK, "img_neck.rounds."),),
-    idle=r"bev_decoder\.bev_encoder\.tgt_pos_embed_layer\.",  # listed twice there, one module
+    idle=r"bev_decoder\.bev_encoder\.tgt_pos_embed_layer\.",  # aliases in the release
     sign=LINE_DECODER,
 )
 

@@ -1,4 +1,4 @@
-"""BeMapNet's losses of one map class: lines, masks, control points, numbers of pieces, curves."""
+"""BeMapNet's losses of one map class: lines, masks, control points, piece counts and curves."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,56 +11,70 @@ from mmdet.models.utils import get_uncertain_point_coords_with_randomness
 from torch import Tensor
 
 from gsmap.models.base.matching import assigned
-from gsmap.models.bemapnet.curves import around, missed
+from gsmap.models.bemapnet.curves import neighbourhood, recovery_loss
 from gsmap.models.lines.losses import Case, LineLosses
 from gsmap.utils.errors import InputError
 
 COSTS = ("class scores", "masks", "control points", "pieces", "curves", "recovery")
-OVERSAMPLING, UNCERTAIN = 3.0, 0.9  # of a mask's points: drawn per taken one, share of the taken
+OVERSAMPLING = 3.0  # random candidates per sampled point of a mask
+UNCERTAIN = 0.9  # share of the sampled points at which the mask is least certain
 
 
 class BezierLines(NamedTuple):
     """Predicted lines of one class, in one sample (n, ...) or in a batch (B, n, ...)."""
 
-    logits: Tensor  # of a line and of none (n, 2)
-    controls: Tensor  # control points, [0, 1] from the left and from the front (n, P, 2)
-    used: Tensor  # which of them the likeliest number of pieces has (n, P)
-    piece_logits: Tensor  # of each number of pieces (n, k)
-    curves: Tensor  # points, likewise (n, 100, 2)
+    logits: Tensor  # logits of a line and of no line (n, 2)
+    controls: Tensor  # control points (from the left, from the front) in [0, 1] (n, P, 2)
+    control_mask: Tensor  # True for points that the most likely number of pieces uses (n, P)
+    piece_logits: Tensor  # logits of the number of pieces (n, k)
+    curves: Tensor  # points (from the left, from the front) in [0, 1] (n, 100, 2)
     masks: Tensor  # logits (n, H, W)
 
 
 class Pairs(NamedTuple):
     """Matched lines of a case."""
 
-    rows: Tensor  # numbers of the predicted ones (M,)
-    cols: Tensor  # and of the annotated ones (M,)
+    rows: Tensor  # indices of the predicted lines (M,)
+    cols: Tensor  # indices of the annotated lines (M,)
 
 
 class TrueCurves(NamedTuple):
     """Annotated lines of one class in one sample."""
 
-    controls: Tensor  # [0, 1] from the left and from the front; unused ones are 0 (K, P, 2)
-    pieces: Tensor  # their number, less one (K,)
-    curves: Tensor  # points (K, 100, 2)
+    controls: Tensor  # (from the left, from the front) in [0, 1]; unused ones are 0 (K, P, 2)
+    pieces: Tensor  # number of pieces less one (K,)
+    curves: Tensor  # points (from the left, from the front) in [0, 1] (K, 100, 2)
     masks: Tensor  # 0 and 1, float (K, H, W)
 
 
 @dataclass(frozen=True)
 class BezierLosses(LineLosses):
-    """Weights of losses and of matching costs; the defaults are the released ones.
+    """BeMapNet's losses and matching costs with their weights, by default as in the released code.
 
-    Masks are compared at ``mask_points`` points each, in matching at random ones, in losses mostly
-    at those where the prediction is least certain; None compares all pixels. With
-    ``redrawn_in_px``, as released, curves of lines whose masks were drawn by them are in pixels.
-    Further weights are ``cls``, ``mask`` and ``none_weight`` of `LineLosses`.
+    Args:
+        cls: Weight of the class in matching and loss.
+        mask: Weight of the masks of lines in matching and loss.
+        semantic: Weight of the masks of whole classes in the loss.
+        none_weight: Weight of predictions without a matched line in the class loss.
+        controls: Weight of the control points in matching and loss.
+        pieces: Weight of the numbers of pieces in matching and loss.
+        curve: Weight of the points of curves in matching and loss.
+        recovery: Weight of the masks' recovery by the curves in matching and loss.
+        mask_points: Number of points, >= 10, at which masks are compared: random points in
+            matching, mostly the least certain points of the prediction in the loss. None compares
+            all pixels.
+        redrawn_in_px: Whether annotated curves whose masks were drawn from them are in pixels, as
+            in the released code.
+
+    Raises:
+        ValueError: If ``mask_points`` is less than 10.
     """
 
-    semantic: float = 0.5  # masks of whole classes
-    controls: float = 5.0  # control points, of matching too
-    pieces: float = 2.0  # numbers of pieces, of matching too
-    curve: float = 10.0  # points of curves, of matching too
-    recovery: float = 1.0  # what curves miss of the masks, of matching too
+    semantic: float = 0.5
+    controls: float = 5.0
+    pieces: float = 2.0
+    curve: float = 10.0
+    recovery: float = 1.0
     mask_points: int | None = 20000
     redrawn_in_px: bool = True
 
@@ -70,70 +84,109 @@ class BezierLosses(LineLosses):
 
     @torch.no_grad()
     def distances(self, masks: Sequence[Tensor], truths: Sequence[Tensor]) -> list[Tensor]:
-        """Return distances of all masks of each sample, at the same points. (n, K) each"""
+        """Compute the distances of all pairs of masks, at random points shared by all samples.
+
+        Args:
+            masks: Logits of the predicted masks of each sample. (n, H, W) each
+            truths: Annotated masks of each sample. (K, H, W) each
+
+        Returns:
+            Distances of each sample. (n, K) each
+        """
         if self.mask_points is not None:
             points = torch.rand(1, self.mask_points, 2, device=masks[0].device)
-            masks, truths = (
-                [point_sample(own[None], points)[0] for own in part] for part in (masks, truths)
-            )
+            masks = [point_sample(mask[None], points)[0] for mask in masks]
+            truths = [point_sample(truth[None], points)[0] for truth in truths]
         return super().distances(masks, truths)
 
     def mask_losses(self, masks: Tensor, truths: Tensor) -> Tensor:
-        """Return the distances of masks from what they should be. (M, H, W) each -> (M,)"""
+        """Compute the losses of matched masks. (M, H, W) each -> (M,)"""
         if self.mask_points is not None and len(masks):
-            masks, truths = masks[:, None], truths[:, None]
+            masks = masks[:, None]
+            truths = truths[:, None]
             with torch.no_grad():
                 points = get_uncertain_point_coords_with_randomness(
-                    masks, masks, self.mask_points, OVERSAMPLING, UNCERTAIN
+                    masks,
+                    labels=masks,
+                    num_points=self.mask_points,
+                    oversample_ratio=OVERSAMPLING,
+                    importance_sample_ratio=UNCERTAIN,
                 )
-            masks, truths = (point_sample(part, points)[:, 0] for part in (masks, truths))
+            masks = point_sample(masks, points)[:, 0]
+            truths = point_sample(truths, points)[:, 0]
         return super().mask_losses(masks, truths)
 
     def costs(self, case: Case) -> tuple[Tensor, ...]:
-        """Return the weighted costs of all pairs of a case. (6, n, K)"""
-        lines, truth = case.lines, case.truth
-        points, size = around(lines.curves, truth.masks.shape[-2:]), lines.curves.shape[0]
+        """Compute the weighted costs of all pairs of a case. (6, n, K)"""
+        lines = case.lines
+        truth = case.truth
+        num_lines = lines.curves.shape[0]
+        points = neighbourhood(lines.curves, truth.masks.shape[-2:])  # (n, 2500, 2)
         values = point_sample(truth.masks[None], points.flatten(0, 1)[None])[0]  # (K, n * 2500)
-        own = [
-            self.controls * _mean_apart(lines.controls[:, None], truth.controls),
-            -self.pieces * lines.piece_logits.softmax(-1)[:, truth.pieces],
-            self.curve * _mean_apart(lines.curves[:, None], truth.curves),
-            self.recovery * missed(values.unflatten(1, (size, points.shape[1]))).T,
-        ]
-        return (torch.cat([self.line_costs(case), torch.stack(own)]),)
+        values = values.unflatten(1, (num_lines, points.shape[1]))
+        controls_cost = self.controls * _mean_difference(lines.controls[:, None], truth.controls)
+        pieces_cost = -self.pieces * lines.piece_logits.softmax(dim=-1)[:, truth.pieces]
+        curve_cost = self.curve * _mean_difference(lines.curves[:, None], truth.curves)
+        recovery_cost = self.recovery * recovery_loss(values).T
+        curve_costs = torch.stack([controls_cost, pieces_cost, curve_cost, recovery_cost])
+        return (torch.cat([self.line_costs(case), curve_costs]),)
 
     def pairs(self, case: Case, costs: list[Tensor]) -> Pairs:
         """Match a case by its `costs`, on the CPU."""
-        return Pairs(*assigned(costs[0], COSTS, {"token": case.token}))
+        rows, cols = assigned(costs[0], COSTS, img_meta={"token": case.token})
+        return Pairs(rows, cols)
 
     def __call__(self, cases: Sequence[Case], matches: Sequence[Pairs]) -> dict[str, Tensor]:
-        """Return the weighted losses of a layer and class, from the cases of all samples."""
-        number = max(sum(len(case.truth.pieces) for case in cases), 1)
-        rows, cols = zip(*matches, strict=True)
-        lines: BezierLines = _chosen([case.lines for case in cases], rows)
-        truth: TrueCurves = _chosen([case.truth for case in cases], cols)
-        around_px, values = around(lines.curves, truth.masks.shape[-2:]), lines.curves[..., 0]
+        """Compute the weighted losses of one layer and class.
+
+        Args:
+            cases: Lines of the class in each sample.
+            matches: Matched lines of each case.
+
+        Returns:
+            ``mask``, ``controls``, ``pieces``, ``curve``, ``recovery`` and ``cls``, divided by the
+            number of annotated lines except for ``cls``.
+        """
+        num_annotated = 0
+        rows = []
+        sample_lines = []
+        sample_truths = []
+        for case, match in zip(cases, matches, strict=True):
+            num_annotated += len(case.truth.pieces)
+            rows.append(match.rows)
+            sample_lines.append(_select(case.lines, match.rows))
+            sample_truths.append(_select(case.truth, match.cols))
+        number = max(num_annotated, 1)
+        lines: BezierLines = _concatenate(sample_lines)
+        truth: TrueCurves = _concatenate(sample_truths)
+        points = neighbourhood(lines.curves, truth.masks.shape[-2:])
+        values = lines.curves[..., 0]
         if len(values):
-            values = point_sample(truth.masks[:, None], around_px)[:, 0]
-        controls = lines.controls * lines.used[..., None]
-        pieces = F.cross_entropy(lines.piece_logits, truth.pieces, reduction="none")
-        sums = {
+            values = point_sample(truth.masks[:, None], points)[:, 0]
+        controls = lines.controls * lines.control_mask[..., None]
+        pieces_loss = F.cross_entropy(lines.piece_logits, truth.pieces, reduction="none")
+        line_losses = {
             "mask": self.mask * self.mask_losses(lines.masks, truth.masks),
-            "controls": self.controls * _mean_apart(controls, truth.controls),
-            "pieces": self.pieces * pieces,
-            "curve": self.curve * _mean_apart(lines.curves, truth.curves),
-            "recovery": self.recovery * missed(values),
+            "controls": self.controls * _mean_difference(controls, truth.controls),
+            "pieces": self.pieces * pieces_loss,
+            "curve": self.curve * _mean_difference(lines.curves, truth.curves),
+            "recovery": self.recovery * recovery_loss(values),
         }
-        losses = {name: value.sum() / number for name, value in sums.items()}
-        return {**losses, "cls": self.class_loss(cases, rows)}
+        losses = {name: value.sum() / number for name, value in line_losses.items()}
+        losses["cls"] = self.class_loss(cases, rows)
+        return losses
 
 
-def _chosen(lines: Sequence[Any], indices: Sequence[Tensor]) -> Any:
-    """Return the chosen lines of all samples as one tuple of them. (M, ...)"""
-    picked = ([part[i] for part in own] for own, i in zip(lines, indices, strict=True))
-    return type(lines[0])(*map(torch.cat, zip(*picked, strict=True)))
+def _select(lines: Any, index: Tensor) -> Any:
+    """Select lines in all fields of a tuple. (n, ...) each -> (M, ...) each"""
+    return type(lines)._make(values[index] for values in lines)
 
 
-def _mean_apart(points: Tensor, others: Tensor) -> Tensor:
-    """Return the mean difference of coordinates. (..., P, 2) each -> (...,)"""
-    return (points - others).abs().mean((-2, -1))
+def _concatenate(samples: Sequence[Any]) -> Any:
+    """Concatenate the fields of the tuples of all samples. (M, ...) each"""
+    return type(samples[0])._make(torch.cat(values) for values in zip(*samples, strict=True))
+
+
+def _mean_difference(points: Tensor, others: Tensor) -> Tensor:
+    """Return the mean absolute difference of coordinates. (..., P, 2) each -> (...,)"""
+    return (points - others).abs().mean(dim=(-2, -1))

@@ -1,4 +1,4 @@
-"""BeMapNet's metric: AP per sample of thin lines, at two sets of thresholds."""
+"""BeMapNet's metric: AP per sample of lines of one pixel, at two sets of thresholds."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from gsmap.evaluation.core.sample_ap import SampleAP
 @register_metric
 @dataclass(frozen=True)
 class BeMapNetAP(SampleAP):
-    """AP per sample by the rules of BeMapNet's released evaluator."""
+    """AP per sample with the rules of BeMapNet's released evaluator."""
 
     name: ClassVar[str] = "bemapnet"
     line_px: ClassVar[int] = 1

@@ -1,4 +1,4 @@
-"""BeMapNet's neck: rounds of BiFPN (EfficientDet), whose levels become one map."""
+"""BeMapNet's neck: several rounds of BiFPN (EfficientDet), whose levels are joined to one map."""
 
 from collections.abc import Sequence
 
@@ -12,80 +12,104 @@ NUM_LEVELS = 5  # P3 to P7
 
 
 def _norm(channels: int) -> nn.BatchNorm2d:
-    """Return EfficientDet's batch norm."""
+    """Return EfficientDet's batch normalisation."""
     return nn.BatchNorm2d(channels, eps=1e-3, momentum=0.01)
 
 
 def _projection(inputs: int, outputs: int) -> nn.Sequential:
-    """Return a matrix per pixel and a norm."""
-    return nn.Sequential(nn.Conv2d(inputs, outputs, 1), _norm(outputs))
+    """Return a 1x1 convolution and its normalisation."""
+    return nn.Sequential(nn.Conv2d(inputs, outputs, kernel_size=1), _norm(outputs))
 
 
-def halved(feats: Tensor) -> Tensor:
-    """Return the maxima of 3 x 3 pixels at every second one; zeros are beyond the border.
+def downsample(feats: Tensor) -> Tensor:
+    """Max-pool a map with a 3x3 kernel and stride 2, padded with zeros.
 
-    An even number of pixels has one more behind the last, an odd one also before the first, so that
-    ``(n + 1) // 2`` remain. (B, C, h, w)
+    An axis of even size is padded by one cell after the last one, an axis of odd size also by one
+    before the first, so that ``(n + 1) // 2`` cells remain. (B, C, h, w)
     """
-    # not F.pad: ONNX Runtime (1.31) makes of it the border of a maximum, which is not zero but -inf
+    # Concatenation, not F.pad: ONNX Runtime (1.31) merges padding into the pooling, which pads with
+    # -inf instead of zeros.
     for axis in (2, 3):
-        line = torch.zeros_like(feats.narrow(axis, 0, 1))
-        before = [line] * (feats.shape[axis] % 2)
-        feats = torch.cat([*before, feats, line], axis)
-    return F.max_pool2d(feats, 3, 2)
+        border = torch.zeros_like(feats.narrow(axis, start=0, length=1))
+        parts = [feats, border]
+        if feats.shape[axis] % 2:
+            parts.insert(0, border)
+        feats = torch.cat(parts, dim=axis)
+    return F.max_pool2d(feats, kernel_size=3, stride=2)
 
 
 class FusionConv(nn.Module):
-    """Mean of maps by learned weights, swish, a separable convolution and a norm."""
+    """Weighted mean of maps, followed by swish, a separable convolution and normalisation.
+
+    Args:
+        num_inputs: Number of maps.
+        channels: Channels C of the maps.
+    """
 
     def __init__(self, num_inputs: int, channels: int) -> None:
         super().__init__()
         self.weights = nn.Parameter(torch.ones(num_inputs))
-        self.depthwise = nn.Conv2d(channels, channels, 3, padding=1, groups=channels, bias=False)
-        self.pointwise = nn.Conv2d(channels, channels, 1)
+        self.depthwise = nn.Conv2d(
+            channels, channels, kernel_size=3, padding=1, groups=channels, bias=False
+        )
+        self.pointwise = nn.Conv2d(channels, channels, kernel_size=1)
         self.norm = _norm(channels)
 
     def forward(self, *maps: Tensor) -> Tensor:
-        """Fuse maps of one size. (B, C, h, w)"""
+        """Fuse maps of equal size. (B, C, h, w) each -> (B, C, h, w)"""
         weights = self.weights.relu()
         shares = weights / (weights.sum() + 1e-4)
-        fused = sum(share * feats for share, feats in zip(shares, maps, strict=True))
-        return self.norm(self.pointwise(self.depthwise(F.silu(fused))))
+        mean = sum(share * feats for share, feats in zip(shares, maps, strict=True))
+        return self.norm(self.pointwise(self.depthwise(F.silu(mean))))
 
 
 class BiFPNRound(nn.Module):
-    """Information runs from the coarsest level to the finest, and back. (B, C, h, w) each"""
+    """Fusion of all levels from the coarsest to the finest one, and back.
+
+    Args:
+        channels: Channels C of each level.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.down = nn.ModuleList(FusionConv(2, channels) for _ in range(NUM_LEVELS - 1))
-        self.up = nn.ModuleList(
-            FusionConv(2 if i == NUM_LEVELS - 1 else 3, channels) for i in range(1, NUM_LEVELS)
-        )
+        self.up = nn.ModuleList()
+        for level in range(1, NUM_LEVELS):
+            num_inputs = 2 if level == NUM_LEVELS - 1 else 3
+            self.up.append(FusionConv(num_inputs, channels))
 
     def forward(self, levels: Sequence[Tensor], again: Sequence[Tensor]) -> list[Tensor]:
-        """Fuse levels, the finest first; ``again`` are they as the way back reads them."""
-        *finer, mixed = levels
-        ways = [mixed]
-        for conv, feats in zip(self.down, reversed(finer), strict=True):
-            mixed = conv(feats, F.interpolate(mixed, feats.shape[-2:], mode="nearest"))
-            ways.insert(0, mixed)
-        results = [mixed]
-        for conv, feats, way in zip(self.up, again[1:], [*ways[1:-1], None], strict=True):
-            between = () if way is None else (way,)  # the coarsest level has none
-            results.append(conv(feats, *between, halved(results[-1])))
+        """Fuse the levels, the finest first. (B, C, h, w) each -> (B, C, h, w) each
+
+        Args:
+            levels: Inputs of the path from the coarsest to the finest level.
+            again: Inputs of the path back.
+        """
+        top_down = [levels[-1]]
+        for conv, feats in zip(self.down, reversed(levels[:-1]), strict=True):
+            coarser = F.interpolate(top_down[-1], size=feats.shape[-2:], mode="nearest")
+            top_down.append(conv(feats, coarser))
+        top_down.reverse()  # the finest first
+        results = [top_down[0]]
+        for level, conv in enumerate(self.up, start=1):
+            finer = downsample(results[-1])
+            if level == NUM_LEVELS - 1:
+                results.append(conv(again[level], finer))
+            else:
+                results.append(conv(again[level], top_down[level], finer))
         return results
 
 
 @MODELS.register_module()
 class BiFPN(BaseModule):
-    """Fuse levels in both directions, then resize all to one size and join their channels.
+    """Image neck that fuses levels in both directions and concatenates them at one size.
 
     Args:
-        in_channels: Channels of the three image features, the finest first.
+        in_channels: Channels of the three levels of image features, the finest first.
         size: Rows and columns of the result.
-        channels: Channels C of each of the five levels; the result has 5 C.
-        num_rounds: How often they are fused.
+        channels: Channels C of each of the five levels; the result has 5 C channels.
+        num_rounds: Number of rounds of fusion.
+        init_cfg: Initialisation config of mmengine.
     """
 
     def __init__(
@@ -97,23 +121,27 @@ class BiFPN(BaseModule):
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(init_cfg)
-        self.size = int(size[0]), int(size[1])
-        self.inputs = nn.ModuleList(_projection(c, channels) for c in in_channels)
+        self.size = (int(size[0]), int(size[1]))
+        self.inputs = nn.ModuleList(_projection(inputs, channels) for inputs in in_channels)
         self.coarser = _projection(in_channels[-1], channels)
-        # what the way back of the first round reads of all levels but the finest
-        self.again = nn.ModuleList(_projection(c, channels) for c in in_channels[1:])
+        # Further projections of the levels but the finest, for the path back of the first round.
+        self.again = nn.ModuleList(_projection(inputs, channels) for inputs in in_channels[1:])
         self.rounds = nn.ModuleList(BiFPNRound(channels) for _ in range(num_rounds))
 
     def forward(self, feats: Sequence[Tensor]) -> list[Tensor]:
-        """Return the joined levels. (B, c, h, w) each -> [(B, 5 C, *size)]"""
-        coarser = [halved(self.coarser(feats[-1]))]
-        coarser.append(halved(coarser[0]))
-        levels = [*(conv(f) for conv, f in zip(self.inputs, feats, strict=True)), *coarser]
-        seconds = [conv(f) for conv, f in zip(self.again, feats[1:], strict=True)]
-        again = [levels[0], *seconds, *coarser]
-        for step in self.rounds:
-            levels = again = step(levels, again)
-        resized = [
-            F.interpolate(level, self.size, mode="bilinear", align_corners=True) for level in levels
-        ]
-        return [torch.cat(resized, 1)]
+        """Fuse levels (n, c, h, w), the finest first, to one map. (n, 5 C, *size)"""
+        sixth = downsample(self.coarser(feats[-1]))
+        seventh = downsample(sixth)
+        levels = [conv(level) for conv, level in zip(self.inputs, feats, strict=True)]
+        again = [conv(level) for conv, level in zip(self.again, feats[1:], strict=True)]
+        again.insert(0, levels[0])
+        levels += [sixth, seventh]
+        again += [sixth, seventh]
+        for fuse in self.rounds:
+            levels = fuse(levels, again)
+            again = levels
+        resized = []
+        for level in levels:
+            level = F.interpolate(level, size=self.size, mode="bilinear", align_corners=True)
+            resized.append(level)
+        return [torch.cat(resized, dim=1)]

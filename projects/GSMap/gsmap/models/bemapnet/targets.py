@@ -1,4 +1,4 @@
-"""BeMapNet's targets: the control points of every line, and its mask."""
+"""BeMapNet's targets: the control points and the mask of every line."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,16 +16,19 @@ from gsmap.utils.errors import InputError
 @TRANSFORMS.register_module()
 @dataclass(eq=False)
 class FormatBezierTargets(FormatLineTargets):
-    """Add ``gt_instances_3d`` with the control points of lines, from ``map_instances``.
+    """Add ``gt_instances_3d`` with the control points of lines, fitted to ``map_instances``.
+
+    The fields of the targets and the other settings are described in `FormatLineTargets`.
 
     Args:
-        degrees: Degrees of the pieces of each class; a config has them in the head.
-        pieces: Most pieces of each class, likewise; as released, further ones are lost.
-        max_error_m: A piece is accepted below this mean deviation, in metres.
+        degrees: Degree of the pieces of each class, 1 to 5. A config sets it in the head.
+        pieces: Largest number of pieces of each class, >= 1. A config sets it in the head. As in
+            the released code, further pieces of a line are dropped.
+        max_error_m: Largest mean deviation of a piece from its line, in metres.
 
-    Other settings, and what the targets are, are those of `FormatLineTargets`. ValueError if a
-    degree is not 1 to 5, a class has no piece or just one of the two, or ``edge_classes`` names one
-    that is not.
+    Raises:
+        ValueError: If degrees and pieces are out of range or differ in length, or if
+            ``edge_classes`` has an unknown class.
     """
 
     degrees: Sequence[int] = (2, 1, 3)
@@ -37,7 +40,7 @@ class FormatBezierTargets(FormatLineTargets):
         super().__post_init__()
 
     def by_class(self) -> tuple[str, Sequence[int]]:
-        """Return the setting that has a number for each class: its name and the numbers."""
+        """Return the name and the values of the setting with one number for each class."""
         return "degrees", self.degrees
 
     def most(self) -> int:
@@ -45,23 +48,42 @@ class FormatBezierTargets(FormatLineTargets):
         return max(d * k + 1 for d, k in zip(self.degrees, self.pieces, strict=True))
 
     def way(self, points: Points, label: int) -> Points:
-        """Return points of the curve of control points."""
+        """Return points along the curve of control points. (P, 2) -> (n, 2)"""
         return curve_points(points, self.degrees[label])
 
     def points(self, line: Points, label: int, grid: BEVGrid) -> Points:
-        """Return the control points of a line, [0, 1] from the front and the left. (P, 2)"""
+        """Fit the control points of a line, from its rear end to the front.
+
+        Args:
+            line: Points (from the front, from the left) in [0, 1]. (n, 2)
+            label: Class index.
+            grid: Raster of the masks.
+
+        Returns:
+            Control points (from the front, from the left) in [0, 1]. (P, 2)
+        """
         if self.sort_rings and is_closed(line):
-            line = directed(line, 0.0, sort_rings=True)
-        size_m = tuple(pixels * self.pixel_m for pixels in front_size(grid))
+            line = directed(line, tolerance=0.0, sort_rings=True)
+        rows, columns = front_size(grid)
+        size_m = (rows * self.pixel_m, columns * self.pixel_m)
         degree = self.degrees[label]
-        fitted = fit_pieces(line * size_m, degree, self.max_error_m, mean_deviation)
-        if fitted[0, 0] > fitted[-1, 0]:  # a curve runs away from the front
-            fitted = fitted[::-1]
-        return fitted[: degree * self.pieces[label] + 1] / size_m
+        controls = fit_pieces(
+            line * size_m,
+            degree,
+            max_error_m=self.max_error_m,
+            deviation=mean_deviation,
+        )
+        if controls[0, 0] > controls[-1, 0]:
+            controls = controls[::-1]
+        return controls[: degree * self.pieces[label] + 1] / size_m
 
 
 def check_curves(degrees: Sequence[int], pieces: Sequence[int]) -> None:
-    """Raise ValueError if these are not degrees and numbers of pieces of classes."""
+    """Check the degrees and the numbers of pieces of the classes.
+
+    Raises:
+        ValueError: If they are out of range or differ in length.
+    """
     if len(degrees) != len(pieces) or not all(1 <= d <= MAX_DEGREE for d in degrees):
         raise InputError(
             f"degrees must be 1 to {MAX_DEGREE} for each class of pieces, got {list(degrees)} for "

@@ -1,1 +1,1 @@
-"""HDMapNet: maps of classes, instances and directions, and lines from them."""
+"""HDMapNet (ICRA 2022), which traces lines in maps of classes, instances and directions."""

@@ -1,1 +1,1 @@
-"""VectorMapNet (Liu et al., ICML 2023)."""
+"""VectorMapNet (ICML 2023), which generates the points of each element one after another."""
