@@ -15,7 +15,7 @@ from reference.report import Row, largest_difference, largest_relative, relative
 from scipy.ndimage import binary_dilation
 
 from gsmap.models.lines.head import LinePredictions
-from gsmap.models.pivotnet.head import PivotHead, packed
+from gsmap.models.pivotnet.head import PivotHead, pack_lines
 from gsmap.models.pivotnet.losses import Lines
 from gsmap.models.pivotnet.matching import match_pivots, path_costs, sequence_costs
 from gsmap.models.pivotnet.targets import FormatPivotTargets
@@ -161,7 +161,7 @@ def check_losses(golden: Golden, name: str) -> Iterator[Row]:
     for tag in ("closed", "many", "dividers_only"):
         yield from loss_rows(parts, name, head, tag, data)
     (layer,) = Given(parts, head, "pv_post_", [5]).layers
-    output = packed([Lines(*(part.detach() for part in own)) for own in layer])
+    output = pack_lines([Lines(*(part.detach() for part in own)) for own in layer])
     yield from decoded_rows(name, head, output, data, "post", (100, 50))
 
 

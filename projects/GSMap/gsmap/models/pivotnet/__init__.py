@@ -1,1 +1,1 @@
-"""PivotNet (arXiv 2308.16477): elements as their pivots, of any number."""
+"""PivotNet (arXiv 2308.16477), which predicts elements as a variable number of pivots."""

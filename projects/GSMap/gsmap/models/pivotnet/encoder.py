@@ -1,4 +1,4 @@
-"""PivotNet's BEV encoder: deformable layers over all cameras side by side."""
+"""PivotNet's BEV encoder: deformable attention over the feature maps of all cameras."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -20,45 +20,83 @@ Shapes = Sequence[tuple[int, int]]
 
 
 class DeformableLayer(nn.Module):
-    """Attentions to maps, one after another, and a feed-forward network, post-norm."""
+    """Layer of successive deformable attentions and a feed-forward network; post-norm.
 
-    def __init__(self, levels: Sequence[int], ffn_dims: int, dropout: float, **sizes: int) -> None:
+    Args:
+        levels: Number of maps of each attention.
+        embed_dims: Channels C of the tokens and of the maps.
+        num_heads: Number of attention heads.
+        num_points: Number of samples per head and map.
+        ffn_dims: Hidden channels of the feed-forward network.
+        dropout: Probability of setting a value to zero in training, in [0, 1].
+    """
+
+    def __init__(
+        self,
+        levels: Sequence[int],
+        embed_dims: int,
+        num_heads: int,
+        num_points: int,
+        ffn_dims: int,
+        dropout: float,
+    ) -> None:
         super().__init__()
-        self.attns = nn.ModuleList(
-            MultiLevelAttention(number, dropout=dropout, **sizes) for number in levels
-        )
-        self.ffn = feed_forward(sizes["embed_dims"], ffn_dims, dropout)
-        self.norms = nn.ModuleList(nn.LayerNorm(sizes["embed_dims"]) for _ in (*levels, "ffn"))
+        self.attns = nn.ModuleList()
+        for num_maps in levels:
+            attn = MultiLevelAttention(
+                num_maps,
+                num_points=num_points,
+                embed_dims=embed_dims,
+                num_heads=num_heads,
+                dropout=dropout,
+            )
+            self.attns.append(attn)
+        self.ffn = feed_forward(embed_dims, ffn_dims, dropout=dropout)
+        self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in range(len(levels) + 1))
 
     def forward(
         self, tokens: Tensor, position: Tensor, *views: tuple[Sequence[Tensor], Tensor]
     ) -> Tensor:
-        """Update tokens (B, Q, C) by maps (B, C, h, w) at references (B, Q, 2) in each of them."""
-        *norms, last = self.norms
+        """Update tokens by the maps of each attention.
+
+        Args:
+            tokens: Tokens. (B, Q, C)
+            position: Positional embeddings. (Q, C)
+            views: For each attention its maps (B, C, h, w) and the references of the tokens in
+                [0, 1] over each map (B, Q, 2).
+
+        Returns:
+            Updated tokens. (B, Q, C)
+        """
+        *norms, last_norm = self.norms
         for attn, norm, (maps, reference) in zip(self.attns, norms, views, strict=True):
-            tokens = norm(tokens + attn(tokens + position, reference, maps))
-        return last(self.ffn(tokens))
+            tokens = norm(tokens + attn(tokens + position, reference, feats=maps))
+        return last_norm(self.ffn(tokens))
 
 
 @MODELS.register_module()
 class PivotBEVEncoder(CameraEncoder):
-    """Mix the cameras side by side, then let BEV cells look at them (PivotNet).
+    """BEV encoder with deformable attention over the concatenated cameras (PivotNet).
 
-    A cell looks around the place of its centre on the ground in one camera, or around a learned one
-    if that camera does not see it. Besides ``bev_feats`` there are ``bev_levels``, what each of the
-    BEV layers returns.
+    The feature maps of all cameras are concatenated from left to right. A BEV cell attends around
+    the projection of its centre on the ground into one camera, or around a learned reference if it
+    is outside that camera's image. In addition to ``bev_feats``, the encoder returns
+    ``bev_levels``, the outputs of all BEV layers.
 
     Args:
-        grid: The map's extent.
+        grid: Extent of the map, in metres.
         image_size: Rows and columns of the (padded) images.
-        in_channels: Channels of the feature maps.
-        strides: Image pixels per pixel of each.
+        in_channels: Channels of each level of image features.
+        strides: Image pixels per feature pixel of each level.
         bev_pixel_m: Side of a BEV cell in metres.
-        num_cams: Number of cameras, neighbours side by side.
-        num_layers: Layers over the cameras, and BEV layers.
-        layer_cfg: ``num_heads``, ``num_points`` per map, ``ffn_dims``, ``dropout`` of all layers.
-        camera_by: The camera that a cell looks at: that in which it has the largest ``"depth"``, as
-            released, or is nearest to the optical axis (``"angle"``), as intended.
+        embed_dims: Channels C of the BEV features.
+        num_cams: Number V of cameras, in the order of concatenation.
+        num_layers: Number of layers over the cameras, and number of BEV layers.
+        layer_cfg: Settings ``num_heads``, ``num_points`` per map, ``ffn_dims`` and ``dropout`` of
+            all layers.
+        camera_by: Choice of the camera of a cell: the one with the largest ``"depth"``, as in the
+            released code, or with the smallest ``"angle"`` to the optical axis, as intended.
+        init_cfg: Initialisation config of mmengine.
 
     Raises:
         ValueError: If ``camera_by`` is unknown.
@@ -83,92 +121,136 @@ class PivotBEVEncoder(CameraEncoder):
     ) -> None:
         super().__init__(init_cfg)
         if camera_by not in ("depth", "angle"):
-            raise InputError(f"camera_by must be 'depth' or 'angle', got {camera_by!r}.")
-        self.grid, self.camera_by = grid.rasterized(bev_pixel_m), camera_by
-        self.shapes = [(image_size[0] // s, num_cams * (image_size[1] // s)) for s in strides]
-        self.input_proj = nn.ModuleList(
-            nn.Sequential(
-                nn.Conv2d(channels, embed_dims, 1, bias=False), nn.BatchNorm2d(embed_dims)
-            )
-            for channels in in_channels
-        )
-        self.source_pos = nn.ModuleList(
-            nn.Embedding(height * width, embed_dims) for height, width in self.shapes
-        )
+            raise ValueError(f"camera_by must be 'depth' or 'angle', got {camera_by!r}.")
+        self.grid = grid.rasterized(bev_pixel_m)
+        self.camera_by = camera_by
+        self.shapes = []
+        for stride in strides:
+            height = image_size[0] // stride
+            width = num_cams * (image_size[1] // stride)
+            self.shapes.append((height, width))
+        self.input_proj = nn.ModuleList()
+        for channels in in_channels:
+            conv = nn.Conv2d(channels, embed_dims, kernel_size=1, bias=False)
+            self.input_proj.append(nn.Sequential(conv, nn.BatchNorm2d(embed_dims)))
+        self.source_pos = nn.ModuleList()
+        for height, width in self.shapes:
+            self.source_pos.append(nn.Embedding(height * width, embed_dims))
         defaults = {"num_heads": 8, "num_points": 8, "ffn_dims": 1024, "dropout": 0.1}
         settings = {"embed_dims": embed_dims, **defaults, **(layer_cfg or {})}
-        self.source_layers, self.bev_layers = (
-            nn.ModuleList(DeformableLayer(levels, **settings) for _ in range(number))
-            for levels, number in zip(((len(strides),), (1, len(strides))), num_layers, strict=True)
+        num_source_layers, num_bev_layers = num_layers
+        num_levels = len(strides)
+        self.source_layers = nn.ModuleList(
+            DeformableLayer(levels=[num_levels], **settings) for _ in range(num_source_layers)
         )
-        cells = self.grid.height * self.grid.width
-        self.bev_embedding = nn.Embedding(cells, embed_dims)
-        self.bev_pos = nn.Embedding(cells, embed_dims)
+        self.bev_layers = nn.ModuleList(
+            DeformableLayer(levels=[1, num_levels], **settings) for _ in range(num_bev_layers)
+        )
+        num_cells = self.grid.height * self.grid.width
+        self.bev_embedding = nn.Embedding(num_cells, embed_dims)
+        self.bev_pos = nn.Embedding(num_cells, embed_dims)
         self.unseen_reference = nn.Linear(embed_dims, 2)
 
     def init_weights(self) -> None:
-        """Initialise the matrices (Xavier); tables of positions and of cells stay normal."""
+        """Initialise matrices with Xavier's method; embeddings are initialised normally."""
         super().init_weights()
-        for part in (self.source_layers, self.bev_layers, self.unseen_reference):
-            init_matrices(part)
+        for module in (self.source_layers, self.bev_layers, self.unseen_reference):
+            init_matrices(module)
 
     def encode(
         self, feats: Sequence[Tensor], calibration: Mapping[str, Tensor], img_shape: tuple[int, int]
     ) -> dict[str, Any]:
-        """Encode feature maps, each (B, V, C, h, w), with ``img_from_ground`` (B, V, 4, 4).
+        """Encode image features to BEV features.
 
-        ValueError if they have other sizes than the position tables.
+        Args:
+            feats: Levels of image features. (B, V, C', h, w) each
+            calibration: ``img_from_ground``, transforms from the ground frame in metres to pixels.
+                (B, V, 4, 4)
+            img_shape: Rows and columns of the padded images.
+
+        Returns:
+            ``bev_feats`` (B, C, H, W) and ``bev_levels``, one map (B, C, H, W) for each BEV layer.
+
+        Raises:
+            ValueError: If the sizes of the features differ from the settings.
         """
-        sources, position = self.sources(feats), self.bev_pos.weight
-        uv, seen = self.project(calibration["img_from_ground"], img_shape)
-        reference = torch.where(seen[..., None], uv, self.unseen_reference(position).sigmoid())
+        sources = self.sources(feats)
+        position = self.bev_pos.weight
+        uv, visible = self.project(calibration["img_from_ground"], img_shape)
+        learned = self.unseen_reference(position).sigmoid()
+        source_reference = torch.where(visible[..., None], uv, learned)  # (B, H * W, 2)
         shapes = [front_size(self.grid)]
-        own = centres(shapes, position.device).expand_as(reference)
-        cells, bev = self.bev_embedding.weight.expand(len(uv), -1, -1), []
+        cell_reference = centres(shapes, position.device).expand_as(source_reference)
+        cells = self.bev_embedding.weight.expand(len(uv), -1, -1)  # (B, H * W, C)
+        levels = []
         for layer in self.bev_layers:
-            cells = layer(cells, position, (maps_of(cells, shapes), own), (sources, reference))
-            bev.append(turned(maps_of(cells, shapes)[0], self.grid))
-        return {"bev_feats": bev[-1], "bev_levels": bev}
+            bev_view = (split_maps(cells, shapes), cell_reference)
+            source_view = (sources, source_reference)
+            cells = layer(cells, position, bev_view, source_view)
+            levels.append(turned(split_maps(cells, shapes)[0], self.grid))
+        return {"bev_feats": levels[-1], "bev_levels": levels}
 
     def sources(self, feats: Sequence[Tensor]) -> list[Tensor]:
-        """Return the cameras side by side, mixed. (B, C, h, V * w) each"""
-        joined = [f.permute(0, 2, 3, 1, 4).flatten(3) for f in feats]
-        found = [tuple(f.shape[-2:]) for f in joined]
-        if found != self.shapes:
-            raise InputError(
-                f"the cameras side by side must have {self.shapes} feature pixels, not {found}; "
+        """Concatenate the cameras from left to right and apply the layers over the cameras.
+
+        Args:
+            feats: Levels of image features. (B, V, C', h, w) each
+
+        Returns:
+            Maps of all cameras. (B, C, h, V * w) each
+
+        Raises:
+            ValueError: If the sizes of the features differ from the settings.
+        """
+        levels = [level.permute(0, 2, 3, 1, 4).flatten(3) for level in feats]
+        shapes = [tuple(level.shape[-2:]) for level in levels]
+        if shapes != self.shapes:
+            raise ValueError(
+                f"the cameras side by side must have {self.shapes} feature pixels, not {shapes}; "
                 "set image_size, strides and num_cams of PivotBEVEncoder to those of the images."
             )
-        maps = zip(self.input_proj, joined, strict=True)
-        tokens = torch.cat([project(f).flatten(2) for project, f in maps], 2).transpose(1, 2)
-        position = torch.cat([*self.source_pos.parameters()])
-        tokens = tokens + position  # as released, the content has the position too
+        pixels = []
+        for project, level in zip(self.input_proj, levels, strict=True):
+            pixels.append(project(level).flatten(2))
+        tokens = torch.cat(pixels, dim=2).transpose(1, 2)  # (B, S, C)
+        position = torch.cat(list(self.source_pos.parameters()))
+        tokens = tokens + position  # As in the released code, values have the position, too.
         reference = centres(self.shapes, position.device).expand(len(tokens), -1, -1)
         for layer in self.source_layers:
-            tokens = layer(tokens, position, (maps_of(tokens, self.shapes), reference))
-        return maps_of(tokens, self.shapes)
+            tokens = layer(tokens, position, (split_maps(tokens, self.shapes), reference))
+        return split_maps(tokens, self.shapes)
 
     def project(self, img_from_ground: Tensor, img_shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
-        """Return each cell's centre in its camera, [0, 1] over all, and whether that sees it.
+        """Project the centres of the BEV cells on the ground into one camera each.
 
-        (B, H * W, 2), (B, H * W)
+        Args:
+            img_from_ground: Transforms from the ground frame in metres to pixels. (B, V, 4, 4)
+            img_shape: Rows and columns of the padded images.
+
+        Returns:
+            Positions in [0, 1] over all concatenated cameras (B, H * W, 2), and True for cells
+            inside the image of their camera. (B, H * W)
         """
         matrices = img_from_ground.float()
-        places = centres([front_size(self.grid)], matrices.device).flip(-1)
-        points = F.pad(self.grid.metres_from_front(places), (0, 1))  # on the ground
+        cell_centres = centres([front_size(self.grid)], matrices.device).flip(-1)
+        points = F.pad(self.grid.metres_from_front(cell_centres), (0, 1))  # z = 0
         points = F.pad(points, (0, 1), value=1.0)  # (Q, 4)
-        uv, visible = project_pillars(points[:, None], matrices, img_shape)
+        uv, visible = project_pillars(points[:, None], matrices, img_shape=img_shape)
         score = torch.einsum("bvd,qd->bvq", matrices[:, :, 2], points)  # the depth
         if self.camera_by == "angle":
-            cameras = torch.linalg.inv(matrices)[..., :3, 3]  # where they stand (B, V, 3)
-            score = score / torch.cdist(cameras, points[None, :, :3].expand(len(cameras), -1, -1))
-        camera = score.argmax(1, keepdim=True)  # (B, 1, Q)
-        u, v = (part.gather(1, camera)[:, 0] for part in uv[..., 0, :].unbind(-1))
+            positions = torch.linalg.inv(matrices)[..., :3, 3]  # of the cameras (B, V, 3)
+            ground = points[None, :, :3].expand(len(positions), -1, -1)
+            score = score / torch.cdist(positions, ground)
+        camera = score.argmax(dim=1, keepdim=True)  # (B, 1, Q)
+        u_by_camera, v_by_camera = uv[..., 0, :].unbind(-1)  # (B, V, Q)
+        u = u_by_camera.gather(1, camera)[:, 0]
+        v = v_by_camera.gather(1, camera)[:, 0]
         u = (u + camera[:, 0]) / matrices.shape[1]
-        return torch.stack([u, v], -1), visible.gather(1, camera)[:, 0]
+        return torch.stack([u, v], dim=-1), visible.gather(1, camera)[:, 0]
 
 
-def maps_of(tokens: Tensor, shapes: Shapes) -> list[Tensor]:
-    """Return the maps whose cells stand one after another. (B, cells, C) -> (B, C, h, w) each"""
-    parts = tokens.transpose(1, 2).split([height * width for height, width in shapes], 2)
+def split_maps(tokens: Tensor, shapes: Shapes) -> list[Tensor]:
+    """Split successive cells into maps of given shapes. (B, cells, C) -> (B, C, h, w) each"""
+    sizes = [height * width for height, width in shapes]
+    parts = tokens.transpose(1, 2).split(sizes, dim=2)
     return [part.unflatten(2, shape) for part, shape in zip(parts, shapes, strict=True)]

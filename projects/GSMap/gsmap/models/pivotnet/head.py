@@ -1,4 +1,4 @@
-"""PivotNet's head: points of lines, of which those that are pivots make the map."""
+"""PivotNet's head: lines of points, of which the pivots form the map elements."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,55 +23,68 @@ from gsmap.utils.errors import InputError
 
 @dataclass(frozen=True)
 class PivotReference(Reference):
-    """What points are: (u, v, logit of a pivot), and the lines that pivots make."""
+    """References of points with the logit of a pivot: (u, v, logit), u and v in [0, 1].
+
+    Args:
+        grid: Extent of the map, in metres.
+    """
 
     grid: BEVGrid
     outputs = ("pts", "num_pts")
 
     def decode(self, references: Tensor) -> Tensors:
-        """Keep the pivots of every line, those of positive logit, in order.
+        """Select the pivots of every line, the points of positive logit, in order.
 
-        ``pts`` (N, P, 2) are in metres, the last one repeated, ``num_pts`` (N,) their numbers.
-        (N, P, 3)
+        Args:
+            references: Points (from the front, from the left) with logits. (N, P, 3)
+
+        Returns:
+            ``pts`` in metres, filled with the last pivot, (N, P, 2) and ``num_pts`` (N,).
         """
-        dropped = references[..., 2] <= 0
-        index = torch.arange(dropped.shape[1], device=dropped.device)
-        order = (index + dropped * len(index)).argsort(-1)  # pivots first
-        number = (~dropped).sum(-1)
+        is_dropped = references[..., 2] <= 0
+        index = torch.arange(is_dropped.shape[1], device=is_dropped.device)
+        order = (index + is_dropped * len(index)).argsort(dim=-1)  # pivots first
+        number = (~is_dropped).sum(dim=-1)
         order = order.gather(1, index.minimum(number[:, None] - 1))
         points = references[..., :2].gather(1, order[..., None].expand(-1, -1, 2))
         return {"pts": self.grid.metres_from_front(points), "num_pts": number}
 
 
-def packed(lines: list[Lines]) -> LinePredictions:
-    """Join what a layer says of the lines of each class; ends are pivots whatever it says."""
+def pack_lines(lines: list[Lines]) -> LinePredictions:
+    """Join the lines of all classes to predictions; the ends of a line are always pivots."""
+    longest = max(class_lines.points.shape[2] for class_lines in lines)
     references = []
-    longest = max(own.points.shape[2] for own in lines)
-    for own in lines:
-        pivot = own.point_logits[..., PIVOT, None] - own.point_logits[..., 1 - PIVOT, None]
+    logits = []
+    for class_lines in lines:
+        point_logits = class_lines.point_logits
+        pivot = point_logits[..., PIVOT, None] - point_logits[..., 1 - PIVOT, None]
         ends = torch.ones_like(pivot[:, :, :1])
-        pivot = torch.cat([ends, pivot[:, :, 1:-1], ends], 2)
-        both = torch.cat([own.points, pivot], -1)
-        references.append(F.pad(both, (0, 0, 0, longest - both.shape[2]), value=-1.0))
-    scores = class_scores([own.logits for own in lines])
-    return LinePredictions(scores, torch.cat(references, 1), lines)
+        pivot = torch.cat([ends, pivot[:, :, 1:-1], ends], dim=2)  # (B, n, p, 1)
+        reference = torch.cat([class_lines.points, pivot], dim=-1)  # (B, n, p, 3)
+        missing = longest - reference.shape[2]
+        references.append(F.pad(reference, (0, 0, 0, missing), value=-1.0))
+        logits.append(class_lines.logits)
+    return LinePredictions(
+        scores=class_scores(logits), references=torch.cat(references, dim=1), lines=lines
+    )
 
 
 @MODELS.register_module()
 class PivotHead(LineHead):
-    """Predict lines of classes that have queries and numbers of points of their own (PivotNet).
+    """Head of lines with a number of queries and of points for each class (PivotNet).
 
     Args:
-        grid: The map's extent.
+        grid: Extent of the map, in metres.
         classes: Names of the classes.
-        queries: Lines of each class, and points of each line.
+        queries: Number of lines, and number of points of each line, for each class.
         decoder: Settings of `PointLineDecoder`.
         losses: Settings of `PivotLosses`.
-        embed_dims: Channels C.
+        embed_dims: Channels C of the points and of the BEV features.
         kwargs: Further arguments of `LineHead`.
 
     Raises:
-        ValueError: If queries do not fit the classes, or there are more layers than weights.
+        ValueError: If queries do not fit the classes, or if there are more decoder layers than loss
+            weights.
     """
 
     transforms = ("FormatPivotTargets",)
@@ -93,47 +106,84 @@ class PivotHead(LineHead):
                 "queries must be lines (>= 1) and their points (>= 2) for each of "
                 f"{list(classes)}, got {list(queries)}."
             )
-        own = {"queries": queries, **(decoder or {})}, PivotLosses(**(losses or {}))
-        numbers = [n for n, _ in queries]
-        super().__init__(grid, classes, numbers, *own, embed_dims=embed_dims, **kwargs)
+        super().__init__(
+            grid,
+            classes,
+            numbers=[num_lines for num_lines, _ in queries],
+            decoder={"queries": queries, **(decoder or {})},
+            losses=PivotLosses(**(losses or {})),
+            embed_dims=embed_dims,
+            **kwargs,
+        )
         self.reference = PivotReference(grid)
-        dims, both = [embed_dims] * 3, 2 * self.point_dims
-        self.point_branches = nn.ModuleList(mlp(*dims, both) for _ in classes)
-        self.kind_branches = nn.ModuleList(mlp(both, both, both, 2) for _ in classes)
+        feature_dims = 2 * self.point_dims
+        self.point_branches = nn.ModuleList()
+        self.kind_branches = nn.ModuleList()
+        for _ in classes:
+            self.point_branches.append(mlp(embed_dims, embed_dims, embed_dims, feature_dims))
+        for _ in classes:
+            self.kind_branches.append(mlp(feature_dims, feature_dims, feature_dims, 2))
 
     @classmethod
     def target_settings(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the settings of the transform that follow from those of the head."""
-        points = tuple(points for _, points in settings["queries"])
-        return {"num_points": points, **super().target_settings(settings)}
+        """Return the settings of `FormatPivotTargets` that follow from the head's settings."""
+        num_points = tuple(num_points for _, num_points in settings["queries"])
+        return {"num_points": num_points, **super().target_settings(settings)}
 
     def predictions(self, layer: Sequence[ClassLines], mean: Tensor) -> LinePredictions:
-        """Return the points, kinds and scores of a layer's lines."""
+        """Predict the points, the pivots and the scores of lines.
+
+        Args:
+            layer: Lines of each class from one decoder layer.
+            mean: Mean feature of the map's coordinates. (D,)
+        """
         lines = []
-        parts = zip(layer, self.point_branches, self.kind_branches, strict=True)
-        for own, point_branch, kind_branch in parts:
-            feature = point_branch(own.states).float()
+        for label, class_lines in enumerate(layer):
+            feature = self.point_branches[label](class_lines.states).float()
             points = (feature.unflatten(-1, (2, -1)) @ mean).sigmoid()  # (B, n, p, 2)
-            kinds = kind_branch(feature).float()
-            lines.append(Lines(own.logits.float(), points, kinds, own.masks.float()))
-        return packed(lines)
+            predicted = Lines(
+                logits=class_lines.logits.float(),
+                points=points,
+                point_logits=self.kind_branches[label](feature).float(),
+                masks=class_lines.masks.float(),
+            )
+            lines.append(predicted)
+        return pack_lines(lines)
 
     def truth(self, sample: Det3DDataSample) -> list[TrueLines]:
-        """Return a sample's annotated lines, by class; ValueError if they are not of this head."""
+        """Return the annotated lines of a sample for each class.
+
+        Raises:
+            ValueError: If the sample has no targets, or targets that do not fit the head.
+        """
         instances = self.annotated(sample)
-        labels, numbers, masks = instances.labels_3d, instances.num_pts, instances.masks
-        pivots, found = self.grid.front_from_metres(instances.pts.float()), []
-        for label, (_, most) in enumerate(self.decoder.queries):
-            own = labels == label
-            if (numbers[own] > most).any():
-                raise InputError(
-                    f"a line of class {label} has {int(numbers[own].max())} pivots, but the head "
-                    f"has {most} points: set num_points of FormatPivotTargets to those of its "
-                    "queries."
+        pivots = self.grid.front_from_metres(instances.pts.float())
+        truths = []
+        for label, (_, num_points) in enumerate(self.decoder.queries):
+            is_class = instances.labels_3d == label
+            numbers = instances.num_pts[is_class]
+            if (numbers > num_points).any():
+                raise ValueError(
+                    f"a line of class {label} has {int(numbers.max())} pivots, but the head "
+                    f"has {num_points} points: set num_points of FormatPivotTargets to those of "
+                    "its queries."
                 )
-            found.append(TrueLines(pivots[own, :most], numbers[own], masks[own].float()))
-        return found
+            class_truth = TrueLines(
+                pivots=pivots[is_class, :num_points],
+                numbers=numbers,
+                masks=instances.masks[is_class].float(),
+            )
+            truths.append(class_truth)
+        return truths
 
     def semantic_loss(self, levels: Sequence[Tensor], truths: Sequence[Any]) -> Tensor:
-        """Return the loss of the class masks, a mean over the classes. (B, classes, H, W) each"""
+        """Compute the loss of the class masks, averaged over the classes.
+
+        Args:
+            levels: Logits of the class masks of each BEV level. (B, classes, H, W) each
+            truths: Annotated lines of each class for each sample.
+
+        Returns:
+            Weighted scalar.
+        """
         return super().semantic_loss(levels, truths) / len(self.classes)

@@ -1,4 +1,4 @@
-"""The table between the state keys of PivotNet's release and ours."""
+"""Mapping between the state keys of the released PivotNet and of this project."""
 
 import torch
 
@@ -48,7 +48,7 @@ PIVOTNET = KeyMap(
     ),
     {
         **CLASS_WEIGHTS,
-        # settings: where each camera stands in the joined image, class weights of another loss
+        # settings: order of the concatenated cameras, class weights of another loss
         BEV + "image_order": torch.arange(6),
         "post_processor.criterion.collinear_pt_weight": torch.tensor((0.2, 1.0)),
     },

@@ -9,42 +9,61 @@ Floats = NDArray[np.floating]
 
 
 def path_costs(costs: Floats) -> Floats:
-    """Return the cheapest way to match the first pivots with points, up to each of both.
+    """Compute the lowest costs of matching the first pivots with the first points, in order.
 
-    The first pivot has the first point; the order is kept. Infinite where there is no way.
-    Differences of pivots (rows) and points (columns). (..., m, p) -> (..., m, p)
+    The first pivot is matched with the first point. Entry (i, j) is the cost of a path in which
+    pivot i is matched with point j; infinite if there is no path.
+
+    Args:
+        costs: Differences of m pivots and p points. (..., m, p)
+
+    Returns:
+        Costs of the best paths. (..., m, p)
     """
-    table = np.full(costs.shape, np.inf)
+    table = np.full(costs.shape, fill_value=np.inf)
     table[..., 0, 0] = costs[..., 0, 0]
     for row in range(1, costs.shape[-2]):
-        before = np.minimum.accumulate(table[..., row - 1, :-1], -1)
-        table[..., row, 1:] = before + costs[..., row, 1:]
+        best_before = np.minimum.accumulate(table[..., row - 1, :-1], axis=-1)
+        table[..., row, 1:] = best_before + costs[..., row, 1:]
     return table
 
 
 def sequence_costs(costs: Floats, lengths: NDArray[np.integer], end_weight: float) -> Floats:
-    """Return the mean cost of lines. (N, K)
+    """Compute the mean matching costs of predicted and annotated lines.
 
     Args:
-        costs: Differences of points and pivots; the last pivot has the last point. (N, K, m, p)
-        lengths: Numbers of pivots. (K,)
-        end_weight: What the ends of a line count more.
+        costs: Differences of the pivots of K annotated lines and the points of N predicted lines.
+            The last pivot is matched with the last point. (N, K, m, p)
+        lengths: Number of pivots of each annotated line. (K,)
+        end_weight: Additional weight of the ends of a line, >= 0.
+
+    Returns:
+        Mean cost of each pair of lines. (N, K)
     """
-    last, number = lengths - 1, np.arange(len(lengths))
+    number = np.arange(len(lengths))
+    last = lengths - 1
     total = path_costs(costs)[:, number, last, -1]
     ends = costs[..., 0, 0] + costs[:, number, last, -1]
     return (total + end_weight * ends) / (lengths + 2 * end_weight)
 
 
 def match_pivots(costs: Floats) -> NDArray[np.int64]:
-    """Return the point of every pivot, the earlier one of two as good. (m, p) -> (m,)
+    """Return the point that is matched with each pivot, the first one of equally good points.
 
-    ValueError if there are fewer points than pivots.
+    Args:
+        costs: Differences of m pivots and p points. (m, p)
+
+    Returns:
+        Indices of the points, increasing. (m,)
+
+    Raises:
+        ValueError: If there are fewer points than pivots.
     """
     num_pivots, num_points = costs.shape
     if num_pivots > num_points:
-        raise InputError(f"{num_pivots} pivots cannot be matched with {num_points} points.")
-    table, path = path_costs(costs), np.full(num_pivots, num_points - 1)
+        raise ValueError(f"{num_pivots} pivots cannot be matched with {num_points} points.")
+    table = path_costs(costs)
+    path = np.full(num_pivots, fill_value=num_points - 1)
     for row in range(num_pivots - 1, 0, -1):
         path[row - 1] = table[row - 1, : path[row]].argmin()
     return path

@@ -1,4 +1,4 @@
-"""PivotNet's targets: the pivots of every line, and its mask."""
+"""PivotNet's targets: the pivots and the mask of every line."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,46 +14,61 @@ from gsmap.utils.errors import InputError
 
 
 def significances(points: Points) -> NDArray[np.float64]:
-    """Return the area with which each point is removed, infinite for the ends. (n, 2) -> (n,)
+    """Compute the significance of a line's points for simplification (Visvalingam and Whyatt).
 
-    Visvalingam and Whyatt: the point of the smallest triangle with its neighbours goes first. A
-    point counts at least as much as those removed before it.
+    The point of the smallest triangle with its neighbours is removed first. Its significance is the
+    area of the triangle, but at least the significance of the points removed before it.
+
+    Args:
+        points: Vertices of the line. (n, 2)
+
+    Returns:
+        Areas, infinite for the ends. (n,)
     """
-    areas, left, next_up = np.full(len(points), np.inf), list(range(len(points))), 0
-    areas[1:-1] = _triangles(points[:-2], points[1:-1], points[2:])
-    while len(left) > 2:
-        at = next_up or int(np.argmin(areas[left]))
-        smallest = areas[left.pop(at)]
-        next_up = 0
-        for near in (at, at - 1):  # what was on its right and on its left
-            if 0 < near < len(left) - 1:
-                areas[left[near]] = _triangles(*points[left[near - 1 : near + 2]])
-                if areas[left[near]] <= smallest:
-                    areas[left[near]], next_up = smallest, near
+    areas = np.full(len(points), fill_value=np.inf)
+    areas[1:-1] = _triangle_areas(points[:-2], points[1:-1], points[2:])
+    remaining = list(range(len(points)))
+    next_position = 0  # of a point that is no more significant than the last one, or 0
+    while len(remaining) > 2:
+        position = next_position or int(np.argmin(areas[remaining]))
+        smallest = areas[remaining.pop(position)]
+        next_position = 0
+        for neighbour in (position, position - 1):
+            if not 0 < neighbour < len(remaining) - 1:
+                continue
+            before, point, after = remaining[neighbour - 1 : neighbour + 2]
+            areas[point] = _triangle_areas(points[before], points[point], points[after])
+            if areas[point] <= smallest:
+                areas[point] = smallest
+                next_position = neighbour
     return areas
 
 
-def _triangles(a: Points, b: Points, c: Points) -> NDArray[np.float64]:
-    """Return the areas of triangles. 3 x (..., 2) -> (...)"""
-    (ax, ay), (bx, by), (cx, cy) = a.T, b.T, c.T
+def _triangle_areas(a: Points, b: Points, c: Points) -> NDArray[np.float64]:
+    """Return the areas of triangles. Three (..., 2) -> (...)"""
+    ax, ay = a.T
+    bx, by = b.T
+    cx, cy = c.T
     return np.abs(ax * (by - cy) + bx * (cy - ay) + cx * (ay - by)) / 2
 
 
 @TRANSFORMS.register_module()
 @dataclass(eq=False)
 class FormatPivotTargets(FormatLineTargets):
-    """Add ``gt_instances_3d`` with the pivots of lines, from ``map_instances``.
+    """Add ``gt_instances_3d`` with the pivots of lines, selected from ``map_instances``.
+
+    The fields of the targets and the other settings are described in `FormatLineTargets`.
 
     Args:
-        num_points: Most pivots P of a line of each class, which a config has in the head's
-            queries; the other settings, and what the targets are, are those of
-            `FormatLineTargets`.
-        min_area_m2: A point is a pivot if its triangle is at least as large.
-        keep_end: Whether a line of too many pivots keeps the most significant ones; by default the
-            first, as released, so that its end is lost.
+        num_points: Largest number P of pivots of a line of each class, >= 2. A config sets it in
+            the queries of the head.
+        min_area_m2: Smallest significance of a pivot, in square metres.
+        keep_end: Whether a line of too many pivots keeps the most significant ones. By default it
+            keeps the first ones and loses its end, as in the released code.
 
     Raises:
-        ValueError: If a class has less than two points, or ``edge_classes`` names one that is not.
+        ValueError: If a class has fewer than two points, or if ``edge_classes`` has an unknown
+            class.
     """
 
     num_points: Sequence[int] = (10, 2, 30)
@@ -66,7 +81,7 @@ class FormatPivotTargets(FormatLineTargets):
         super().__post_init__()
 
     def by_class(self) -> tuple[str, Sequence[int]]:
-        """Return the setting that has a number for each class: its name and the numbers."""
+        """Return the name and the values of the setting with one number for each class."""
         return "num_points", self.num_points
 
     def most(self) -> int:
@@ -74,11 +89,22 @@ class FormatPivotTargets(FormatLineTargets):
         return max(self.num_points)
 
     def points(self, line: Points, label: int, grid: BEVGrid) -> Points:
-        """Return the pivots of a line, [0, 1] from the front and the left. (m, 2)"""
-        size_m, most = np.array(front_size(grid)) * self.pixel_m, self.num_points[label]
-        line_m = directed(line * size_m, 1.0, self.sort_rings)
+        """Select the pivots of a line.
+
+        Args:
+            line: Points (from the front, from the left) in [0, 1]. (n, 2)
+            label: Class index.
+            grid: Raster of the masks.
+
+        Returns:
+            Pivots (from the front, from the left) in [0, 1]. (m, 2)
+        """
+        size_m = np.array(front_size(grid)) * self.pixel_m
+        largest = self.num_points[label]
+        line_m = directed(line * size_m, tolerance=1.0, sort_rings=self.sort_rings)
         areas = significances(line_m)
-        chosen = np.flatnonzero(areas >= self.min_area_m2)
-        if self.keep_end and len(chosen) > most:
-            chosen = np.sort(np.argsort(-areas, kind="stable")[:most])
-        return line_m[chosen[:most]] / size_m
+        pivots = np.flatnonzero(areas >= self.min_area_m2)
+        if self.keep_end and len(pivots) > largest:
+            most_significant = np.argsort(-areas, kind="stable")[:largest]
+            pivots = np.sort(most_significant)
+        return line_m[pivots[:largest]] / size_m
