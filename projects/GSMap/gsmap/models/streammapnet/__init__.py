@@ -1,1 +1,1 @@
-"""StreamMapNet (arXiv 2308.12570): one query per element, attention at its points, memory."""
+"""StreamMapNet (arXiv 2308.12570), with one query per element and a memory of earlier frames."""

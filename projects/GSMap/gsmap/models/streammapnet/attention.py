@@ -1,4 +1,4 @@
-"""StreamMapNet's attention: an instance query looks once beside each point of its line."""
+"""StreamMapNet's multi-point attention, with one sample beside each point of a line."""
 
 import torch
 from mmdet3d.registry import MODELS
@@ -10,25 +10,36 @@ from gsmap.structures.tensors import constant
 
 @MODELS.register_module()
 class LinePointAttention(BEVDeformableAttention):
-    """Deformable attention with one sample beside every point of a line (multi-point attention).
+    """Deformable attention of instance queries with one sample beside each point of their lines.
 
-    Sample p lies at point p of the instance's reference plus a learned offset. Arguments as of
-    `SamplingAttention`; ``num_points`` are the points per instance P. Offsets count rows from the
-    map's largest y, as the weights of StreamMapNet do.
+    Sample p lies at point p of the instance's reference plus a learned offset. Offsets count rows
+    from the largest y of the map, as in the released weights. The arguments are described in
+    `SamplingAttention`; ``num_points`` is the number P of points per instance.
     """
 
     def offsets_in_cells(self, query: Tensor) -> Tensor:
-        """Return the learned offsets (x, y) in cells. (B, N, heads, P, 2)"""
+        """Compute the learned offsets (x, y) in cells. (B, N, C) -> (B, N, heads, P, 2)"""
         offsets = super().offsets_in_cells(query)
         return offsets * constant(offsets, [1.0, -1.0])
 
     def locations(
         self, query: Tensor, reference: Tensor, shape: tuple[int, int], frames: Tensor | None
     ) -> Tensor:
-        """Return where each instance looks, from references of its points (B, N * P, D)."""
+        """Compute the locations of the samples.
+
+        Args:
+            query: Instance queries. (B, N, C)
+            reference: References of their points, which begin with (x, y) in [0, 1] over the map.
+                (B, N * P, D)
+            shape: Rows and columns of the map.
+            frames: Rotations of the offsets of each point, or None. (B, N * P, 2, 2)
+
+        Returns:
+            Locations (x, y) in [0, 1] over the map. (B, N, heads, P, 2)
+        """
         offsets = self.offsets_in_cells(query)  # (B, N, heads, P, 2)
         if frames is not None:
-            turns = frames.unflatten(1, (-1, self.num_points))[:, :, None]  # (B, N, 1, P, 2, 2)
-            offsets = torch.sum(turns * offsets[..., None, :], -1)
-        points = reference[..., :2].unflatten(1, (-1, self.num_points))
+            rotations = frames.unflatten(1, (-1, self.num_points))[:, :, None]  # (B, N, 1, P, 2, 2)
+            offsets = torch.sum(rotations * offsets[..., None, :], dim=-1)
+        points = reference[..., :2].unflatten(1, (-1, self.num_points))  # (B, N, P, 2)
         return points[:, :, None] + offsets / constant(offsets, [shape[1], shape[0]])

@@ -1,4 +1,4 @@
-"""StreamMapNet's decoder: instance queries of twice the map's channels, whose lines they refine."""
+"""StreamMapNet's decoder, in which instance queries refine the points of their lines."""
 
 from typing import Any
 
@@ -12,7 +12,16 @@ from gsmap.models.base.decoder import Decoded, MapDecoder, MapDecoderLayer
 
 @MODELS.register_module()
 class StreamMapNetDecoderLayer(MapDecoderLayer):
-    """`MapDecoderLayer` for instance queries, with `LinePointAttention` at their points."""
+    """`MapDecoderLayer` of instance queries with `LinePointAttention` at their points.
+
+    Args:
+        embed_dims: Channels C of the queries.
+        num_points: Points per instance P.
+        ffn_dims: Hidden channels of the feed-forward network.
+        self_attn: Settings of the self-attention.
+        cross_attn: Settings of the cross-attention.
+        kwargs: Further arguments of `MapDecoderLayer`.
+    """
 
     def __init__(
         self,
@@ -33,20 +42,31 @@ class StreamMapNetDecoderLayer(MapDecoderLayer):
         )
 
     def forward(self, query: Tensor, query_pos: Tensor, *inputs: Any) -> Tensor:
-        """Update the instance queries (B, N, C); their learned position is not used."""
+        """Update the instance queries; their learned position is ignored.
+
+        Args:
+            query: Instance queries. (B, N, C)
+            query_pos: Learned positions, of which only the shape is used. (B, N, C)
+            inputs: Further arguments of `MapDecoderLayer.forward`.
+
+        Returns:
+            Updated queries. (B, N, C)
+        """
         return super().forward(query, torch.zeros_like(query_pos), *inputs)
 
 
 @MODELS.register_module()
 class StreamMapNetDecoder(MapDecoder):
-    """A stack of layers on instance queries, which have no position (StreamMapNet).
+    """Decoder of instance queries without a positional embedding (StreamMapNet).
 
-    The map's features are widened by one convolution and get a sine code, the only position there
-    is. Besides `MapDecoder`'s arguments:
+    A convolution projects the BEV features to the channels of the queries, and a sine encoding of
+    the cells is added.
 
     Args:
+        layer: Settings of `StreamMapNetDecoderLayer`.
         embed_dims: Channels C of the queries.
-        bev_dims: Channels of the BEV features; None means ``embed_dims``.
+        bev_dims: Channels C' of the BEV features; None for ``embed_dims``.
+        kwargs: Further arguments of `MapDecoder`.
     """
 
     point_queries = False
@@ -60,23 +80,38 @@ class StreamMapNetDecoder(MapDecoder):
         **kwargs: Any,
     ) -> None:
         super().__init__(layer or {}, embed_dims=embed_dims, **kwargs)
-        self.input_proj = nn.Conv2d(bev_dims or embed_dims, embed_dims, 1)
+        self.input_proj = nn.Conv2d(bev_dims or embed_dims, embed_dims, kernel_size=1)
         self.code = SinePositionalEncoding(embed_dims // 2, normalize=True)
 
     def start(
         self, query: Tensor, reference: Tensor, bev_feats: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return queries, references of their points (B, N * P, D) and features with a code."""
+        """Prepare the inputs of the layers.
+
+        Args:
+            query: Instance queries. (B, N, C)
+            reference: Initial lines. (B, N, P * D)
+            bev_feats: BEV features. (B, C', H, W)
+
+        Returns:
+            Instance queries (B, N, C), references of their points (B, N * P, D), and projected BEV
+            features with the sine encoding (B, C, H, W).
+        """
         cells = bev_feats.new_zeros((1, *bev_feats.shape[-2:]), dtype=torch.bool)
         code = self.code(cells).flip(2)  # rows are counted from the largest y
         points = reference.unflatten(-1, (self.num_points, -1)).flatten(1, 2)
         return query, points, self.input_proj(bev_feats) + code
 
     def point_states(self, state: Tensor) -> Tensor:
-        """Return the states that move the lines: those of the instances. (B, N, C)"""
+        """Return the states from which the lines are refined, one per instance. (B, N, C)"""
         return state
 
     def read(self, state: Tensor, references: Tensor) -> Decoded:
-        """Return a layer's output; an instance's points share its state. (B, N * P, D)"""
-        points = state[:, :, None].expand(-1, -1, self.num_points, -1)
-        return Decoded(points, self.by_instance(references), state)
+        """Return the output of a layer, in which all points of an instance share its state.
+
+        Args:
+            state: States of the instances. (B, N, C)
+            references: Refined references of the points. (B, N * P, D)
+        """
+        point_states = state[:, :, None].expand(-1, -1, self.num_points, -1)  # (B, N, P, C)
+        return Decoded(point_states, self.by_instance(references), instance_states=state)

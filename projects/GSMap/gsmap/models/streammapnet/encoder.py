@@ -1,4 +1,4 @@
-"""StreamMapNet's BEV encoder: BEVFormer's on several levels, rows counted from the largest y."""
+"""StreamMapNet's BEV encoder: BEVFormer's on several levels, with rows from the largest y."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,31 +13,36 @@ from gsmap.structures.grid import BEVGrid
 
 
 class StreamMapNetEncoderLayer(BEVEncoderLayer):
-    """`BEVEncoderLayer` whose cells can look at the mirrored row, as in the released code.
+    """`BEVEncoderLayer` whose self-attention can be mirrored, as in the released code.
 
-    ``mirrored`` switches that on; other arguments as of `BEVEncoderLayer`.
+    Args:
+        cross_attn: Settings of the camera cross-attention.
+        mirrored: Whether a cell attends around the row mirrored at the middle of the map.
+        kwargs: Further arguments of `BEVEncoderLayer`.
     """
 
-    def __init__(self, *args: Any, mirrored: bool = False, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
+    def __init__(self, cross_attn: dict, mirrored: bool = False, **kwargs: Any) -> None:
+        super().__init__(cross_attn, **kwargs)
         self.mirrored = mirrored
 
     def centres(self, grid: BEVGrid, device: torch.device) -> Tensor:
-        """Return where each cell's query looks around itself, [0, 1] over the map. (H, W, 2)"""
+        """Return the reference of each cell's self-attention, [0, 1] over the map. (H, W, 2)"""
         centres = super().centres(grid, device)
         return centres.flip(0) if self.mirrored else centres
 
 
 @MODELS.register_module()
 class StreamMapNetEncoder(BEVQueryEncoder):
-    """`BEVQueryEncoder` without the vehicle's motion, whose weights start with the largest y.
+    """`BEVQueryEncoder` without the vehicle's motion, with weights from the largest y on.
 
-    Its output is as any encoder's, row 0 at the smallest y. Besides `BEVQueryEncoder`'s:
+    Row 0 of its output is at the smallest y, as in all encoders.
 
     Args:
-        num_levels: Levels of image features.
-        mirrored_self_attn: Let each cell's self-attention look at the row mirrored in the middle of
-            the map, as released: the released weights need it.
+        num_levels: Number of levels of image features.
+        layer_cfg: Settings of `StreamMapNetEncoderLayer`.
+        mirrored_self_attn: Whether the self-attention of each cell is centred at the row mirrored
+            at the middle of the map, as in the released code. The released weights require it.
+        kwargs: Further arguments of `BEVQueryEncoder`.
     """
 
     layer_class = StreamMapNetEncoderLayer
@@ -55,13 +60,32 @@ class StreamMapNetEncoder(BEVQueryEncoder):
     def encode(
         self, feats: Any, calibration: Mapping[str, Tensor], img_shape: tuple[int, int]
     ) -> dict[str, Tensor]:
-        """Return ``bev_feats``, from ``img_from_frame`` (B, V, 4, 4)."""
-        bev_feats = super().encode(feats, calibration, img_shape)["bev_feats"]
+        """Encode image features to BEV features.
+
+        Args:
+            feats: Image features of one level (B, V, C, h, w), or a list of levels.
+            calibration: ``img_from_frame``, transforms from the map frame in metres to pixels.
+                (B, V, 4, 4)
+            img_shape: Rows and columns of the padded images.
+
+        Returns:
+            ``bev_feats``. (B, C, H, W)
+        """
+        bev_feats = super().encode(feats, calibration, img_shape=img_shape)["bev_feats"]
         return {"bev_feats": bev_feats.flip(2)}
 
     def project(self, img_from_frame: Tensor, img_shape: tuple[int, int]) -> PillarProjection:
-        """Project the pillars of all cells, those of the largest y first, into every camera."""
-        seen = super().project(img_from_frame, img_shape)
-        rows = self.grid.height
-        uv, visible = (part.unflatten(2, (rows, -1)).flip(2).flatten(2, 3) for part in seen)
-        return PillarProjection(uv, visible)
+        """Project the pillars of all cells into every camera, beginning at the largest y.
+
+        Args:
+            img_from_frame: Transforms from the map frame in metres to pixels. (B, V, 4, 4)
+            img_shape: Rows and columns of the padded images.
+        """
+        projection = super().project(img_from_frame, img_shape)
+        return PillarProjection(
+            uv=self._flip_rows(projection.uv), visible=self._flip_rows(projection.visible)
+        )
+
+    def _flip_rows(self, values: Tensor) -> Tensor:
+        """Reverse the order of the rows. (B, V, H * W, ...) -> (B, V, H * W, ...)"""
+        return values.unflatten(2, (self.grid.height, -1)).flip(2).flatten(2, 3)

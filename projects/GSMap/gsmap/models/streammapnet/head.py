@@ -1,6 +1,6 @@
-"""StreamMapNet's head: one query per element, one class branch and one line branch for all layers.
+"""StreamMapNet's head, with one query per element and branches shared by all layers.
 
-What it keeps of earlier frames is not its own: see `gsmap.models.streams`.
+The memory of earlier frames is implemented in `gsmap.models.streams`.
 """
 
 from typing import Any
@@ -16,25 +16,26 @@ from gsmap.models.streammapnet.reference import LineReference
 
 
 class BestClassCoder(MapCoder):
-    """Keep every query with its best class."""
+    """Coder that keeps each query with its best class."""
 
     def best(self, scores: Tensor) -> Detections:
-        """Return the best class of each query, best query first. (N, classes)"""
-        best, labels = scores.float().sigmoid().max(-1)
-        first, order = best.topk(min(self.max_num, len(best)))
-        return Detections(first, labels[order], order)
+        """Select the best queries, the highest score first. (N, classes)"""
+        best_scores, labels = scores.float().sigmoid().max(dim=-1)
+        top_scores, order = best_scores.topk(min(self.max_num, len(best_scores)))
+        return Detections(top_scores, labels[order], query_inds=order)
 
 
 @MODELS.register_module()
 class StreamMapNetHead(MapHead):
-    """The map head with StreamMapNet's parts. Besides `MapHead`'s arguments:
+    """Map head with StreamMapNet's parts.
 
     Args:
         decoder: Settings of `StreamMapNetDecoder`.
         reference: Settings of `LineReference`.
-        coder: Settings of `BestClassCoder`; by default all queries are handed on.
+        coder: Settings of `BestClassCoder`; by default it keeps all queries.
         num_points: Points per instance P.
         embed_dims: Channels of the BEV features; the queries have twice as many.
+        kwargs: Further arguments of `MapHead`.
     """
 
     def __init__(
@@ -46,10 +47,11 @@ class StreamMapNetHead(MapHead):
         embed_dims: int = 256,
         **kwargs: Any,
     ) -> None:
-        lines = {"type": LineReference, "num_points": num_points}
+        reference_settings: PARTS = {"type": LineReference, "num_points": num_points}
+        reference_settings |= reference or {}
         super().__init__(
             decoder={"type": StreamMapNetDecoder, "bev_dims": embed_dims, **decoder},
-            reference={**lines, **(reference or {})},
+            reference=reference_settings,
             num_points=num_points,
             embed_dims=2 * embed_dims,
             **kwargs,
@@ -58,11 +60,12 @@ class StreamMapNetHead(MapHead):
         self.instance_embedding = nn.Embedding(num_queries, self.embed_dims)
         branch = nn.Linear(self.embed_dims, len(self.classes))
         self.cls_branches = nn.ModuleList([branch] * len(self.cls_branches))
-        settings = {"max_num": self.query_groups[0].num, "margin_m": None, **(coder or {})}
-        self.coder = BestClassCoder(grid=self.grid, **settings)
+        coder_settings: PARTS = {"max_num": self.query_groups[0].num, "margin_m": None}
+        coder_settings |= coder or {}
+        self.coder = BestClassCoder(grid=self.grid, **coder_settings)
 
     def queries(self) -> tuple[Tensor, Tensor]:
-        """Return the queries, which say their first line, and which the decoder starts from."""
+        """Return the queries, as the source of their first lines and as input of the decoder."""
         query = self.instance_embedding.weight
         if not self.training:
             query = query[: self.query_groups[0].num]

@@ -1,4 +1,4 @@
-"""The table between the state keys of StreamMapNet's release and ours."""
+"""Mapping between the state keys of the released StreamMapNet and of this project."""
 
 import torch
 
@@ -36,7 +36,7 @@ STREAMMAPNET = KeyMap(
         ("head.query_update.fc.", "temporal.queries.fc."),
         ("stream_fusion_neck.", "temporal.bev."),
     ),
-    {  # the map's cells, size and corner, which the config says
+    {  # cells, size and corner of the map, which are settings of a config
         "plane": torch.stack([_X, _Y, torch.zeros_like(_X), torch.ones_like(_X)], -1),
         "head.roi_size": torch.tensor((60.0, 30.0)),
         "head.origin": torch.tensor((-30.0, -15.0)),

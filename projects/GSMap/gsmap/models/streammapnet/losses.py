@@ -1,4 +1,4 @@
-"""StreamMapNet's distance of lines: smooth L1, per point, as a loss and as a matching cost."""
+"""StreamMapNet's smooth L1 distance of lines, as a loss and as a matching cost."""
 
 from typing import Any
 
@@ -15,12 +15,12 @@ from gsmap.structures.tensors import check_same_shape
 
 @MODELS.register_module()
 class SmoothPointsLoss(MapLoss):
-    """Smooth L1 distance of the points of matched pairs, over their number P (StreamMapNet).
+    """Smooth L1 distance of the points of matched pairs, divided by their number (StreamMapNet).
 
     Args:
         loss_weight: Weight of the loss.
-        beta: Distance, [0, 1] over the map, below which it is a parabola.
-        flags: As in `MapLoss`.
+        beta: Distance in [0, 1] over the map below which the loss is quadratic, > 0.
+        flags: Flags of `MapLoss`.
     """
 
     name = "pts"
@@ -30,19 +30,22 @@ class SmoothPointsLoss(MapLoss):
         self.beta = beta
 
     def values(self, pairs: MatchedPairs) -> Tensor:
-        """Return the distance of each coordinate, over P. (M, P, 2 or 3)"""
-        pred, target = pairs.pred_pts, pairs.gt_pts
+        """Compute the distance of each coordinate, divided by P. (M, P, 2 or 3)"""
+        pred = pairs.pred_pts
+        target = pairs.gt_pts
         check_same_shape(pred=pred, target=target)
         return F.smooth_l1_loss(pred, target, reduction="none", beta=self.beta) / pred.shape[1]
 
 
 @TASK_UTILS.register_module()
 class SmoothPointsCost(OrderedPointsCost):
-    """Smooth L1 distance to the closest equivalent point order, over P; it chooses that order.
+    """Smooth L1 distance to the closest equivalent point order, divided by the number of points.
+
+    The distance also determines the point order of matched pairs.
 
     Args:
         weight: Weight of the cost.
-        beta: As of `SmoothPointsLoss`.
+        beta: Distance in [0, 1] over the map below which the cost is quadratic, > 0.
     """
 
     def __init__(self, weight: float = 50.0, beta: float = 0.01) -> None:
@@ -50,14 +53,26 @@ class SmoothPointsCost(OrderedPointsCost):
         self.beta = beta
 
     def between_points(self, pts: Tensor, targets: Tensor) -> Tensor:
-        """Return the distance of each coordinate, which also chooses the order of a pair."""
+        """Compute the distance of each coordinate. Two (..., P, 2 or 3) -> (..., P, 2 or 3)"""
         return F.smooth_l1_loss(pts, targets, reduction="none", beta=self.beta)
 
     def __call__(
         self, pred_instances: SampleView, gt_instances: SampleView, img_meta: Any = None
     ) -> Tensor:
-        """Compare normalised ``pts`` (N, P, 2) with ``pts_shifts`` (K, S, P, 2). (N, K)"""
+        """Compute the costs of all pairs.
+
+        Args:
+            pred_instances: Predictions with normalised ``pts``. (N, P, 2)
+            gt_instances: Ground truth with ``pts_shifts``, S equivalent orders (K, S, P, 2), and
+                ``labels`` (K,).
+            img_meta: Metadata of the sample; unused.
+
+        Returns:
+            Weighted costs. (N, K)
+        """
         orders = gt_instances.pts_shifts
-        pts = pred_instances.pts[:, None, None].expand(-1, *orders.shape)  # (N, K, S, P, 2)
-        distances = self.between_points(pts, orders.expand_as(pts)).sum((-1, -2))
-        return distances.amin(-1) / pts.shape[-2] * weights_of(self.weight, gt_instances.labels)
+        pts = pred_instances.pts[:, None, None]  # (N, 1, 1, P, 2)
+        pts = pts.expand((len(pts), *orders.shape))  # (N, K, S, P, 2)
+        distances = self.between_points(pts, orders.expand_as(pts)).sum(dim=(-1, -2))
+        closest = distances.amin(dim=-1) / pts.shape[-2]
+        return closest * weights_of(self.weight, gt_instances.labels)

@@ -1,4 +1,4 @@
-"""StreamMapNet's reference: a whole line per instance query, predicted anew by each layer."""
+"""StreamMapNet's reference: a line per instance query, which each layer predicts directly."""
 
 from collections.abc import Sequence
 
@@ -12,13 +12,18 @@ from gsmap.structures.tensors import in_float32
 
 @MODELS.register_module()
 class LineReference(PointReference):
-    """The points of a line, [0, 1] over the map, which each layer predicts absolutely.
+    """Points of a line in [0, 1] over the map, predicted by each layer without an offset.
 
-    All layers share one branch, and nothing is added to the line before. Besides `PointReference`'s
-    arguments:
+    All layers share one branch.
 
     Args:
+        grid: Extent of the map, in metres.
+        embed_dims: Channels C of the instance states.
+        num_layers: Number of decoder layers.
         num_points: Points per instance P.
+        coords: Coordinates D of a point: 2, or 3 for points with height.
+        z_range: Lowest and highest z in metres, for points with height.
+        points_per_state: Argument of `PointReference`.
     """
 
     def __init__(
@@ -31,24 +36,44 @@ class LineReference(PointReference):
         z_range: Sequence[float] | None = None,
         points_per_state: int = 1,
     ) -> None:
-        super().__init__(grid, 1, 0, coords, z_range, points_per_state)
+        super().__init__(
+            grid,
+            embed_dims=1,
+            num_layers=0,
+            coords=coords,
+            z_range=z_range,
+            points_per_state=points_per_state,
+        )
         self.initial = nn.Linear(embed_dims, num_points * coords)
-        layers: list[nn.Module] = []
-        dims = embed_dims
-        for _ in range(2):
-            layers += [nn.Linear(dims, 2 * embed_dims), nn.LayerNorm(2 * embed_dims), nn.ReLU()]
-            dims = 2 * embed_dims
-        branch = nn.Sequential(*layers, nn.Linear(dims, num_points * coords))
+        hidden_dims = 2 * embed_dims
+        branch = nn.Sequential(
+            nn.Linear(embed_dims, hidden_dims),
+            nn.LayerNorm(hidden_dims),
+            nn.ReLU(),
+            nn.Linear(hidden_dims, hidden_dims),
+            nn.LayerNorm(hidden_dims),
+            nn.ReLU(),
+            nn.Linear(hidden_dims, num_points * coords),
+        )
         self.branches = nn.ModuleList([branch] * num_layers)
 
     def init_weights(self) -> None:
-        """Spread the first lines over the map; matrices of the branch are Xavier's."""
+        """Spread the first lines over the map, and initialise the branch with Xavier's method."""
         super().init_weights()
         for parameter in self.branches.parameters():
             if parameter.dim() > 1:
                 nn.init.xavier_uniform_(parameter)
 
     def refine(self, layer: int, point_states: Tensor, reference: Tensor) -> Tensor:
-        """Return the lines after a layer. (B, N, C), (B, N * P, D) -> (B, N * P, D)"""
+        """Predict the lines of a layer.
+
+        Args:
+            layer: Number of the layer.
+            point_states: States of the instances. (B, N, C)
+            reference: References of the previous layer; unused. (B, N * P, D)
+
+        Returns:
+            References in [0, 1] over the map. (B, N * P, D)
+        """
         lines = in_float32(self.branches[layer], point_states).sigmoid()
         return lines.unflatten(-1, (-1, self.coords)).flatten(1, 2)
