@@ -30,7 +30,7 @@ from gsmap.models.base.head import MapHead
 from gsmap.models.base.pairs import Predictions
 from gsmap.models.mgmap.decoder import MaskedDecoded, RefinedDecoded
 from gsmap.models.mgmap.keys import MGMAP
-from gsmap.models.mgmap.refinement import BINS, patches_around
+from gsmap.models.mgmap.refinement import BINS, crop_patches
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import clip_to_box
 
@@ -246,7 +246,7 @@ def feature_rows(
     outputs = head({"bev_feats": bev})
     for g in (0, 1):
         centres = outputs[LAYERS - 1 + g].pts.flatten(1, 2)
-        ours[f"patch_roi{g}_sub"] = (patches_around(feature, centres)[:, ::100, ::16], 3e-4)
+        ours[f"patch_roi{g}_sub"] = (crop_patches(feature, centres)[:, ::100, ::16], 3e-4)
     for key, (value, tolerance) in ours.items():
         yield Row(name, key, largest_difference(value, data[key]), tolerance)
     yield Row(name, "bins", abs(BINS - data["patch_roi0_sub"].shape[-1]), 0)

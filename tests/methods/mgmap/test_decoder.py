@@ -6,7 +6,7 @@ from head_cases import GSMAP, HEAD, LANES, N, P, bev, build_head, losses_of, tra
 from mmengine.registry import init_default_scope
 
 from gsmap.models.mgmap.decoder import MaskedDecoded, MGMapDecoder, RefinedDecoded
-from gsmap.models.mgmap.refinement import patches_around
+from gsmap.models.mgmap.refinement import crop_patches
 
 GROUPS = [{"num": N}, {"name": "one2many", "num": 2, "repeats": 2}]
 LOSSES = [*HEAD["losses"], {"type": "QueryMaskLoss"}, {"type": "ForegroundLoss"}]
@@ -57,12 +57,12 @@ def test_instance_features_are_means_under_the_masks():
 def test_a_patch_by_hand():
     """On a plane value = x the bins are the mean places of their samples; half a cell unshifted."""
     feats = torch.arange(40.0).view(1, 1, 1, 40).expand(1, 1, 20, 40)
-    patches = patches_around(feats, torch.tensor([[[0.5, 0.5]]]))  # 4 cells wide, from 18
+    patches = crop_patches(feats, torch.tensor([[[0.5, 0.5]]]))  # 4 cells wide, from 18
     expected = [18 + (bin + 0.5) * 4 / 5 for bin in range(5)]
     assert patches.shape == (1, 1, 1, 5, 5)
     for row in patches[0, 0, 0]:
         assert row.tolist() == pytest.approx(expected)
-    outside = patches_around(feats + 1, torch.tensor([[[0.0, 0.5]]]))[0, 0, 0, 0]
+    outside = crop_patches(feats + 1, torch.tensor([[[0.0, 0.5]]]))[0, 0, 0, 0]
     assert outside[0] == 0.0  # more than a cell outside
     assert outside[4] == pytest.approx(1 + 1.6)
 

@@ -1,1 +1,1 @@
-"""MGMap (arXiv 2404.00876): masks of instances activate the queries, patches refine the points."""
+"""MGMap (arXiv 2404.00876), with instance masks that activate queries and refine points."""

@@ -1,5 +1,6 @@
-"""MGMap's decoder: masks activate the queries, layers look at four levels, patches refine."""
+"""MGMap's decoder: queries activated by masks, attention to four levels, refinement by patches."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,35 +10,49 @@ from mmengine.model import ModuleList
 from torch import Tensor, nn
 
 from gsmap.models.base.attention import MultiLevelAttention
-from gsmap.models.base.decoder import Decoded, MapDecoder, Refine
+from gsmap.models.base.decoder import Decoded, MapDecoder, Queries, Refine
 from gsmap.models.maptr.self_attention import mask_of_points
 from gsmap.models.mgmap.neck import EnhancedNeck
 from gsmap.models.mgmap.refinement import (
     BINS,
     MaskFeature,
     PatchRefinement,
+    crop_patches,
     mask_network,
-    patches_around,
 )
 from gsmap.utils.errors import InputError
 
 
 @dataclass(eq=False)
 class MaskedDecoded(Decoded):
-    """What a decoder layer returns, with the masks that activated the queries."""
+    """Output of a decoder layer, with the masks that activate the queries.
 
-    mask_logits: Tensor  # of the instances, the same in all layers (B, N, H, W)
+    Args:
+        point_states: States of the points. (B, N, P, C)
+        references: Refined references, float32. (B, N, P, D)
+        instance_states: States of the instances. (B, N, C)
+        mask_logits: Logits of the instances' masks, shared by all layers. (B, N, H, W)
+    """
+
+    mask_logits: Tensor
 
 
 @dataclass(eq=False)
 class RefinedDecoded(Decoded):
-    """What a stage of the refinement returns."""
+    """Output of a refinement stage.
 
-    segmentation: Tensor  # logits of elements and of background, of all instances (B, 2, H, W)
+    Args:
+        point_states: States of the points. (B, N, P, C)
+        references: Refined references, float32. (B, N, P, D)
+        instance_states: States of the instances. (B, N, C)
+        segmentation: Logits of elements and of background, shared by all instances. (B, 2, H, W)
+    """
+
+    segmentation: Tensor
 
     def of_queries(self, queries: slice) -> Decoded:
-        """Return what belongs to some of the instance queries; the segmentation to all."""
-        plain = Decoded(self.point_states, self.references, self.instance_states)
+        """Select the output of some instance queries, with the whole segmentation."""
+        plain = Decoded(self.point_states, self.references, instance_states=self.instance_states)
         return replace(self, **vars(plain.of_queries(queries)))
 
 
@@ -46,17 +61,17 @@ class MGMapDecoder(MapDecoder):
     """MapTR's decoder on enhanced BEV features, with activated queries and a refinement (MGMap).
 
     Args:
-        layer: Config of the layer (`MapDecoderLayer` with `MultiLevelAttention`).
-        embed_dims: Channels C.
-        num_masks: Instance queries of all groups, each with its mask.
-        patches: Show the refinement a patch around each point. The released model shows it zeros,
-            so that every point is corrected alike.
-        refinements: Stages of the refinement; they use the branches of the last layers.
-        refine_ffn_dims: Hidden channels of its feed-forward networks.
+        layer: Settings of the layer, `MapDecoderLayer` with `MultiLevelAttention`.
+        embed_dims: Channels C of the queries and of the BEV features.
+        num_masks: Number of instance queries of all groups, each with a mask.
+        patches: Whether the refinement uses a patch around each point. The released model uses
+            patches of zeros, so that the correction of a point does not depend on its position.
+        refinements: Number of refinement stages, which use the branches of the last layers.
+        refine_ffn_dims: Hidden channels of the feed-forward networks of the refinement.
         kwargs: Further arguments of `MapDecoder`.
 
     Raises:
-        ValueError: If there are less than no refinements, or more than layers.
+        ValueError: If ``refinements`` is negative, or larger than the number of layers.
     """
 
     def __init__(
@@ -70,62 +85,124 @@ class MGMapDecoder(MapDecoder):
         **kwargs: Any,
     ) -> None:
         layer = layer or {}
-        levels = {"type": MultiLevelAttention, "num_levels": EnhancedNeck.num_levels}
-        layer = {**layer, "cross_attn": {**levels, **layer.get("cross_attn", {})}}
+        cross_attn = {"type": MultiLevelAttention, "num_levels": EnhancedNeck.num_levels}
+        cross_attn |= layer.get("cross_attn", {})
+        layer = {**layer, "cross_attn": cross_attn}
         super().__init__(layer, embed_dims=embed_dims, **kwargs)
         if not 0 <= refinements <= len(self.layers):
             raise InputError(
                 f"refinements use the branches of layers, each one, got {refinements} and "
                 f"{len(self.layers)} layers."
             )
-        self.branches = [*self.branches, *self.branches[len(self.layers) - refinements :]]
-        self.num_masks, self.patches = num_masks, patches
+        self.branches = self.branches + self.branches[len(self.layers) - refinements :]
+        self.num_masks = num_masks
+        self.patches = patches
         self.neck = EnhancedNeck(embed_dims)
-        self.mask_net = mask_network(embed_dims, num_masks, nn.ReLU())
+        self.mask_net = mask_network(embed_dims, num_masks, activation=nn.ReLU())
         self.activation = nn.Linear(embed_dims, embed_dims)
-        self.segmentation = mask_network(embed_dims, 2, nn.LeakyReLU(0.01))
+        self.segmentation = mask_network(embed_dims, 2, activation=nn.LeakyReLU(0.01))
         self.mask_feature = MaskFeature(embed_dims)
-        heads, dropout = layer.get("num_heads", 8), layer.get("dropout", 0.1)
-        self.refinements = ModuleList(
-            PatchRefinement(embed_dims, (1 + g) * embed_dims, heads, refine_ffn_dims, dropout)
-            for g in range(refinements)
-        )
+        self.refinements = ModuleList()
+        for number in range(refinements):
+            stage = PatchRefinement(
+                embed_dims,
+                state_dims=(1 + number) * embed_dims,
+                num_heads=layer.get("num_heads", 8),
+                ffn_dims=refine_ffn_dims,
+                dropout=layer.get("dropout", 0.1),
+            )
+            self.refinements.append(stage)
 
-    def forward(self, query: Tensor, *inputs: Any) -> list[Decoded]:  # type: ignore[override]
-        """Run all layers, then the refinement; inputs as of `MapDecoder.forward`."""
-        query_pos, reference, bev_feats, *flow = inputs
+    def forward(
+        self,
+        query: Tensor,
+        query_pos: Tensor,
+        reference: Tensor,
+        bev_feats: Tensor,
+        refine: Refine,
+        attn_mask: Tensor | None = None,
+        between: Callable[[int, Queries], Queries] | None = None,
+    ) -> list[Decoded]:
+        """Run all layers and the refinement stages.
+
+        Args:
+            query: Content of the point queries. (B, N * P, C)
+            query_pos: Learned positions of the queries. (B, N * P, C)
+            reference: Initial references. (B, N * P, D)
+            bev_feats: BEV features. (B, C, H, W)
+            refine: Function from the number of a branch, point states (B, N * P, C) and references
+                (B, N * P, D) to refined references.
+            attn_mask: True where an instance does not attend to another one, or None. (N, N)
+            between: Function from the number of a layer and the queries after it to the queries of
+                the next layer, or None.
+
+        Returns:
+            Outputs of the layers (`MaskedDecoded`) and of the stages (`RefinedDecoded`).
+        """
         fused, levels = self.neck(bev_feats)
-        masks = self.mask_net(fused)[:, : query.shape[1] // self.num_points]
-        activated = self.activation(self.instance_features(fused, masks))
-        query = query + activated.repeat_interleave(self.num_points, 1)
-        layers = super().forward(query, query_pos, reference, levels, *flow)
-        stages = self.refined(layers[-1], fused, *flow[:2])
-        return [MaskedDecoded(**vars(layer), mask_logits=masks) for layer in layers] + stages
+        masks = self.mask_net(fused)[:, : query.shape[1] // self.num_points]  # (B, N, H, W)
+        activated = self.activation(self.instance_features(fused, masks))  # (B, N, C)
+        query = query + activated.repeat_interleave(self.num_points, dim=1)
+        layers = super().forward(
+            query,
+            query_pos,
+            reference=reference,
+            bev_feats=levels,
+            refine=refine,
+            attn_mask=attn_mask,
+            between=between,
+        )
+        stages = self.refine_points(layers[-1], fused, refine=refine, attn_mask=attn_mask)
+        outputs: list[Decoded] = []
+        for layer in layers:
+            outputs.append(MaskedDecoded(**vars(layer), mask_logits=masks))
+        return outputs + stages
 
     @staticmethod
     def instance_features(feats: Tensor, mask_logits: Tensor) -> Tensor:
-        """Return means of features (B, C, H, W), weighted by masks (B, N, H, W). (B, N, C)"""
+        """Average features under the masks of instances.
+
+        Args:
+            feats: Features. (B, C, H, W)
+            mask_logits: Logits of the masks. (B, N, H, W)
+
+        Returns:
+            Mean features. (B, N, C)
+        """
         weights = mask_logits.float().sigmoid()
-        total = weights.sum((2, 3)).clamp(min=1e-6)
+        total = weights.sum(dim=(2, 3)).clamp(min=1e-6)
         return torch.einsum("bnhw,bchw->bnc", weights, feats.float()) / total[..., None]
 
-    def refined(
+    def refine_points(
         self, last: Decoded, fused: Tensor, refine: Refine, attn_mask: Tensor | None
     ) -> list[Decoded]:
-        """Correct the points of the last layer in stages, each with a branch of its own."""
+        """Refine the points of the last layer in several stages.
+
+        Args:
+            last: Output of the last layer.
+            fused: BEV features of all levels of the neck. (B, C, H, W)
+            refine: Function from the number of a branch, point states and references to refined
+                references.
+            attn_mask: True where an instance does not attend to another one, or None. (N, N)
+
+        Returns:
+            Outputs of the stages.
+        """
         segmentation = self.segmentation(fused)
         feats = self.mask_feature(fused, segmentation) if self.patches else None
         mask = mask_of_points(attn_mask, self.num_points)
-        states, references = (x.flatten(1, 2) for x in (last.point_states, last.references))
+        states = last.point_states.flatten(1, 2)  # (B, N * P, C)
+        references = last.references.flatten(1, 2)  # (B, N * P, D)
         patches = fused.new_zeros(1, 1, fused.shape[1], BINS, BINS)
         outputs: list[Decoded] = []
-        for branch, stage in zip(self.branches[len(self.layers) :], self.refinements, strict=True):
+        branches = self.branches[len(self.layers) :]
+        for branch, stage in zip(branches, self.refinements, strict=True):
             references = references.detach()
             if feats is not None:
-                patches = patches_around(feats, references[..., :2])
-            corrected, seen = stage(states, patches, mask)
-            states = torch.cat([states, seen], -1)
+                patches = crop_patches(feats, references[..., :2])
+            corrected, glimpses = stage(states, patches, mask=mask)
+            states = torch.cat([states, glimpses], dim=-1)
             references = refine(branch, corrected, references)
-            output = vars(self.read(corrected, references))
-            outputs.append(RefinedDecoded(**output, segmentation=segmentation))
+            output = self.read(corrected, references)
+            outputs.append(RefinedDecoded(**vars(output), segmentation=segmentation))
         return outputs

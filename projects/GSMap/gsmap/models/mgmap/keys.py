@@ -1,12 +1,26 @@
-"""The table between the state keys of MGMap's release and ours."""
+"""Mapping between the state keys of the released MGMap and of this project."""
 
-from gsmap.checkpoints.key_rules import KeyMap, rules_of
+from gsmap.checkpoints.key_rules import KeyMap, Rules, rules_of
 from gsmap.models.maptr.keys import CODE_WEIGHTS, GRID_OFFSETS, HEAD, MAPTR, TRANSFORMER
 
 _ENHANCED = TRANSFORMER + "bevencode."
 _NECK = "map_head.decoder.neck."
-_BLOCKS = tuple((f"{_ENHANCED}layer{n + 1}.{{i}}.", f"{_NECK}stages.{n}.{{i}}.") for n in range(3))
+_BLOCKS = (
+    (_ENHANCED + "layer1.{i}.", _NECK + "stages.0.{i}."),
+    (_ENHANCED + "layer2.{i}.", _NECK + "stages.1.{i}."),
+    (_ENHANCED + "layer3.{i}.", _NECK + "stages.2.{i}."),
+)
 _ACTIVATION = (TRANSFORMER + "decoder.ins_conv.", "map_head.decoder.mask_net.")
+
+
+def _gate_rules() -> Rules:
+    """Return the rules of the gates of all blocks."""
+    rules = []
+    for theirs, ours in _BLOCKS:
+        rules += rules_of(theirs, ours, names="ca.fc.=gates.channel. sa.conv1.=gates.space.")
+    return tuple(rules)
+
+
 MGMAP = KeyMap(
     "mgmap",
     (
@@ -19,11 +33,7 @@ MGMAP = KeyMap(
             "conv1.=stem.0. bn1.=stem.1. conv_1.conv.=fusion.0. conv_1.bn.=fusion.1. "
             "neck.convs.{i}.conv.=levels.{i}.0. neck.convs.{i}.norm.=levels.{i}.1.",
         ),
-        *(
-            rule
-            for block in _BLOCKS
-            for rule in rules_of(*block, "ca.fc.=gates.channel. sa.conv1.=gates.space.")
-        ),
+        *_gate_rules(),
         *_BLOCKS,
         *rules_of(
             HEAD,
@@ -45,7 +55,7 @@ MGMAP = KeyMap(
     ),
     CODE_WEIGHTS,
     markers=(_ACTIVATION,),
-    # never called, but for a second name of glimpse_transformer_0 and weights in a loss
+    # modules that are never called, an alias of glimpse_transformer_0, and weights of a loss
     idle=r"pts_bbox_head\.(conv_seg|glimpse_transformer|loss_fn_?|(cls|reg)_branches\.[6-9]|"
     r"transformer\.bevencode\.(fpn_conv|attention)|(rego_hs_fuser|layer_norms)_\d\.[1-5])\.|"
     + GRID_OFFSETS,

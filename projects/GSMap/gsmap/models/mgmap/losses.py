@@ -1,4 +1,4 @@
-"""MGMap's losses: of the masks that activate the queries, and of the segmentation."""
+"""MGMap's losses of the masks that activate the queries, and of the segmentation."""
 
 from typing import cast
 
@@ -17,15 +17,16 @@ from gsmap.utils.errors import InputError
 
 @MODELS.register_module()
 class QueryMaskLoss(MapLoss):
-    """The masks that activate the queries, against those of the matched ground truth (MGMap).
+    """Cross-entropy and dice loss of the masks that activate the queries (MGMap).
 
-    As released, the cross-entropy is a mean over all queries, of which those without a match should
-    be empty, times the share of matched ones; dice counts the matched ones over all.
+    As in the released code, the cross-entropy is averaged over all queries, with empty targets for
+    unmatched ones, and multiplied by the share of matched queries. The dice loss is summed over the
+    matched queries and divided by the number of all queries.
 
     Args:
         loss_weight: Weight of the cross-entropy.
         dice_weight: Weight of the dice loss.
-        flags: As in `MapLoss`.
+        flags: Flags of `MapLoss`.
     """
 
     name = "ins"
@@ -36,37 +37,45 @@ class QueryMaskLoss(MapLoss):
         self.dice_weight = dice_weight
 
     def check(self, head: BuiltHead) -> None:
-        """Raise ValueError if there are other queries than masks, or none of both."""
-        queries, masks = len(head.instance_embedding.weight), decoder_of(self, head).num_masks
-        if queries != masks:
-            raise InputError(f"decoder.num_masks is {masks}, and there are {queries} queries.")
+        """Check that the head has a mask for each query.
+
+        Raises:
+            ValueError: If the decoder has no masks, or if their number differs from the queries'.
+        """
+        num_queries = len(head.instance_embedding.weight)
+        num_masks = get_decoder(self, head).num_masks
+        if num_queries != num_masks:
+            raise ValueError(
+                f"decoder.num_masks is {num_masks}, and there are {num_queries} queries."
+            )
 
     def reads(self, pairs: MatchedPairs) -> bool:
-        """Return whether it is a decoder layer: the refinement has no masks of its own."""
+        """Return True for decoder layers, False for refinement stages, which have no masks."""
         return isinstance(pairs.predictions.decoded, MaskedDecoded)
 
     def forward(self, pairs: MatchedPairs) -> Tensor:
-        """Return the weighted loss."""
-        logits = cast(MaskedDecoded, pairs.predictions.decoded).mask_logits.float()
-        own = pairs.of_queries(logits)  # (M, H, W)
-        masks = pairs.of_truths(pairs.truths.pipeline_masks).to(own)
-        check_same_shape(logits=own, gt_masks=masks)
+        """Compute the weighted loss of one layer."""
+        decoded = cast(MaskedDecoded, pairs.predictions.decoded)
+        logits = decoded.mask_logits.float()  # (B, N, H, W)
+        matched_logits = pairs.of_queries(logits)  # (M, H, W)
+        masks = pairs.of_truths(pairs.truths.pipeline_masks).to(matched_logits)
+        check_same_shape(logits=matched_logits, gt_masks=masks)
         targets = torch.zeros_like(logits)
         targets[pairs.samples, pairs.query_inds] = masks
-        queries = logits.shape[0] * logits.shape[1]
-        cross_entropy = F.binary_cross_entropy_with_logits(logits, targets) * len(own)
-        dice = dice_loss(own.sigmoid(), masks, reduction="sum")
-        return (self.loss_weight * cross_entropy + self.dice_weight * dice) / queries
+        num_queries = logits.shape[0] * logits.shape[1]
+        cross_entropy = F.binary_cross_entropy_with_logits(logits, targets) * len(matched_logits)
+        dice = dice_loss(matched_logits.sigmoid(), masks, reduction="sum")
+        return (self.loss_weight * cross_entropy + self.dice_weight * dice) / num_queries
 
 
 @MODELS.register_module()
 class ForegroundLoss(MapLoss):
-    """The segmentation of a sample into elements and background (MGMap).
+    """Cross-entropy and dice loss of the segmentation into elements and background (MGMap).
 
     Args:
         loss_weight: Weight of the cross-entropy.
         dice_weight: Weight of the dice loss of both masks together.
-        pos_weight: Weight of the cells of a mask in its cross-entropy.
+        pos_weight: Weight of the positive cells of a mask in its cross-entropy.
     """
 
     name = "seg"
@@ -76,28 +85,40 @@ class ForegroundLoss(MapLoss):
         self, loss_weight: float = 1.0, dice_weight: float = 15.0, pos_weight: float = 4.0
     ) -> None:
         super().__init__(loss_weight, last_layer_only=True, first_group_only=True)
-        self.dice_weight, self.pos_weight = dice_weight, pos_weight
+        self.dice_weight = dice_weight
+        self.pos_weight = pos_weight
 
     def check(self, head: BuiltHead) -> None:
-        """Raise ValueError if there is no segmentation."""
-        if not len(decoder_of(self, head).refinements):
-            raise InputError("ForegroundLoss needs a refinement: set decoder.refinements.")
+        """Check that the head has a segmentation.
+
+        Raises:
+            ValueError: If the decoder has no refinement, whose segmentation the loss requires.
+        """
+        if not len(get_decoder(self, head).refinements):
+            raise ValueError("ForegroundLoss needs a refinement: set decoder.refinements.")
 
     def forward(self, pairs: MatchedPairs) -> Tensor:
-        """Return the weighted loss."""
-        logits = cast(RefinedDecoded, pairs.predictions.decoded).segmentation.float()
-        truths = pairs.truths
-        drawn = [own.bool().any(0) for own in truths.pipeline_masks.split(truths.counts)]
-        targets = torch.stack([torch.stack([own, ~own]) for own in drawn]).to(logits)
-        check_same_shape(logits=logits, gt_masks=targets)  # (B, 2, H, W)
+        """Compute the weighted loss of the last refinement stage."""
+        decoded = cast(RefinedDecoded, pairs.predictions.decoded)
+        logits = decoded.segmentation.float()  # (B, 2, H, W)
+        targets = []
+        for masks in pairs.truths.pipeline_masks.split(pairs.truths.counts):
+            foreground = masks.bool().any(dim=0)
+            targets.append(torch.stack([foreground, ~foreground]))
+        target = torch.stack(targets).to(logits)
+        check_same_shape(logits=logits, gt_masks=target)
         weight = constant(logits, self.pos_weight)
-        cross_entropy = F.binary_cross_entropy_with_logits(logits, targets, pos_weight=weight)
-        dice = dice_loss(logits.sigmoid(), targets)
+        cross_entropy = F.binary_cross_entropy_with_logits(logits, target, pos_weight=weight)
+        dice = dice_loss(logits.sigmoid(), target)
         return self.loss_weight * cross_entropy + self.dice_weight * dice
 
 
-def decoder_of(loss: MapLoss, head: BuiltHead) -> MGMapDecoder:
-    """Return the head's decoder; ValueError if it has no masks for the loss."""
+def get_decoder(loss: MapLoss, head: BuiltHead) -> MGMapDecoder:
+    """Return the decoder of a head.
+
+    Raises:
+        ValueError: If it is not an `MGMapDecoder`, whose masks the loss requires.
+    """
     if not isinstance(head.decoder, MGMapDecoder):
         raise InputError(
             f"{type(loss).__name__} needs the masks of MGMapDecoder, got "

@@ -1,4 +1,4 @@
-"""MGMap's neck: BEV features of four levels, and one map of all of them."""
+"""MGMap's neck: BEV features at four levels, and their fusion to one map."""
 
 from typing import Any
 
@@ -10,71 +10,96 @@ from gsmap.models.base.layers import enlarged, resnet_stages
 
 
 class Gates(nn.Module):
-    """Weigh the channels of a map, then its cells, each by means and maxima over the other."""
+    """Channel attention followed by spatial attention, each from means and maxima (CBAM).
+
+    Args:
+        channels: Channels C of the map.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
         hidden = max(channels // 16, 1)
         self.channel = nn.Sequential(
-            nn.Conv2d(channels, hidden, 1, bias=False),
+            nn.Conv2d(channels, hidden, kernel_size=1, bias=False),
             nn.ReLU(),
-            nn.Conv2d(hidden, channels, 1, bias=False),
+            nn.Conv2d(hidden, channels, kernel_size=1, bias=False),
         )
-        self.space = nn.Conv2d(2, 1, 7, padding=3, bias=False)
+        self.space = nn.Conv2d(2, 1, kernel_size=7, padding=3, bias=False)
 
     def forward(self, feats: Tensor) -> Tensor:
-        """Return the weighted map. (B, C, H, W)"""
-        pooled = feats.mean((2, 3), keepdim=True), feats.amax((2, 3), keepdim=True)
-        feats = feats * sum(self.channel(part) for part in pooled).sigmoid()
-        summary = torch.cat([feats.mean(1, keepdim=True), feats.amax(1, keepdim=True)], 1)
-        return feats * self.space(summary).sigmoid()
+        """Weight the channels and the cells of a map. (B, C, H, W) -> (B, C, H, W)"""
+        mean = self.channel(feats.mean(dim=(2, 3), keepdim=True))
+        largest = self.channel(feats.amax(dim=(2, 3), keepdim=True))
+        feats = feats * (mean + largest).sigmoid()
+        cell_mean = feats.mean(dim=1, keepdim=True)
+        cell_largest = feats.amax(dim=1, keepdim=True)
+        return feats * self.space(torch.cat([cell_mean, cell_largest], dim=1)).sigmoid()
 
 
 class GatedBlock(BasicBlock):
-    """ResNet's basic block, gated behind its second normalisation."""
+    """ResNet's basic block with `Gates` after its second normalisation.
 
-    def __init__(self, inplanes: int, planes: int, *args: Any, **kwargs: Any) -> None:
-        super().__init__(inplanes, planes, *args, **kwargs)
+    Args:
+        inplanes: Input channels.
+        planes: Output channels.
+        kwargs: Further arguments of mmdet's ``BasicBlock``.
+    """
+
+    def __init__(self, inplanes: int, planes: int, **kwargs: Any) -> None:
+        super().__init__(inplanes, planes, **kwargs)
         self.gates = Gates(planes)
 
     def forward(self, feats: Tensor) -> Tensor:
-        """Return the block's output. (B, C, H, W)"""
+        """Apply the block. (B, inplanes, H, W) -> (B, planes, H / stride, W / stride)"""
         inner = self.relu(self.norm1(self.conv1(feats)))
-        kept = feats if self.downsample is None else self.downsample(feats)
-        return self.relu(self.gates(self.norm2(self.conv2(inner))) + kept)
+        shortcut = feats if self.downsample is None else self.downsample(feats)
+        return self.relu(self.gates(self.norm2(self.conv2(inner))) + shortcut)
 
 
 class EnhancedNeck(nn.Module):
-    """Three stages of gated blocks on the BEV features, which are then put together (MGMap).
+    """BEV neck of three stages of gated blocks and a fusion of their outputs (MGMap).
 
-    The stages have a quarter, a half and all of the C channels.
+    The stages have C / 4, C / 2 and C channels.
+
+    Args:
+        embed_dims: Channels C of the BEV features.
     """
 
     num_levels = 4
 
     def __init__(self, embed_dims: int = 256) -> None:
         super().__init__()
-        widths = embed_dims // 4, embed_dims // 2, embed_dims
-        self.stem, self.stages = resnet_stages(GatedBlock, embed_dims, widths)
+        widths = (embed_dims // 4, embed_dims // 2, embed_dims)
+        self.stem, self.stages = resnet_stages(GatedBlock, embed_dims, widths=widths)
         self.fusion = nn.Sequential(
-            nn.Conv2d(sum(widths), embed_dims, 3, padding=1, bias=False),
+            nn.Conv2d(sum(widths), embed_dims, kernel_size=3, padding=1, bias=False),
             nn.BatchNorm2d(embed_dims),
             nn.LeakyReLU(0.01),
         )
-        self.levels = nn.ModuleList(
-            nn.Sequential(
-                nn.Conv2d(width, embed_dims, 1), nn.GroupNorm(min(32, embed_dims), embed_dims)
-            )
-            for width in (*widths, embed_dims)
-        )
+        self.levels = nn.ModuleList()
+        for width in (*widths, embed_dims):
+            conv = nn.Conv2d(width, embed_dims, kernel_size=1)
+            norm = nn.GroupNorm(min(32, embed_dims), embed_dims)
+            self.levels.append(nn.Sequential(conv, norm))
 
     def forward(self, bev_feats: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """Return one map of all stages (B, C, H, W), and the levels (B, C, h, w)."""
-        feats = stem = self.stem(bev_feats)
+        """Enhance BEV features.
+
+        Args:
+            bev_feats: BEV features. (B, C, H, W)
+
+        Returns:
+            Fusion of all stages (B, C, H, W), and maps of four levels (B, C, h, w): of the stages,
+            and of their fusion at half the size.
+        """
+        stem = self.stem(bev_feats)
+        feats = stem
         maps = []
         for stage in self.stages:
             feats = stage(feats)
             maps.append(feats)
-        fused = self.fusion(torch.cat([enlarged(m, bev_feats.shape[2:]) for m in maps], 1))
+        size = bev_feats.shape[2:]
+        fused = self.fusion(torch.cat([enlarged(feats, size) for feats in maps], dim=1))
         maps.append(enlarged(fused, stem.shape[2:]))
-        return fused, [level(m) for level, m in zip(self.levels, maps, strict=True)]
+        levels = [level(feats) for level, feats in zip(self.levels, maps, strict=True)]
+        return fused, levels

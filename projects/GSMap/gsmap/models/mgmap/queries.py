@@ -1,4 +1,4 @@
-"""MGMap's queries: an instance makes the embeddings of its points."""
+"""MGMap's queries, whose point embeddings are computed from instance embeddings."""
 
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
@@ -9,11 +9,11 @@ from gsmap.models.base.queries import head_setting
 
 @MODELS.register_module()
 class PointsOfInstances(nn.Linear):
-    """Embeddings of points that a matrix makes of their instance's embedding (MGMap).
+    """Linear layer that computes the embeddings of points from their instance's (MGMap).
 
     Args:
         num_points: Points per instance P.
-        embed_dims: Channels C of a query; an embedding has twice as many.
+        embed_dims: Channels C of a query; an embedding has 2 C channels.
     """
 
     def __init__(self, num_points: int, embed_dims: int) -> None:
@@ -21,16 +21,16 @@ class PointsOfInstances(nn.Linear):
         self.num_points = num_points
 
     def forward(self, instances: Tensor) -> Tensor:
-        """Return the embeddings of the points of instances. (N, 2 C) -> (N, P, 2 C)"""
+        """Compute the embeddings of the points of instances. (N, 2 C) -> (N, P, 2 C)"""
         points = super().forward(instances).unflatten(1, (self.num_points, -1))
         return instances[:, None] + points
 
 
 @head_setting("points_from_instances")
 def points_from_instances(value: bool) -> PARTS:
-    """Return the settings of a head whose instances make the embeddings of their points.
+    """Return the settings of a head with `PointsOfInstances`.
 
     Args:
-        value: Whether they do.
+        value: Whether the head computes point embeddings in this way.
     """
     return {"point_queries": {"type": PointsOfInstances}} if value else {}

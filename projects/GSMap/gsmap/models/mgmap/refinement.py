@@ -1,6 +1,4 @@
-"""MGMap's refinement: a patch of a mask feature around each point corrects its state."""
-
-from typing import Any
+"""MGMap's refinement, which corrects point states by patches of a mask feature."""
 
 import torch
 from mmdet.models.backbones.resnet import BasicBlock
@@ -10,71 +8,115 @@ from torch import Tensor, nn
 from gsmap.ops.deformable_sampling import deformable_sample
 from gsmap.structures.tensors import constant
 
-BINS, SAMPLES = 5, 2  # bins of a patch and samples of a bin along each axis
-_BOX = 0.1  # side of a patch, of the map's side
+BINS = 5  # bins of a patch along each axis
+SAMPLES = 2  # samples of a bin along each axis
+_BOX = 0.1  # side of a patch, as a share of the map's side
 
 
-def patches_around(feats: Tensor, centres: Tensor) -> Tensor:
-    """Cut patches of a tenth of the map's sides out of it, bilinearly (RoI-align).
+def crop_patches(feats: Tensor, centres: Tensor) -> Tensor:
+    """Crop patches of a tenth of the map's sides by bilinear sampling (RoIAlign).
 
-    As RoI-align does without its half-cell shift: values lie at whole numbers, and samples more
-    than a cell outside count as zero. Maps (B, C, H, W), centres (x, y) in [0, 1] over them
-    (B, Q, 2). -> (B, Q, C, 5, 5)
+    As in RoIAlign without the half-cell shift, values lie at integer positions, and samples more
+    than a cell outside the map are 0.
+
+    Args:
+        feats: Features. (B, C, H, W)
+        centres: Centres (x, y) of the patches in [0, 1] over the map. (B, Q, 2)
+
+    Returns:
+        Patches. (B, Q, C, 5, 5)
     """
     height, width = feats.shape[2:]
     size = constant(centres, [width, height])
     steps = (torch.arange(BINS * SAMPLES, device=feats.device) + 0.5) / (BINS * SAMPLES)
-    grid = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1)  # (10, 10, 2)
+    grid = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), dim=-1)  # (10, 10, 2)
     corners = (centres.clamp(max=1.0) - _BOX / 2) * size
-    places = corners[:, :, None, None] + grid * (_BOX * size).clamp(min=1.0)
-    places = places.unflatten(3, (BINS, SAMPLES)).unflatten(2, (BINS, SAMPLES))
-    places = places.transpose(3, 4).flatten(4, 5).flatten(1, 3)[:, :, None]  # (B, Q * 25, 1, 4, 2)
-    inside = ((places >= -1) & (places <= size)).all(-1)
-    locations = (places.clamp(min=0.0).minimum(size - 1) + 0.5) / size
+    samples = corners[:, :, None, None] + grid * (_BOX * size).clamp(min=1.0)  # (B, Q, 10, 10, 2)
+    samples = samples.unflatten(3, (BINS, SAMPLES)).unflatten(2, (BINS, SAMPLES))
+    samples = samples.transpose(3, 4).flatten(4, 5)  # (B, Q, 5, 5, 4, 2)
+    samples = samples.flatten(1, 3)[:, :, None]  # (B, Q * 25, 1, 4, 2)
+    inside = ((samples >= -1) & (samples <= size)).all(dim=-1)
+    locations = (samples.clamp(min=0.0).minimum(size - 1) + 0.5) / size
     values = feats.float().flatten(2).transpose(1, 2)[:, :, None]  # (B, cells, 1, C)
-    seen = deformable_sample(values, (height, width), locations, inside / SAMPLES**2)
-    return seen.unflatten(1, (-1, BINS, BINS)).movedim(-1, 2)
+    patches = deformable_sample(
+        values, (height, width), locations=locations, weights=inside / SAMPLES**2
+    )
+    return patches.unflatten(1, (-1, BINS, BINS)).movedim(-1, 2)
 
 
 class MaskFeature(nn.Module):
-    """BEV features with what a segmentation and the place of each cell say of them."""
+    """Fusion of BEV features with a segmentation embedding and a positional encoding.
+
+    Args:
+        embed_dims: Channels C of the BEV features.
+        hidden: Channels of the segmentation embedding.
+    """
 
     def __init__(self, embed_dims: int, hidden: int = 32) -> None:
         super().__init__()
-        self.expand = nn.Conv2d(2, hidden, 3, padding=1)
+        self.expand = nn.Conv2d(2, hidden, kernel_size=3, padding=1)
         self.block = BasicBlock(hidden, hidden)
-        self.reduce = nn.Conv2d(embed_dims + hidden + 2, embed_dims, 1)
+        self.reduce = nn.Conv2d(embed_dims + hidden + 2, embed_dims, kernel_size=1)
 
     def forward(self, feats: Tensor, segmentation: Tensor) -> Tensor:
-        """Join features (B, C, H, W) and logits (B, 2, H, W). -> (B, C, H, W)"""
-        y, x = (
-            ((torch.arange(side, device=feats.device) + 0.5) / side - 0.5).abs()
-            for side in feats.shape[2:]
-        )
-        place = torch.stack(torch.meshgrid(x, y, indexing="xy"))  # (2, H, W)
-        mask = self.block(self.expand(segmentation.softmax(1)))
-        return self.reduce(torch.cat([feats, mask, place.expand(len(feats), -1, -1, -1)], 1))
+        """Fuse features and segmentation logits.
+
+        Args:
+            feats: BEV features. (B, C, H, W)
+            segmentation: Logits of elements and of background. (B, 2, H, W)
+
+        Returns:
+            Fused features. (B, C, H, W)
+        """
+        height, width = feats.shape[2:]
+        y = ((torch.arange(height, device=feats.device) + 0.5) / height - 0.5).abs()
+        x = ((torch.arange(width, device=feats.device) + 0.5) / width - 0.5).abs()
+        position = torch.stack(torch.meshgrid(x, y, indexing="xy"))  # (2, H, W)
+        position = position.expand(len(feats), -1, -1, -1)
+        mask = self.block(self.expand(segmentation.softmax(dim=1)))
+        return self.reduce(torch.cat([feats, mask, position], dim=1))
 
 
 class _HalfAttention(nn.TransformerDecoderLayer):
-    """A decoder layer that adds half of what both of its attentions return."""
+    """Decoder layer that adds half of the output of both attentions."""
 
-    def _sa_block(self, *args: Any, **kwargs: Any) -> Tensor:
-        return 0.5 * super()._sa_block(*args, **kwargs)
+    def _sa_block(
+        self,
+        x: Tensor,
+        attn_mask: Tensor | None,
+        key_padding_mask: Tensor | None,
+        is_causal: bool = False,
+    ) -> Tensor:
+        return 0.5 * super()._sa_block(x, attn_mask, key_padding_mask, is_causal)
 
-    def _mha_block(self, *args: Any, **kwargs: Any) -> Tensor:
-        return 0.5 * super()._mha_block(*args, **kwargs)
+    def _mha_block(
+        self,
+        x: Tensor,
+        mem: Tensor,
+        attn_mask: Tensor | None,
+        key_padding_mask: Tensor | None,
+        is_causal: bool = False,
+    ) -> Tensor:
+        return 0.5 * super()._mha_block(x, mem, attn_mask, key_padding_mask, is_causal)
 
 
 class PatchRefinement(BaseModule):
-    """One stage of the refinement (MGMap), which starts from states of ``state_dims`` channels."""
+    """Refinement stage (MGMap).
+
+    Args:
+        embed_dims: Channels C of the patches and of the corrected states.
+        state_dims: Channels S of the input states.
+        num_heads: Number of attention heads.
+        ffn_dims: Hidden channels of the feed-forward network.
+        dropout: Probability of setting a value to zero in training, in [0, 1].
+    """
 
     def __init__(
         self, embed_dims: int, state_dims: int, num_heads: int, ffn_dims: int, dropout: float
     ) -> None:
         super().__init__()
         self.patch_net = nn.Sequential(
-            nn.Conv2d(embed_dims, embed_dims, BINS, groups=4),
+            nn.Conv2d(embed_dims, embed_dims, kernel_size=BINS, groups=4),
             nn.Flatten(),
             nn.LayerNorm(embed_dims),
             nn.ReLU(),
@@ -84,47 +126,57 @@ class PatchRefinement(BaseModule):
         self.memory = nn.Sequential(
             nn.Linear(state_dims, embed_dims, bias=False), nn.LayerNorm(embed_dims)
         )
-        self.layer = _HalfAttention(embed_dims, num_heads, ffn_dims, dropout, batch_first=True)
+        self.layer = _HalfAttention(
+            embed_dims, num_heads, dim_feedforward=ffn_dims, dropout=dropout, batch_first=True
+        )
         self.norm = nn.LayerNorm(embed_dims)
         self.fuser = nn.Sequential(
             nn.Linear(state_dims + embed_dims, embed_dims, bias=False), nn.LayerNorm(embed_dims)
         )
 
     def init_weights(self) -> None:
-        """Initialise as released: normal matrices without biases around the layer."""
-        for part in (*self.patch_net, *self.memory, *self.fuser):
-            if isinstance(part, (nn.Conv2d, nn.Linear)):
-                nn.init.xavier_normal_(part.weight)
-                if part.bias is not None:
-                    nn.init.zeros_(part.bias)
+        """Initialise as in the released code: normal (Xavier) matrices around the layer."""
+        for module in (*self.patch_net, *self.memory, *self.fuser):
+            if isinstance(module, (nn.Conv2d, nn.Linear)):
+                nn.init.xavier_normal_(module.weight)
+                if module.bias is not None:
+                    nn.init.zeros_(module.bias)
 
     def forward(
         self, states: Tensor, patches: Tensor, mask: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Return corrected states, and what they saw. (B, Q, state_dims) -> 2 x (B, Q, C)
+        """Correct the states of points.
 
-        Patches are around the points (B, Q, C, 5, 5), or one for all (1, 1, C, 5, 5); the mask is
-        True where a point may not attend to another (Q, Q).
+        Args:
+            states: States of the points. (B, Q, S)
+            patches: Patches around the points (B, Q, C, 5, 5), or one patch for all points
+                (1, 1, C, 5, 5).
+            mask: True where a point does not attend to another one, or None. (Q, Q)
+
+        Returns:
+            Corrected states and glimpses, the features of the patches after attention.
+            (B, Q, C) each
         """
-        seen = self.patch_net(patches.flatten(0, 1)).unflatten(0, patches.shape[:2])
-        seen = seen.expand(*states.shape[:2], -1)
+        glimpses = self.patch_net(patches.flatten(0, 1)).unflatten(0, patches.shape[:2])
+        glimpses = glimpses.expand(states.shape[0], states.shape[1], -1)
         memory = self.memory(states)
-        seen = self.norm(self.layer(seen, memory, tgt_mask=mask, memory_mask=mask))
-        return self.fuser(torch.cat([states.detach(), seen], -1)), seen
+        glimpses = self.norm(self.layer(glimpses, memory, tgt_mask=mask, memory_mask=mask))
+        corrected = self.fuser(torch.cat([states.detach(), glimpses], dim=-1))
+        return corrected, glimpses
 
 
 def mask_network(embed_dims: int, masks: int, activation: nn.Module) -> nn.Sequential:
-    """Return a 3x3 convolution with BatchNorm and a 1x1. (B, C, H, W) -> (B, masks, H, W)
+    """Create a network for masks: a 3x3 convolution with BatchNorm, and a 1x1 convolution.
 
     Args:
-        embed_dims: C.
-        masks: Number of masks.
-        activation: What stands between the two.
+        embed_dims: Channels C of the input. (B, C, H, W)
+        masks: Number of masks, the channels of the output. (B, masks, H, W)
+        activation: Activation between both convolutions.
     """
     hidden = embed_dims // 2
     return nn.Sequential(
-        nn.Conv2d(embed_dims, hidden, 3, padding=1, bias=False),
+        nn.Conv2d(embed_dims, hidden, kernel_size=3, padding=1, bias=False),
         nn.BatchNorm2d(hidden),
         activation,
-        nn.Conv2d(hidden, masks, 1),
+        nn.Conv2d(hidden, masks, kernel_size=1),
     )
