@@ -184,7 +184,7 @@ def inside_rows(
 ) -> Iterator[Row]:
     """Compare what the attention computes on its way."""
     state, position, reference, feats = call
-    samples = attention.look(state.instances + position, reference, feats)
+    samples = attention.compute_samples(state.instances + position, reference, feats)
     instances, points = attention.aggregate(feats, samples)
     point_code, instance_code = attention.codes(samples)
     exchanged = attention.interact_points(points, point_code, state)

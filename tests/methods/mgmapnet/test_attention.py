@@ -60,7 +60,7 @@ def by_definition(attention, query, reference, feats):
 def test_one_sampling_gives_both_granularities_and_their_gradients(num_levels):
     attention = build(num_levels=num_levels)
     query, position, reference, feats = inputs(num_levels)
-    samples = attention.look(query + position, reference, feats)
+    samples = attention.compute_samples(query + position, reference, feats)
     ours = attention.aggregate(feats, samples)
     theirs = by_definition(attention, query + position, reference, feats)
     gradients = []
@@ -92,7 +92,7 @@ def test_a_new_attention_looks_around_its_reference():
     out = attention(Granularities(query.float()), position.float(), reference.float(), feats)
     # opposite heads cancel: the mean of all samples is the reference itself
     torch.testing.assert_close(out.mean_locations, reference[..., :2].float())
-    samples = attention.look(query.float(), reference.float(), feats)
+    samples = attention.compute_samples(query.float(), reference.float(), feats)
     torch.testing.assert_close(samples.point_weights, torch.full_like(samples.weights, 1 / K))
     torch.testing.assert_close(samples.weights, torch.full_like(samples.weights, 1 / (2 * P * K)))
 

@@ -143,7 +143,7 @@ def test_gaussians_guide_positions_and_samples_once_they_are_not_neutral():
     frames = layer.guidance.frames(neutral, torch.empty(1, 1, 8, 6))
     torch.testing.assert_close(frames, torch.eye(2, dtype=frames.dtype).expand_as(frames))
     position = torch.randn(B, N, C, dtype=torch.float64)
-    torch.testing.assert_close(layer.guided(position, neutral), position)
+    torch.testing.assert_close(layer.guide_position(position, neutral), position)
 
 
 def test_without_a_position_code_every_layer_adds_the_learned_position():

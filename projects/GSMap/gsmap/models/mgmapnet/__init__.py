@@ -1,1 +1,1 @@
-"""MGMapNet (arXiv 2410.07733): instance and point queries."""
+"""MGMapNet (arXiv 2410.07733), with queries of instances and of points."""

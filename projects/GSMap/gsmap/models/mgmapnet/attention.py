@@ -1,4 +1,4 @@
-"""MGMapNet's attention: one sampling of the BEV serves an instance query and its point queries."""
+"""MGMapNet's attention, in which an instance query and its point queries share BEV samples."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -16,30 +16,31 @@ from gsmap.utils.errors import InputError
 
 
 class Granularities(NamedTuple):
-    """The queries of all map elements at both granularities, as layers hand them on."""
+    """Queries of all map elements at both granularities, passed from layer to layer."""
 
-    instances: Tensor  # (B, N, C)
-    points: Tensor | None = None  # none before the first layer (B, N, P, C)
-    point_code: Tensor | float = 0.0  # position code (B, N, P, C), 0 without codes
-    mean_locations: Tensor | None = None  # of each point's samples (B, N, P, 2)
+    instances: Tensor  # instance queries (B, N, C)
+    points: Tensor | None = None  # point queries, None before the first layer (B, N, P, C)
+    point_code: Tensor | float = 0.0  # position codes of the points, or 0 (B, N, P, C)
+    mean_locations: Tensor | None = None  # mean location of each point's samples (B, N, P, 2)
 
 
 class Samples(NamedTuple):
-    """Where an attention looks, and how it weighs it: (B, N, P, levels, heads, K) each."""
+    """Locations and weights of BEV samples. (B, N, P, levels, heads, K) each"""
 
-    locations: Tensor  # sampling points (x, y), [0, 1] over the map (..., 2)
-    point_weights: Tensor  # of sum one over K
-    weights: Tensor  # of sum one over P, levels and K
+    locations: Tensor  # (x, y) in [0, 1] over the map (..., 2)
+    point_weights: Tensor  # sum to 1 over K
+    weights: Tensor  # sum to 1 over P, levels and K
 
 
 class PerPointSampling(SamplingAttention):
-    """What both attentions of this module share: the BEV sampled at K offsets around every point.
+    """Base of the attentions that sample BEV features at K offsets around every point.
 
     Args:
         num_points: Points per instance P.
-        num_samples: Samples per head, level and point K.
-        num_levels: Levels of BEV features.
-        kwargs: ``embed_dims`` C, ``num_heads`` and ``dropout`` as in :class:`SamplingAttention`.
+        num_samples: Samples K per head, level and point.
+        num_levels: Number of levels of BEV features.
+        kwargs: Arguments ``embed_dims`` C, ``num_heads`` and ``dropout`` of
+            :class:`SamplingAttention`.
     """
 
     def __init__(
@@ -56,73 +57,117 @@ class PerPointSampling(SamplingAttention):
         feats: Sequence[Tensor],
         frames: Tensor | None = None,
     ) -> Granularities:
-        """Update the queries from the BEV, residuals included.
+        """Update the queries from BEV features, residuals included.
 
-        Points and their code are those of the layer before. Instances have a position (B, N, C),
-        points references (B, N, P, D) and frames (B, N * P, 2, 2), as in `place_samples`; features
-        are levels x (B, C, H, W), the finest first. ValueError if the numbers of levels or points
-        are not the module's.
+        Args:
+            state: Queries of the previous layer.
+            position: Positional embeddings of the instances. (B, N, C)
+            reference: References of the points, which begin with (x, y) in [0, 1] over the map.
+                (B, N, P, D)
+            feats: Levels of BEV features, the finest first. (B, C, H, W) each
+            frames: Rotations of the offsets of each point, or None. (B, N * P, 2, 2)
+
+        Returns:
+            Updated queries.
+
+        Raises:
+            ValueError: If the number of levels or of points differs from the settings.
         """
-        samples = self.look(state.instances + position, reference, feats, frames)
-        updated = self.update(state, feats, samples)
-        return updated._replace(mean_locations=samples.locations.mean((3, 4, 5)))
+        query = state.instances + position
+        samples = self.compute_samples(query, reference, feats=feats, frames=frames)
+        updated = self.update(state, feats, samples=samples)
+        return updated._replace(mean_locations=samples.locations.mean(dim=(3, 4, 5)))
 
     def update(
         self, state: Granularities, feats: Sequence[Tensor], samples: Samples
     ) -> Granularities:
-        """Return the queries, updated by what the samples see."""
+        """Update the queries from the sampled features.
+
+        Args:
+            state: Queries of the previous layer.
+            feats: Levels of BEV features, the finest first. (B, C, H, W) each
+            samples: Locations and weights of the samples.
+        """
         raise NotImplementedError
 
-    def look(
+    def compute_samples(
         self,
         query: Tensor,
         reference: Tensor,
         feats: Sequence[Tensor],
         frames: Tensor | None = None,
     ) -> Samples:
-        """Place and weigh the samples of instance queries (B, N, C) with their position added."""
-        levels, points, _ = self.layout
-        if len(feats) != levels or reference.shape[2] != points:
-            raise InputError(
-                f"expected {levels} levels of BEV features and {points} points per instance, got "
-                f"{len(feats)} and {reference.shape[2]}."
+        """Compute the locations and the weights of the samples from the instance queries.
+
+        Args:
+            query: Instance queries plus their positional embeddings. (B, N, C)
+            reference: References of the points, which begin with (x, y) in [0, 1] over the map.
+                (B, N, P, D)
+            feats: Levels of BEV features, the finest first. (B, C, H, W) each
+            frames: Rotations of the offsets of each point, or None. (B, N * P, 2, 2)
+
+        Raises:
+            ValueError: If the number of levels or of points differs from the settings.
+        """
+        num_levels, num_points, _ = self.layout
+        if len(feats) != num_levels or reference.shape[2] != num_points:
+            raise ValueError(
+                f"expected {num_levels} levels of BEV features and {num_points} points per "
+                f"instance, got {len(feats)} and {reference.shape[2]}."
             )
         offsets = self.offsets_in_cells(query).unflatten(-2, self.layout)
-        offsets = offsets.permute(3, 0, 1, 4, 2, 5, 6).flatten(2, 3)  # (levels, B, N P, heads, K,2)
-        locations = [
-            place_samples(by_level, reference.flatten(1, 2), (f.shape[-2], f.shape[-1]), frames)
-            for by_level, f in zip(offsets, feats, strict=True)
-        ]
+        offsets = offsets.permute(3, 0, 1, 4, 2, 5, 6)
+        offsets = offsets.flatten(2, 3)  # (levels, B, N * P, heads, K, 2)
+        point_references = reference.flatten(1, 2)  # (B, N * P, D)
+        level_locations = []
+        for level_offsets, level in zip(offsets, feats, strict=True):
+            shape = (level.shape[-2], level.shape[-1])
+            locations = place_samples(level_offsets, point_references, shape=shape, frames=frames)
+            level_locations.append(locations)
         logits = at_least_float32(self.attention_weights(query))
         logits = logits.unflatten(-1, (self.num_heads, *self.layout))
-        joint = logits.flatten(-3).softmax(-1).unflatten(-1, self.layout)
+        point_weights = logits.softmax(dim=-1)
+        weights = logits.flatten(-3).softmax(dim=-1).unflatten(-1, self.layout)
         order = (0, 1, 4, 3, 2, 5)  # (B, N, heads, levels, P, K) -> (B, N, P, levels, heads, K)
         return Samples(
-            torch.stack(locations, 2).unflatten(1, (-1, points)),
-            logits.softmax(-1).permute(order),
-            joint.permute(order),
+            locations=torch.stack(level_locations, dim=2).unflatten(1, (-1, num_points)),
+            point_weights=point_weights.permute(order),
+            weights=weights.permute(order),
         )
 
     def sample(self, feats: Sequence[Tensor], locations: Tensor, weights: Tensor) -> Tensor:
-        """Return weighted sums of each level, for locations (B, Q, levels, heads, S, 2) in it.
+        """Sample each level and compute weighted sums.
 
-        Weights have the locations' shape without its last entry. (B, Q, levels, heads, C / heads)
+        Args:
+            feats: Levels of BEV features, the finest first. (B, C, H, W) each
+            locations: Locations (x, y) in [0, 1] over the map. (B, Q, levels, heads, S, 2)
+            weights: Weights of the samples. (B, Q, levels, heads, S)
+
+        Returns:
+            Weighted sums of each level and head. (B, Q, levels, heads, C / heads)
         """
-        seen = []
-        for level, f in enumerate(feats):
-            value, shape = self.values(f.flatten(2).transpose(1, 2)), (f.shape[-2], f.shape[-1])
-            seen.append(
-                deformable_sample(value, shape, locations[:, :, level], weights[:, :, level])
+        sums = []
+        for number, level in enumerate(feats):
+            level_sum = deformable_sample(
+                self.values(level.flatten(2).transpose(1, 2)),
+                (level.shape[-2], level.shape[-1]),
+                locations=locations[:, :, number],
+                weights=weights[:, :, number],
             )
-        return torch.stack(seen, 2).unflatten(-1, (self.num_heads, -1))
+            sums.append(level_sum)
+        return torch.stack(sums, dim=2).unflatten(-1, (self.num_heads, -1))
 
 
 @MODELS.register_module()
 class MultiPointAttention(PerPointSampling):
-    """Instance queries alone look around all of their points (StreamMapNet).
+    """Attention of instance queries alone around all of their points (StreamMapNet).
 
-    The point queries follow from the instance query by one matrix, as StreamMapNet's points do.
-    This is the baseline of MGMapNet's tables. Arguments as in :class:`PerPointSampling`.
+    A linear layer computes the point queries from the instance query. This is the baseline of
+    MGMapNet's tables.
+
+    Args:
+        embed_dims: Channels C.
+        kwargs: Further arguments of :class:`PerPointSampling`.
     """
 
     def __init__(self, embed_dims: int = 256, **kwargs: Any) -> None:
@@ -132,28 +177,35 @@ class MultiPointAttention(PerPointSampling):
     def update(
         self, state: Granularities, feats: Sequence[Tensor], samples: Samples
     ) -> Granularities:
-        """Return the instance queries with what they see, and their points."""
+        """Update the instance queries from the sampled features, and compute their points.
+
+        Args:
+            state: Queries of the previous layer.
+            feats: Levels of BEV features, the finest first. (B, C, H, W) each
+            samples: Locations and weights of the samples.
+        """
         # (B, N, P, levels, heads, K, ...) -> (B, N, levels, heads, P * K, ...)
         locations = samples.locations.movedim(2, 4).flatten(4, 5)
-        seen = self.sample(feats, locations, samples.weights.movedim(2, 4).flatten(4, 5)).sum(2)
-        instances = state.instances + self.dropout(self.output_proj(seen.flatten(2)))
+        weights = samples.weights.movedim(2, 4).flatten(4, 5)
+        sampled = self.sample(feats, locations, weights=weights).sum(dim=2)  # (B, N, heads, C')
+        instances = state.instances + self.dropout(self.output_proj(sampled.flatten(2)))
         points = self.point_proj(instances).unflatten(-1, (self.layout[1], -1))
         return Granularities(instances, points)
 
 
 @MODELS.register_module()
 class MultiGranularityAttention(PerPointSampling):
-    """An aggregated instance query and its P point queries, which then interact (MGMapNet).
+    """Attention that samples for instance and point queries, which then interact (MGMapNet).
 
-    Each part has its switch, for the ablation tables of the paper.
+    Each part can be switched off, for the ablation tables of the paper.
 
     Args:
         embed_dims: Channels C.
         ffn_dims: Hidden channels of the interactions.
-        add_instance: Add the aggregated instance query to its points, before P2I.
-        p2p: Let an instance's points attend to each other and to those of the layer before.
-        p2i: Let the points attend to all aggregated instance queries of the sample.
-        position_codes: Add codes of the sampling locations to queries and keys of both.
+        add_instance: Whether the aggregated instance query is added to its points before P2I.
+        p2p: Whether the points of an instance attend to each other and to their previous states.
+        p2i: Whether points attend to all aggregated instance queries of the sample.
+        position_codes: Whether codes of the sampling locations are added to queries and keys.
         kwargs: Further arguments of :class:`PerPointSampling`.
     """
 
@@ -168,7 +220,7 @@ class MultiGranularityAttention(PerPointSampling):
         **kwargs: Any,
     ) -> None:
         super().__init__(embed_dims=embed_dims, **kwargs)
-        _, points, samples = self.layout
+        _, num_points, num_samples = self.layout
         interaction = partial(
             Interaction,
             embed_dims=embed_dims,
@@ -179,91 +231,157 @@ class MultiGranularityAttention(PerPointSampling):
         self.add_instance = add_instance
         self.p2p = interaction() if p2p else None
         self.p2i = interaction() if p2i else None
-        dims = (embed_dims, embed_dims)
-        coded = position_codes and (p2p or p2i)
-        self.point_code = mlp(2 * samples, *dims) if coded else None
-        self.instance_code = mlp(2 * points * samples, *dims) if coded and p2i else None
-        self.instance_mlp = mlp(points * embed_dims, *dims)
+        self.point_code: nn.Sequential | None = None
+        self.instance_code: nn.Sequential | None = None
+        if position_codes and (p2p or p2i):
+            self.point_code = mlp(2 * num_samples, embed_dims, embed_dims)
+        if position_codes and p2i:
+            self.instance_code = mlp(2 * num_points * num_samples, embed_dims, embed_dims)
+        self.instance_mlp = mlp(num_points * embed_dims, embed_dims, embed_dims)
 
     def update(
         self, state: Granularities, feats: Sequence[Tensor], samples: Samples
     ) -> Granularities:
-        """Return both queries after they have seen the BEV and each other."""
+        """Update both kinds of queries from the sampled features and from each other.
+
+        Args:
+            state: Queries of the previous layer.
+            feats: Levels of BEV features, the finest first. (B, C, H, W) each
+            samples: Locations and weights of the samples.
+        """
         instances, points = self.aggregate(feats, samples)
         point_code, instance_code = self.codes(samples)
-        points = self.interact_points(points, point_code, state)
+        points = self.interact_points(points, point_code, before=state)
         if self.add_instance:
             points = points + instances[:, :, None]
-        points = self.interact_instances(points, point_code, instances, instance_code)
+        points = self.interact_instances(
+            points, point_code, instances=instances, instance_code=instance_code
+        )
         # Differs from the poster, which sums the points: the released model concatenates them.
         instances = state.instances + self.dropout(self.instance_mlp(points.flatten(2)))
         points = self.dropout(self.output_proj(points))
         if state.points is not None:
             points = points + state.points
-        return Granularities(instances, points, point_code)
+        return Granularities(instances, points, point_code=point_code)
 
     def aggregate(self, feats: Sequence[Tensor], samples: Samples) -> tuple[Tensor, Tensor]:
-        """Sum the samples to instance queries (B, N, C) and, mean over levels, points (B, N, P, C).
+        """Aggregate the sampled features to instance queries and point queries.
 
-        The joint weights are the points' weights times the share that each point and level has in
-        the instance, so the instance query is a weighted sum of what its points saw.
+        The joint weight of a sample is its weight within the point times the share of the point and
+        level in the instance, so an instance query is a weighted sum of the features of its points.
+
+        Args:
+            feats: Levels of BEV features, the finest first. (B, C, H, W) each
+            samples: Locations and weights of the samples.
+
+        Returns:
+            Instance queries (B, N, C), and point queries averaged over the levels (B, N, P, C).
         """
-        by_point = samples.locations.flatten(1, 2), samples.point_weights.flatten(1, 2)
-        by_head = self.sample(feats, *by_point).unflatten(1, (-1, self.layout[1]))
-        shares = samples.weights.sum(-1)  # (B, N, P, levels, heads)
+        by_head = self.sample(
+            feats,
+            locations=samples.locations.flatten(1, 2),
+            weights=samples.point_weights.flatten(1, 2),
+        )
+        by_head = by_head.unflatten(1, (-1, self.layout[1]))  # (B, N, P, levels, heads, C / heads)
+        shares = samples.weights.sum(dim=-1)  # (B, N, P, levels, heads)
         instances = torch.einsum("bnplh,bnplhc->bnhc", shares, by_head)
-        return instances.flatten(2), by_head.mean(3).flatten(3)
+        return instances.flatten(2), by_head.mean(dim=3).flatten(3)
 
     def codes(self, samples: Samples) -> tuple[Tensor | float, Tensor | float]:
-        """Return the position codes of points (B, N, P, C) and instances (B, N, C), 0 for none."""
-        locations = samples.locations.mean((3, 4))  # (B, N, P, K, 2)
-        point_code = instance_code = 0.0
-        # Differs from the poster's MLP(S, W): the released model codes their product.
+        """Compute the position codes of points (B, N, P, C) and instances (B, N, C), or 0."""
+        locations = samples.locations.mean(dim=(3, 4))  # (B, N, P, K, 2)
+        point_code: Tensor | float = 0.0
+        instance_code: Tensor | float = 0.0
+        # Differs from the poster's MLP(S, W): the released model encodes their product.
         if self.point_code is not None:
-            weighted = locations * samples.point_weights.mean((3, 4))[..., None]
+            weighted = locations * samples.point_weights.mean(dim=(3, 4))[..., None]
             point_code = self.point_code(weighted.flatten(3))
         if self.instance_code is not None:
-            weighted = locations * samples.weights.mean((3, 4))[..., None]
+            weighted = locations * samples.weights.mean(dim=(3, 4))[..., None]
             instance_code = self.instance_code(weighted.flatten(2))
         return point_code, instance_code
 
     def interact_points(
         self, points: Tensor, code: Tensor | float, before: Granularities
     ) -> Tensor:
-        """Let points attend to their instance's, now and in the layer before. (B, N, P, C)"""
+        """Attend from points to the points of their instance, now and in the previous layer.
+
+        Args:
+            points: Point queries. (B, N, P, C)
+            code: Position codes of the points, or 0. (B, N, P, C)
+            before: Queries of the previous layer.
+
+        Returns:
+            Updated point queries. (B, N, P, C)
+        """
         if self.p2p is None:
             return points
+        query = points + code
+        key = query
         value = points
-        query = key = points + code
-        # Differs from the poster, whose later layers attend to the points of the layer before only.
+        # Differs from the poster, whose later layers attend to the previous points alone.
         if before.points is not None:
-            value = torch.cat([before.points, value], 2)  # (B, N, 2 P, C)
-            key = torch.cat([before.points + before.point_code, key], 2)
-        flat = [x.flatten(0, 1) for x in (points, query, key, value)]
-        return self.p2p(*flat).unflatten(0, points.shape[:2])
+            key = torch.cat([before.points + before.point_code, key], dim=2)  # (B, N, 2 P, C)
+            value = torch.cat([before.points, value], dim=2)
+        updated = self.p2p(
+            points.flatten(0, 1),
+            query=query.flatten(0, 1),
+            key=key.flatten(0, 1),
+            value=value.flatten(0, 1),
+        )
+        return updated.unflatten(0, points.shape[:2])
 
     def interact_instances(
         self, points: Tensor, code: Tensor | float, instances: Tensor, instance_code: Tensor | float
     ) -> Tensor:
-        """Let all points of a sample attend to its aggregated instance queries. (B, N, P, C)"""
+        """Attend from points to all aggregated instance queries of the sample.
+
+        Args:
+            points: Point queries. (B, N, P, C)
+            code: Position codes of the points, or 0. (B, N, P, C)
+            instances: Aggregated instance queries. (B, N, C)
+            instance_code: Position codes of the instances, or 0. (B, N, C)
+
+        Returns:
+            Updated point queries. (B, N, P, C)
+        """
         if self.p2i is None:
             return points
-        query, key = (points + code).flatten(1, 2), instances + instance_code
-        attended = self.p2i(points.flatten(1, 2), query, key, instances)
-        return attended.unflatten(1, points.shape[1:3])
+        query = (points + code).flatten(1, 2)  # (B, N * P, C)
+        key = instances + instance_code
+        updated = self.p2i(points.flatten(1, 2), query=query, key=key, value=instances)
+        return updated.unflatten(1, points.shape[1:3])
 
 
 class Interaction(nn.Module):
-    """Attention and feed-forward network, each with residual and LayerNorm after it."""
+    """Attention and feed-forward network, each with residual and LayerNorm after it.
+
+    Args:
+        embed_dims: Channels C.
+        num_heads: Number of attention heads.
+        ffn_dims: Hidden channels of the feed-forward network.
+        dropout: Probability of setting a value to zero in training, in [0, 1].
+    """
 
     def __init__(self, embed_dims: int, num_heads: int, ffn_dims: int, dropout: float) -> None:
         super().__init__()
-        self.attn = nn.MultiheadAttention(embed_dims, num_heads, dropout, batch_first=True)
-        self.ffn = feed_forward(embed_dims, ffn_dims, dropout)
+        self.attn = nn.MultiheadAttention(embed_dims, num_heads, dropout=dropout, batch_first=True)
+        self.ffn = feed_forward(embed_dims, ffn_dims, dropout=dropout)
         self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in range(2))
         self.dropout = nn.Dropout(dropout)
 
     def forward(self, content: Tensor, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
-        """Update the content (B, Q, C) from keys and values (B, S, C). -> (B, Q, C)"""
-        attended = self.attn(query, key, value, need_weights=False)[0]
-        return self.norms[1](self.ffn(self.norms[0](content + self.dropout(attended))))
+        """Update the content by attention.
+
+        Args:
+            content: Content, to which the attended values are added. (B, Q, C)
+            query: Queries. (B, Q, C)
+            key: Keys. (B, S, C)
+            value: Values. (B, S, C)
+
+        Returns:
+            Updated content. (B, Q, C)
+        """
+        attended, _ = self.attn(query, key, value, need_weights=False)
+        content = self.norms[0](content + self.dropout(attended))
+        return self.norms[1](self.ffn(content))

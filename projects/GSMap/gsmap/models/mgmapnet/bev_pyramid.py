@@ -6,7 +6,11 @@ from gsmap.utils.errors import InputError
 
 
 class PatchMerging(nn.Module):
-    """Halve a map: the C channels of 2 x 2 cells are joined, normalised and mixed (MGMapNet)."""
+    """Downsampling by two: the channels of 2 x 2 cells are normalised and projected (MGMapNet).
+
+    Args:
+        embed_dims: Channels C.
+    """
 
     def __init__(self, embed_dims: int) -> None:
         super().__init__()
@@ -14,19 +18,31 @@ class PatchMerging(nn.Module):
         self.reduction = nn.Linear(4 * embed_dims, embed_dims, bias=False)
 
     def forward(self, feats: Tensor) -> Tensor:
-        """Halve a map; ValueError if a side is odd. (B, C, H, W) -> (B, C, H / 2, W / 2)"""
+        """Halve the sides of a map. (B, C, H, W) -> (B, C, H / 2, W / 2)
+
+        Raises:
+            ValueError: If a side is odd.
+        """
         height, width = feats.shape[-2:]
         if height % 2 or width % 2:
             raise InputError(f"a BEV level needs even sides to be halved, got {height} x {width}.")
         patches = feats.unflatten(3, (-1, 2)).unflatten(2, (-1, 2))  # (B, C, h, 2, w, 2)
-        # the order of a checkpoint's channels: both rows of the even column, then of the odd one
-        # (mmdet's PatchMerging has another)
+        # Channel order of the released checkpoints: both rows of the even column, then both rows of
+        # the odd column. mmdet's PatchMerging has another order.
         patches = patches.permute(0, 2, 4, 5, 3, 1).flatten(3)  # (B, h, w, 4 C)
         return self.reduction(self.norm(patches)).permute(0, 3, 1, 2)
 
 
 class BEVPyramid(nn.Module):
-    """BEV features, and the same at half the resolution and so on; ValueError without a level."""
+    """Levels of BEV features, each with half the resolution of the previous one.
+
+    Args:
+        embed_dims: Channels C.
+        num_levels: Number of levels, >= 1.
+
+    Raises:
+        ValueError: If ``num_levels`` is less than 1.
+    """
 
     def __init__(self, embed_dims: int = 256, num_levels: int = 2) -> None:
         super().__init__()
@@ -35,7 +51,7 @@ class BEVPyramid(nn.Module):
         self.merges = nn.ModuleList(PatchMerging(embed_dims) for _ in range(num_levels - 1))
 
     def forward(self, bev_feats: Tensor) -> list[Tensor]:
-        """Return all levels, the finest first. (B, C, H, W) -> (B, C, H / 2^l, W / 2^l) each"""
+        """Compute all levels, the finest first. (B, C, H, W) -> (B, C, H / 2^l, W / 2^l) each"""
         levels = [bev_feats]
         for merge in self.merges:
             levels.append(merge(levels[-1]))

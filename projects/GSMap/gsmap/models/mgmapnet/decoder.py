@@ -1,4 +1,4 @@
-"""MGMapNet's decoder: instance queries and point queries in one stack of layers."""
+"""MGMapNet's decoder of instance and point queries."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,15 +15,22 @@ from gsmap.models.mgmapnet.bev_pyramid import BEVPyramid
 
 @MODELS.register_module()
 class MGMapNetDecoderLayer(MapDecoderLayer):
-    """Self-attention of the instances, attention on the BEV, and a network for each granularity.
+    """Decoder layer of instance and point queries with `MultiGranularityAttention` to the BEV.
 
-    The attention on the BEV is `MultiGranularityAttention`. Arguments besides those of
-    `MapDecoderLayer`:
+    It consists of the self-attention of the instances, the attention to the BEV, and a feed-forward
+    network for each granularity.
 
     Args:
-        num_levels: Levels of BEV features.
-        reference_dims: Entries of the reference that its position code reads; None for the learned
-            position instead.
+        embed_dims: Channels C of the queries.
+        num_points: Points per instance P.
+        num_levels: Number of levels of BEV features.
+        ffn_dims: Hidden channels of the feed-forward networks.
+        dropout: Probability of setting a value to zero in training, in [0, 1].
+        self_attn: Settings of the self-attention.
+        cross_attn: Settings of the attention to the BEV.
+        reference_dims: Number of coordinates of a reference in its position code; None to use the
+            learned position instead.
+        kwargs: Further arguments of `MapDecoderLayer`.
     """
 
     def __init__(
@@ -47,16 +54,37 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
             cross_attn={**sampling, "num_points": num_points, **(cross_attn or {})},
             **kwargs,
         )
-        self.num_points, self.reference_dims = num_points, reference_dims
-        self.point_ffn = feed_forward(embed_dims, ffn_dims, dropout)
+        self.num_points = num_points
+        self.reference_dims = reference_dims
+        self.point_ffn = feed_forward(embed_dims, ffn_dims, dropout=dropout)
         self.point_norm = nn.LayerNorm(embed_dims)
         self.reference_code: nn.Sequential | None = None
         if reference_dims is not None:
             self.reference_code = mlp(num_points * reference_dims, embed_dims, embed_dims)
 
-    def forward(self, state: Granularities, *inputs: Any) -> Granularities:  # type: ignore[override]
-        """Update the queries that the layer before left; inputs as of `update_instances`."""
-        state = self.update_instances(state, *inputs)
+    def forward(  # type: ignore[override]
+        self,
+        state: Granularities,
+        query_pos: Tensor,
+        reference: Tensor,
+        feats: Sequence[Tensor],
+        attn_mask: Tensor | None,
+    ) -> Granularities:
+        """Update instance and point queries.
+
+        Args:
+            state: Queries of the previous layer.
+            query_pos: Learned positions of the instances. (B, N, C)
+            reference: References of the points. (B, N * P, D)
+            feats: Levels of BEV features, the finest first. (B, C, H, W) each
+            attn_mask: True where an instance does not attend to another one, or None. (N, N)
+
+        Returns:
+            Updated queries.
+        """
+        state = self.update_instances(
+            state, query_pos, reference=reference, feats=feats, attn_mask=attn_mask
+        )
         return state._replace(points=self.point_norm(self.point_ffn(state.points)))
 
     def update_instances(
@@ -67,41 +95,60 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
         feats: Sequence[Tensor],
         attn_mask: Tensor | None,
     ) -> Granularities:
-        """Run both attentions and the instances' network; the points' own network is to come.
+        """Apply all parts of the layer but the feed-forward network of the points.
 
-        As in `MapDecoderLayer`, but that instances have the position (B, N, C) and the features
-        have levels, the finest first.
+        Args:
+            state: Queries of the previous layer.
+            query_pos: Learned positions of the instances. (B, N, C)
+            reference: References of the points. (B, N * P, D)
+            feats: Levels of BEV features, the finest first. (B, C, H, W) each
+            attn_mask: True where an instance does not attend to another one, or None. (N, N)
+
+        Returns:
+            Updated queries.
         """
-        attended = self.self_attn(state.instances, self.guided(query_pos, reference), attn_mask)
+        position = self.guide_position(query_pos, reference)
+        attended = self.self_attn(state.instances, position, attn_mask)
         state = state._replace(instances=self.norms[0](attended))
         by_instance = reference.unflatten(1, (-1, self.num_points))  # (B, N, P, D)
         position = query_pos
         if self.reference_code is not None:
             position = self.reference_code(by_instance[..., : self.reference_dims].flatten(2))
         frames = None
-        if self.guidance is not None:  # levels halve both sides, so one frame serves all
+        if self.guidance is not None:
+            # Each level halves both sides, so the rotations of the finest one hold for all.
             frames = self.guidance.frames(reference, feats[0])
-        position = self.guided(position, reference)
-        state = self.cross_attn(state, position, by_instance, feats, frames)
+        position = self.guide_position(position, reference)
+        state = self.cross_attn(state, position, reference=by_instance, feats=feats, frames=frames)
         return state._replace(instances=self.norms[2](self.ffn(self.norms[1](state.instances))))
 
-    def guided(self, position: Tensor, reference: Tensor) -> Tensor:
-        """Add the mean of what the guidance adds to the position of each point. (B, N, C)"""
+    def guide_position(self, position: Tensor, reference: Tensor) -> Tensor:
+        """Apply the guidance to the position of each point, and average over the points.
+
+        Args:
+            position: Positions of the instances. (B, N, C)
+            reference: References of the points. (B, N * P, D)
+
+        Returns:
+            Positions of the instances. (B, N, C)
+        """
         if self.guidance is None:
             return position
-        by_point = position.repeat_interleave(self.num_points, 1)  # (B, N * P, C)
+        by_point = position.repeat_interleave(self.num_points, dim=1)  # (B, N * P, C)
         by_point = self.guidance.position(by_point, reference)
-        return by_point.unflatten(1, (-1, self.num_points)).mean(2)
+        return by_point.unflatten(1, (-1, self.num_points)).mean(dim=2)
 
 
 @dataclass(eq=False)
 class MGMapNetDecoded(Decoded):
-    """What a layer of `MGMapNetDecoder` returns, for all samples of a batch.
+    """Output of a layer of `MGMapNetDecoder`, for all samples of a batch.
 
     Args:
-        point_states: States of the point queries; they move the references. (B, N, P, C)
-        references: What the layer has refined, float32. (B, N, P, D)
-        instance_states: States of the instance queries; they say the class. (B, N, C)
+        point_states: States of the point queries, from which the references are refined.
+            (B, N, P, C)
+        references: Refined references, float32. (B, N, P, D)
+        instance_states: States of the instance queries, from which classes are predicted.
+            (B, N, C)
         mean_locations: Mean of each point's sampling locations (x, y), [0, 1] over the map, not
             clipped. (B, N, P, 2)
     """
@@ -111,14 +158,16 @@ class MGMapNetDecoded(Decoded):
 
 @MODELS.register_module()
 class MGMapNetDecoder(MapDecoder):
-    """A stack of layers with instance and point queries that refine one reference (MGMapNet).
+    """Decoder of instance and point queries that refine one reference (MGMapNet).
 
-    It takes instance queries and one reference for each, which its points share at first.
+    Its inputs are instance queries with one reference each, which all points of an instance share
+    before the first layer.
 
     Args:
-        layer: Config of the layer (`MGMapNetDecoderLayer`). Its ``reference_dims`` holds from the
-            second layer on: before that no point has moved.
-        num_levels: Levels of BEV features.
+        layer: Settings of `MGMapNetDecoderLayer`. Its ``reference_dims`` applies from the second
+            layer on, as the references of an instance's points are equal before.
+        embed_dims: Channels C of the queries and of the BEV features.
+        num_levels: Number of levels of BEV features.
         kwargs: Further arguments of `MapDecoder`.
     """
 
@@ -132,8 +181,7 @@ class MGMapNetDecoder(MapDecoder):
         num_levels: int = 2,
         **kwargs: Any,
     ) -> None:
-        kwargs |= {"embed_dims": embed_dims, "num_levels": num_levels}
-        super().__init__(layer or {}, **kwargs)
+        super().__init__(layer or {}, **kwargs, embed_dims=embed_dims, num_levels=num_levels)
         # Differs from the poster: the released model's first layer adds the learned position.
         self.layers[0].reference_code = None
         self.bev_pyramid = BEVPyramid(embed_dims, num_levels)
@@ -141,8 +189,17 @@ class MGMapNetDecoder(MapDecoder):
     def start(
         self, query: Tensor, reference: Tensor, bev_feats: Tensor
     ) -> tuple[Granularities, Tensor, list[Tensor]]:
-        """Return the instances' queries, the points' references (B, N * P, D) and all levels."""
-        references = reference.repeat_interleave(self.num_points, 1)
+        """Prepare the inputs of the layers.
+
+        Args:
+            query: Instance queries. (B, N, C)
+            reference: Initial references of the instances. (B, N, D)
+            bev_feats: BEV features. (B, C, H, W)
+
+        Returns:
+            Queries, references of the points (B, N * P, D), and levels of BEV features.
+        """
+        references = reference.repeat_interleave(self.num_points, dim=1)
         return Granularities(query), references, self.bev_pyramid(bev_feats)
 
     def point_states(self, state: Granularities) -> Tensor:
@@ -151,8 +208,17 @@ class MGMapNetDecoder(MapDecoder):
         return state.points.flatten(1, 2)
 
     def read(self, state: Granularities, references: Tensor) -> MGMapNetDecoded:
-        """Return a layer's output, with the references that it has refined. (B, N * P, D)"""
+        """Return the output of a layer.
+
+        Args:
+            state: Queries after the layer.
+            references: Refined references of the points. (B, N * P, D)
+        """
         assert state.points is not None
         assert state.mean_locations is not None
-        references = self.by_instance(references)
-        return MGMapNetDecoded(state.points, references, state.instances, state.mean_locations)
+        return MGMapNetDecoded(
+            point_states=state.points,
+            references=self.by_instance(references),
+            instance_states=state.instances,
+            mean_locations=state.mean_locations,
+        )

@@ -1,4 +1,4 @@
-"""MGMapNet's head: instance and point queries, masks of the instances, supervised samples."""
+"""MGMapNet's head, with instance and point queries, instance masks and supervised samples."""
 
 import logging
 from collections.abc import Mapping, Sequence
@@ -22,14 +22,19 @@ QUERY_GROUPS: tuple[PARTS, ...] = ({"num": 100}, {"name": "one2many", "num": 600
 
 @MODELS.register_module()
 class MGMapHead(MapHead):
-    """The map head with MGMapNet's parts as defaults. Besides `MapHead`'s arguments:
+    """Map head with MGMapNet's parts as defaults.
 
     Args:
-        decoder: Config of the decoder; one of another class becomes `MGMapNetDecoder` (see
-            `with_granularities`).
+        grid: Extent of the map, in metres.
+        decoder: Settings of the decoder. Another class is replaced by `MGMapNetDecoder`, see
+            `with_granularities`.
+        losses: Settings of further losses.
+        query_groups: Settings of the query groups.
         loss_mean_loc: Settings of `SamplingLocationLoss`, or None to train without it.
         loss_ins_seg: Settings of `InstanceMaskLoss`, or None to train without it.
-        masks: Settings of `ElementMasks`; its lines are 3 pixels wide by default.
+        masks: Settings of `ElementMasks`, whose lines are 3 pixels wide by default.
+        embed_dims: Channels C of the queries and of the BEV features.
+        kwargs: Further arguments of `MapHead`.
     """
 
     def __init__(
@@ -44,9 +49,10 @@ class MGMapHead(MapHead):
         embed_dims: int = 256,
         **kwargs: Any,
     ) -> None:
-        drawing = ElementMasks(grid, **(masks or {}))
-        if "line_width_m" not in (masks or {}):
-            drawing.line_width_m = LINE_PX * 2 * drawing.half_pixel_m
+        mask_settings = masks or {}
+        element_masks = ElementMasks(grid, **mask_settings)
+        if "line_width_m" not in mask_settings:
+            element_masks.line_width_m = LINE_PX * 2 * element_masks.half_pixel_m
         mean_loc = brought(SamplingLocationLoss, loss_mean_loc)
         ins_seg = brought(InstanceMaskLoss, loss_ins_seg, embed_dims=embed_dims)
         super().__init__(
@@ -54,25 +60,25 @@ class MGMapHead(MapHead):
             decoder=with_granularities(decoder),
             losses=[*losses, *mean_loc, *ins_seg],
             query_groups=query_groups,
-            masks=drawing,
+            masks=element_masks,
             embed_dims=embed_dims,
             **kwargs,
         )
 
 
 def with_granularities(decoder: PARTS) -> PARTS:
-    """Return a decoder's config as one of `MGMapNetDecoder`, which takes queries of instances.
+    """Convert the settings of a decoder to settings of `MGMapNetDecoder`.
 
-    What MapTR's and MapTRv2's configs say of their own layers and attentions, which take queries of
-    points, is replaced, and a line in the log names it. Any other attention reaches the layer.
+    Layers and attentions of MapTR's and MapTRv2's configs, which require point queries, are
+    replaced and logged. Other attentions are kept.
     """
-    kind = class_of(decoder)
-    if kind is not None and issubclass(kind, MGMapNetDecoder):
+    decoder_class = class_of(decoder)
+    if decoder_class is not None and issubclass(decoder_class, MGMapNetDecoder):
         return decoder
     layer = dict(decoder.get("layer", {}))
     replaced = {}
-    kind = class_of(layer)
-    if kind is None or not issubclass(kind, MGMapNetDecoderLayer):
+    layer_class = class_of(layer)
+    if layer_class is None or not issubclass(layer_class, MGMapNetDecoderLayer):
         replaced["type"] = layer.pop("type", None)
     if class_of(layer.get("self_attn") or {}) is DecoupledSelfAttention:
         replaced["self_attn"] = layer.pop("self_attn")

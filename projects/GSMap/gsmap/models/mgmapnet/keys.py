@@ -1,4 +1,4 @@
-"""The table between the state keys of MGMapNet's release and ours."""
+"""Mapping between the state keys of the released MGMapNet and of this project."""
 
 from gsmap.checkpoints.key_rules import KeyMap, rules_of, zeros
 from gsmap.models.maptr.keys import DECODER, DECODER_LAYER, DECODER_RULES, HEAD, LAYER, TRANSFORMER
@@ -39,13 +39,13 @@ MGMAPNET = KeyMap(
     ),
     {
         **LIFTED_UNUSED,
-        HEAD + "loss_seg.loss_fn.pos_weight": None,  # a loss that MGMapNet has not
+        HEAD + "loss_seg.loss_fn.pos_weight": None,  # a loss without counterpart
         **zeros(
             HEAD,
             {
-                # the embedding of the points, which MGMapNet's queries do not use
+                # an unused embedding of the points
                 "pts_embedding.weight": (20, 512),
-                # the second mask head of the camera view, which is never called
+                # the second mask head of the cameras, which is never called
                 **{f"bev_pv_seg_head.{i}.weight": (256, 256, 3, 3) for i in (0, 3)},
                 **{f"bev_pv_seg_head.{i}.{leaf}": (256,) for i in (1, 4) for leaf in _NORM},
                 **{f"bev_pv_seg_head.{i}.num_batches_tracked": () for i in (1, 4)},
@@ -56,7 +56,7 @@ MGMAPNET = KeyMap(
         **zeros(
             DECODER,
             {
-                # the code of the first layer's reference, which adds the learned position instead
+                # the reference code of the first layer, which uses the learned position instead
                 "gen_pos_embed.0.0.weight": (256, 40),
                 "gen_pos_embed.0.0.bias": (256,),
                 "gen_pos_embed.0.2.weight": (256, 256),

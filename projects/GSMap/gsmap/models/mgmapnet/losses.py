@@ -1,4 +1,4 @@
-"""MGMapNet's losses: of sampling locations, and of masks of instances."""
+"""MGMapNet's losses of sampling locations and of instance masks."""
 
 from typing import cast
 
@@ -21,31 +21,40 @@ PAIRINGS = ("matched", "released")
 def instance_mask_losses(
     logits: Tensor, targets: Tensor, avg_factor: float | Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return cross-entropy and dice of matched instances' masks, summed over ``avg_factor``.
+    """Compute the cross-entropy and the dice loss of the masks of matched instances.
 
-    Masks in [0, 1], of any dtype, 2 x (M, H, W); an instance's cross-entropy is the mean over its
-    cells; zero without matches. ValueError if the shapes disagree.
+    Args:
+        logits: Logits of the masks. (M, H, W)
+        targets: Target masks in [0, 1], of any type. (M, H, W)
+        avg_factor: Divisor of the sum over the instances.
+
+    Returns:
+        Cross-entropy, averaged over the cells of an instance, and dice loss; 0 without matches.
+
+    Raises:
+        ValueError: If the shapes differ.
     """
     check_same_shape(logits=logits, targets=targets)
-    logits, targets = logits.float(), targets.float()
+    logits = logits.float()
+    targets = targets.float()
     cross_entropy = F.binary_cross_entropy_with_logits(logits, targets, reduction="none")
     dice = dice_loss(logits.sigmoid(), targets)
-    return cross_entropy.mean((1, 2)).sum() / avg_factor, dice.sum() / avg_factor
+    return cross_entropy.mean(dim=(1, 2)).sum() / avg_factor, dice.sum() / avg_factor
 
 
 @MODELS.register_module()
 class InstanceMaskLoss(MapLoss):
-    """Masks of matched instances, by the product of their states and the BEV features (MGMapNet).
+    """Loss of instance masks, the products of instance states and BEV features (MGMapNet).
 
     Args:
         embed_dims: Channels C of the states and of the BEV features.
         loss_weight: Weight of the cross-entropy.
         dice_weight: Weight of the dice loss.
-        pairing: ``"matched"`` compares each query with the mask of its own ground truth;
-            ``"released"``, as MGMapNet's released code, the i-th matched query with the i-th ground
-            truth, which is right only if the matching happens to be sorted.
-        last_layer_only: As in `MapLoss`.
-        first_group_only: As in `MapLoss`.
+        pairing: ``"matched"`` compares each query with the mask of its ground truth.
+            ``"released"`` compares the i-th matched query with the i-th ground truth, as in the
+            released code, which is correct only if the matching happens to be sorted.
+        last_layer_only: Flag of `MapLoss`.
+        first_group_only: Flag of `MapLoss`.
 
     Raises:
         ValueError: If ``pairing`` is unknown.
@@ -62,39 +71,48 @@ class InstanceMaskLoss(MapLoss):
         last_layer_only: bool = True,
         first_group_only: bool = True,
     ) -> None:
-        super().__init__(loss_weight, last_layer_only, first_group_only)
+        super().__init__(
+            loss_weight, last_layer_only=last_layer_only, first_group_only=first_group_only
+        )
         if pairing not in PAIRINGS:
             raise InputError(f"pairing must be one of {PAIRINGS}, got {pairing!r}.")
         self.embedding = mlp(embed_dims, embed_dims, embed_dims, embed_dims)
-        self.dice_weight, self.pairing = dice_weight, pairing
+        self.dice_weight = dice_weight
+        self.pairing = pairing
 
     def logits(self, states: Tensor, bev_feats: Tensor) -> Tensor:
-        """Return the masks of a sample's instances. (n, C), (C, H, W) -> (n, H, W)"""
+        """Compute the mask logits of one sample's instances. (n, C), (C, H, W) -> (n, H, W)"""
         return torch.einsum("nc,chw->nhw", self.embedding(states), bev_feats.to(states))
 
     def forward(self, pairs: MatchedPairs) -> Tensor:
-        """Return the weighted loss; masks are averaged over the cells of the BEV features."""
-        states, feats = pairs.pred_instance_states, pairs.predictions.bev_feats
-        samples = zip(states.split(pairs.counts), feats, strict=True)
-        logits = torch.cat([self.logits(*sample) for sample in samples])  # (M, H, W)
+        """Compute the weighted loss; masks are averaged over the cells of the BEV features."""
+        sample_states = pairs.pred_instance_states.split(pairs.counts)
+        sample_logits = []
+        for states, feats in zip(sample_states, pairs.predictions.bev_feats, strict=True):
+            sample_logits.append(self.logits(states, feats))
+        logits = torch.cat(sample_logits)  # (M, H, W)
         masks = pairs.gt_masks.to(logits)
         if self.pairing == "released":
-            split = zip(masks.split(pairs.counts), pairs.gt_inds.split(pairs.counts), strict=True)
-            masks = torch.cat([own[inds.argsort()] for own, inds in split])
+            sample_masks = masks.split(pairs.counts)
+            sample_indices = pairs.gt_inds.split(pairs.counts)
+            sorted_masks = []
+            for own_masks, indices in zip(sample_masks, sample_indices, strict=True):
+                sorted_masks.append(own_masks[indices.argsort()])
+            masks = torch.cat(sorted_masks)
         if masks.shape != logits.shape and len(masks):
             masks = F.interpolate(masks[:, None], size=logits.shape[-2:], mode="area")[:, 0]
         masks = masks.reshape(logits.shape)
-        cross_entropy, dice = instance_mask_losses(logits, masks, pairs.avg_factor)
+        cross_entropy, dice = instance_mask_losses(logits, masks, avg_factor=pairs.avg_factor)
         return self.loss_weight * cross_entropy + self.dice_weight * dice
 
 
 @MODELS.register_module()
 class SamplingLocationLoss(MapLoss):
-    """L1 distance of each point's mean sampling location to the point itself (MGMapNet).
+    """L1 distance of each point's mean sampling location from the annotated point (MGMapNet).
 
     Args:
         loss_weight: Weight of the loss.
-        flags: As in `MapLoss`.
+        flags: Flags of `MapLoss`.
     """
 
     name = "mean_loc"
@@ -103,7 +121,11 @@ class SamplingLocationLoss(MapLoss):
         super().__init__(loss_weight, **flags)
 
     def check(self, head: BuiltHead) -> None:
-        """Raise ValueError if the decoder does not say where it samples."""
+        """Check that the head has sampling locations.
+
+        Raises:
+            ValueError: If the decoder is not an `MGMapNetDecoder`.
+        """
         if not isinstance(head.decoder, MGMapNetDecoder):
             raise InputError(
                 "SamplingLocationLoss needs the sampling locations of MGMapNetDecoder, got "
@@ -111,6 +133,6 @@ class SamplingLocationLoss(MapLoss):
             )
 
     def values(self, pairs: MatchedPairs) -> Tensor:
-        """Return the distance of each coordinate in the plane, [0, 1] over the map. (M, P, 2)"""
+        """Compute the distance of x and y, [0, 1] over the map. (M, P, 2)"""
         decoded = cast(MGMapNetDecoded, pairs.predictions.decoded)
         return (pairs.of_queries(decoded.mean_locations) - pairs.gt_pts[..., :2]).abs()
