@@ -231,7 +231,7 @@ class BezierHead(LineHead):
             numbers = instances.num_pts[is_class]
             largest = curve.weights.shape[-1]
             if ((numbers > largest) | ((numbers - 1) % curve.degree != 0)).any():
-                raise ValueError(
+                raise InputError(
                     f"lines of class {label} have {numbers.tolist()} control points, but the head "
                     f"pieces of degree {curve.degree} and at most {largest} points: set degrees "
                     "and pieces of FormatBezierTargets to those of the head."

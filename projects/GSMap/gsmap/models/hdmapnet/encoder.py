@@ -110,7 +110,7 @@ class ViewTransformEncoder(CameraEncoder):
         num_rows, num_columns = forward_size(self.grid)
         self.view_size = (2 * num_rows // 5, 2 * num_columns // 5)
         if min(self.feature_size + self.view_size) < 1:
-            raise ValueError(
+            raise InputError(
                 f"image_size {tuple(image_size)} by stride {stride} makes {self.feature_size} "
                 f"feature pixels, and the map a camera's map of {self.view_size} cells: neither "
                 "may be empty."
@@ -160,7 +160,7 @@ class ViewTransformEncoder(CameraEncoder):
         num_cams = feats.shape[1]
         size = tuple(feats.shape[-2:])
         if num_cams != len(self.views) or size != self.feature_size:
-            raise ValueError(
+            raise InputError(
                 f"the encoder is built for {len(self.views)} cameras of {self.feature_size} "
                 f"feature pixels, got {num_cams} of {size}: set num_cams, image_size and "
                 "stride of ViewTransformEncoder to those of the images."

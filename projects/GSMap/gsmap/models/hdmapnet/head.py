@@ -67,7 +67,7 @@ class HDMapNetHead(DetectionHead):
     ) -> None:
         super().__init__(init_cfg)
         if num_directions < 1 or 360 % num_directions:
-            raise ValueError(f"num_directions must divide 360, got {num_directions}.")
+            raise InputError(f"num_directions must divide 360, got {num_directions}.")
         self.grid = grid.rasterized(pixel_m)
         self.classes = tuple(classes)
         self.map_size = forward_size(self.grid)
@@ -146,7 +146,7 @@ class HDMapNetHead(DetectionHead):
         channels = len(self.classes) if name == "gt_lines" else 2
         shape = (channels, *self.map_size)
         if tuple(target.shape) != shape:
-            raise ValueError(
+            raise InputError(
                 f"{name} is {tuple(target.shape)}, the head's maps are {shape}: give MakeLineMaps "
                 "the head's pixel_m and number of classes, and the grid's forward."
             )

@@ -158,7 +158,7 @@ def _check(semantic: Tensor, embedding: Tensor, direction: Tensor, config: Vecto
         if not bounds.isfinite().all():
             not_finite.append(name)
     if not_finite:
-        raise ValueError(f"{' and '.join(not_finite)} have values that are not finite.")
+        raise InputError(f"{' and '.join(not_finite)} have values that are not finite.")
 
 
 def top_directions(direction: Tensor) -> IntArray:

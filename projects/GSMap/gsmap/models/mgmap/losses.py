@@ -45,7 +45,7 @@ class QueryMaskLoss(MapLoss):
         num_queries = len(head.instance_embedding.weight)
         num_masks = get_decoder(self, head).num_masks
         if num_queries != num_masks:
-            raise ValueError(
+            raise InputError(
                 f"decoder.num_masks is {num_masks}, and there are {num_queries} queries."
             )
 
@@ -95,7 +95,7 @@ class ForegroundLoss(MapLoss):
             ValueError: If the decoder has no refinement, whose segmentation the loss requires.
         """
         if not len(get_decoder(self, head).refinements):
-            raise ValueError("ForegroundLoss needs a refinement: set decoder.refinements.")
+            raise InputError("ForegroundLoss needs a refinement: set decoder.refinements.")
 
     def forward(self, pairs: MatchedPairs) -> Tensor:
         """Compute the weighted loss of the last refinement stage."""

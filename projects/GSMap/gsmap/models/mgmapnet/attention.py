@@ -111,7 +111,7 @@ class PerPointSampling(SamplingAttention):
         """
         num_levels, num_points, _ = self.layout
         if len(feats) != num_levels or reference.shape[2] != num_points:
-            raise ValueError(
+            raise InputError(
                 f"expected {num_levels} levels of BEV features and {num_points} points per "
                 f"instance, got {len(feats)} and {reference.shape[2]}."
             )

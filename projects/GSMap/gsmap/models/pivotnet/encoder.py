@@ -121,7 +121,7 @@ class PivotBEVEncoder(CameraEncoder):
     ) -> None:
         super().__init__(init_cfg)
         if camera_by not in ("depth", "angle"):
-            raise ValueError(f"camera_by must be 'depth' or 'angle', got {camera_by!r}.")
+            raise InputError(f"camera_by must be 'depth' or 'angle', got {camera_by!r}.")
         self.grid = grid.rasterized(bev_pixel_m)
         self.camera_by = camera_by
         self.shapes = []
@@ -205,7 +205,7 @@ class PivotBEVEncoder(CameraEncoder):
         levels = [level.permute(0, 2, 3, 1, 4).flatten(3) for level in feats]
         shapes = [tuple(level.shape[-2:]) for level in levels]
         if shapes != self.shapes:
-            raise ValueError(
+            raise InputError(
                 f"the cameras side by side must have {self.shapes} feature pixels, not {shapes}; "
                 "set image_size, strides and num_cams of PivotBEVEncoder to those of the images."
             )

@@ -163,7 +163,7 @@ class PivotHead(LineHead):
             is_class = instances.labels_3d == label
             numbers = instances.num_pts[is_class]
             if (numbers > num_points).any():
-                raise ValueError(
+                raise InputError(
                     f"a line of class {label} has {int(numbers.max())} pivots, but the head "
                     f"has {num_points} points: set num_points of FormatPivotTargets to those of "
                     "its queries."

@@ -61,7 +61,7 @@ def match_pivots(costs: Floats) -> NDArray[np.int64]:
     """
     num_pivots, num_points = costs.shape
     if num_pivots > num_points:
-        raise ValueError(f"{num_pivots} pivots cannot be matched with {num_points} points.")
+        raise InputError(f"{num_pivots} pivots cannot be matched with {num_points} points.")
     table = path_costs(costs)
     path = np.full(num_pivots, fill_value=num_points - 1)
     for row in range(num_pivots - 1, 0, -1):
