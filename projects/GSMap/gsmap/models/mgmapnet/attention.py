@@ -126,8 +126,8 @@ class PerPointSampling(SamplingAttention):
             level_locations.append(locations)
         logits = at_least_float32(self.attention_weights(query))
         logits = logits.unflatten(-1, (self.num_heads, *self.layout))
-        point_weights = logits.softmax(dim=-1)
         weights = logits.flatten(-3).softmax(dim=-1).unflatten(-1, self.layout)
+        point_weights = logits.softmax(dim=-1)
         order = (0, 1, 4, 3, 2, 5)  # (B, N, heads, levels, P, K) -> (B, N, P, levels, heads, K)
         return Samples(
             locations=torch.stack(level_locations, dim=2).unflatten(1, (-1, num_points)),
@@ -316,13 +316,13 @@ class MultiGranularityAttention(PerPointSampling):
         """
         if self.p2p is None:
             return points
+        value = points
         query = points + code
         key = query
-        value = points
         # Differs from the poster, whose later layers attend to the previous points alone.
         if before.points is not None:
-            key = torch.cat([before.points + before.point_code, key], dim=2)  # (B, N, 2 P, C)
-            value = torch.cat([before.points, value], dim=2)
+            value = torch.cat([before.points, value], dim=2)  # (B, N, 2 P, C)
+            key = torch.cat([before.points + before.point_code, key], dim=2)
         updated = self.p2p(
             points.flatten(0, 1),
             query=query.flatten(0, 1),
