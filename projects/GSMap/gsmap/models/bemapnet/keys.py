@@ -34,7 +34,7 @@ def _path_rules(path: str, release_path: str, number: int, levels: Sequence[int]
         number: Number of the path in the names of the release's weights.
         levels: Levels in the order of the path.
     """
-    rules = []
+    rules: list[tuple[str, str]] = []
     for i, level in enumerate(levels):
         theirs = f"{_NECK}{{i}}."
         ours = f"img_neck.rounds.{{i}}.{path}.{i}."
@@ -45,7 +45,7 @@ def _path_rules(path: str, release_path: str, number: int, levels: Sequence[int]
 
 def _projection_rules() -> Rules:
     """Return the rules of the projections, whose convolutions the release nests deeper."""
-    rules = []
+    rules: list[tuple[str, str]] = []
     for theirs, ours in _PROJECTIONS.items():
         rules.append((f"{_NECK}0.{theirs}0.conv.", f"img_neck.{ours}0."))
         rules.append((f"{_NECK}0.{theirs}1.", f"img_neck.{ours}1."))

@@ -15,7 +15,7 @@ _ACTIVATION = (TRANSFORMER + "decoder.ins_conv.", "map_head.decoder.mask_net.")
 
 def _gate_rules() -> Rules:
     """Return the rules of the gates of all blocks."""
-    rules = []
+    rules: list[tuple[str, str]] = []
     for theirs, ours in _BLOCKS:
         rules += rules_of(theirs, ours, names="ca.fc.=gates.channel. sa.conv1.=gates.space.")
     return tuple(rules)
