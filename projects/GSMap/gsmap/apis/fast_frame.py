@@ -44,7 +44,7 @@ def reason_against(model: Any) -> str:
         return "it remembers earlier frames (temporal)"
     if head.not_exported:
         return f"{type(head).__name__} has no fixed number of operations ({head.not_exported})"
-    if not hasattr(model.data_preprocessor, "normalised"):
+    if not hasattr(model.data_preprocessor, "normalise"):
         return "its data_preprocessor is not MapDataPreprocessor"
     return ""
 
@@ -85,7 +85,7 @@ class StaticFrame(nn.Module):
             The fields of ``layout`` side by side, in float32. (B, M, F)
         """
         model = self.model
-        images = model.data_preprocessor.normalised(images)
+        images = model.data_preprocessor.normalise(images)
         feats = model.extract_img_feats(images)
         given = dict(zip(self.names, calibration, strict=True))
         shape = (images.shape[-2], images.shape[-1])
@@ -168,7 +168,7 @@ class FastFrames:
         if any(sample.metainfo.get("image_steps") for sample in samples):
             preprocessor = self.frame.model.data_preprocessor
             pixels = torch.stack(uploaded(images, self.device))
-            images = preprocessor.finished(pixels, samples)
+            images = preprocessor.run_noted_steps(pixels, samples)
         else:
             images = torch.stack(list(images))
         self._add_shapes(batch, (images.shape[-2], images.shape[-1]))

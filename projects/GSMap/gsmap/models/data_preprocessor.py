@@ -1,4 +1,4 @@
-"""From what the data pipeline packs to what the detector takes: a whole batch at once."""
+"""Data preprocessor: from packed samples to the inputs of the detector, a batch at once."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -15,47 +15,52 @@ from gsmap.structures.tensors import uploaded
 
 @MODELS.register_module()
 class MapDataPreprocessor(Det3DDataPreprocessor):
-    """mmdet3d's `Det3DDataPreprocessor`, whose arguments and results it has, for cameras in a ring.
+    """`Det3DDataPreprocessor` of mmdet3d for samples of several cameras.
 
-    What a batch consists of goes to a GPU without a wait for it, ground truths as one block of
-    memory. Images of one size are turned to the network's channels, normalised and padded together.
+    Arguments and results are those of the base class. All tensors of a batch are copied to a GPU
+    without synchronisation, ground truths as one block of memory. Images of equal size are
+    converted, normalised and padded as one tensor.
     """
 
     def cast_data(self, data: Any) -> Any:
-        """Return nested data with its tensors on the device."""
-        found = list(_tensors(data))
-        if self.device.type == "cpu" or not any(each.device.type == "cpu" for each in found):
+        """Copy the tensors of nested data to the device."""
+        tensors = list(_tensors(data))
+        some_on_host = any(tensor.device.type == "cpu" for tensor in tensors)
+        if self.device.type == "cpu" or not some_on_host:
             return super().cast_data(data)
-        moved = uploaded(found, self.device)
-        return _replaced(data, {id(old): new for old, new in zip(found, moved, strict=True)})
+        replacements = {}
+        for tensor, copy in zip(tensors, uploaded(tensors, self.device), strict=True):
+            replacements[id(tensor)] = copy
+        return _replace_tensors(data, replacements)
 
     def collate_data(self, data: dict[str, Any]) -> dict[str, Any]:
-        """Move a batch to the device and make one tensor ``imgs`` (B, V, 3, H, W) of its images."""
+        """Copy a batch to the device and stack its images as ``imgs`` (B, V, 3, H, W)."""
         images = data["inputs"].get("img")
-        if not _of_one_size(images):  # each on its own, padded to the largest
-            return super().collate_data(data)
+        if not _have_one_size(images):
+            return super().collate_data(data)  # pads each image to the largest one
         data = self.cast_data(data)
-        imgs = self.finished(torch.stack(data["inputs"]["img"]), data.get("data_samples") or ())
-        data["inputs"]["imgs"] = self.normalised(imgs)
+        imgs = torch.stack(data["inputs"]["img"])
+        imgs = self.run_noted_steps(imgs, data.get("data_samples") or ())
+        data["inputs"]["imgs"] = self.normalise(imgs)
         data.setdefault("data_samples", None)
         return data
 
     @staticmethod
-    def finished(images: Tensor, samples: Sequence[Any]) -> Tensor:
-        """Take the steps that the pipeline has noted for the device (`image_steps`).
+    def run_noted_steps(images: Tensor, samples: Sequence[Any]) -> Tensor:
+        """Run the steps that the pipeline has deferred to the device (`image_steps`).
 
         Args:
-            images: Pixels as they were packed. (B, V, 3, H, W)
-            samples: The samples.
+            images: Packed pixels. (B, V, 3, H, W)
+            samples: The samples, with the steps in their metainfo.
 
         Returns:
-            The images that the published pipelines pack. (B, V, 3, H', W')
+            Images as packed by the published pipelines. (B, V, 3, H', W')
         """
         steps = [sample.metainfo.get("image_steps") or () for sample in samples]
         return take_noted_steps(images, steps) if any(steps) else images
 
-    def normalised(self, images: Tensor) -> Tensor:
-        """Turn pixel values to the network's input. (..., 3, H, W) -> (..., 3, H', W') float32"""
+    def normalise(self, images: Tensor) -> Tensor:
+        """Convert the channels, normalise and pad. (..., 3, H, W) -> (..., 3, H', W') float32"""
         if self._channel_conversion:
             images = images.flip(-3)
         images = images.float()
@@ -70,10 +75,10 @@ class MapDataPreprocessor(Det3DDataPreprocessor):
 
 
 def take_noted_steps(images: Tensor, steps: Sequence[Sequence[Any]]) -> Tensor:
-    """Take the noted steps of a batch on its device.
+    """Run deferred steps on the device of the images.
 
     Args:
-        images: Pixels as they were packed. (B, V, 3, H, W)
+        images: Packed pixels. (B, V, 3, H, W)
         steps: Steps of each sample, in their order (`gsmap.datasets.transforms.image_steps`).
 
     Returns:
@@ -81,22 +86,34 @@ def take_noted_steps(images: Tensor, steps: Sequence[Sequence[Any]]) -> Tensor:
     """
     if not any(steps):
         return images
-    batch = images.shape[:2]
-    together = []
-    for each in zip(*steps, strict=False):
-        step = each[0].joined(each[1:])
-        if step is None or len({len(own) for own in steps}) > 1:
-            alone = [take_noted_steps(images[i : i + 1], [own]) for i, own in enumerate(steps)]
-            return torch.cat(alone)
-        together.append(step)
+    batch_shape = images.shape[:2]
+    batch_steps = _join_steps(steps)
+    if batch_steps is None:
+        samples = []
+        for index, sample_steps in enumerate(steps):
+            samples.append(take_noted_steps(images[index : index + 1], [sample_steps]))
+        return torch.cat(samples)
     images = images.flatten(0, 1)
-    for step in together:
+    for step in batch_steps:
         images = step.on_device(images)
-    return images.unflatten(0, batch)
+    return images.unflatten(0, batch_shape)
 
 
-def _of_one_size(images: Any) -> bool:
-    """Return whether images are a list of samples' cameras (V, 3, H, W), all of one shape."""
+def _join_steps(steps: Sequence[Sequence[Any]]) -> list[Any] | None:
+    """Join the steps of all samples to steps of the batch; None if they do not fit together."""
+    if len({len(sample_steps) for sample_steps in steps}) > 1:
+        return None
+    joined = []
+    for first, *others in zip(*steps, strict=True):
+        step = first.joined(others)
+        if step is None:
+            return None
+        joined.append(step)
+    return joined
+
+
+def _have_one_size(images: Any) -> bool:
+    """Whether images are a list of tensors (V, 3, H, W), one per sample, of one shape and type."""
     if not isinstance(images, Sequence) or not all(isinstance(each, Tensor) for each in images):
         return False
     kinds = {(each.shape, each.dtype) for each in images}
@@ -115,17 +132,20 @@ def _tensors(data: Any) -> Iterator[Tensor]:
             yield from _tensors(value)
 
 
-def _replaced(data: Any, moved: Mapping[int, Tensor]) -> Any:
-    """Return a copy of nested data with other tensors, by the ``id`` of the old ones."""
+def _replace_tensors(data: Any, replacements: Mapping[int, Tensor]) -> Any:
+    """Copy nested data, with each tensor replaced by the one for its ``id``."""
     if isinstance(data, Tensor):
-        return moved[id(data)]
-    if isinstance(data, BaseDataElement):
-        return data.new(**{name: _replaced(value, moved) for name, value in data.items()})
-    if isinstance(data, Mapping):
-        return {name: _replaced(value, moved) for name, value in data.items()}
-    if isinstance(data, list):
-        return [_replaced(value, moved) for value in data]
-    if isinstance(data, tuple):
-        parts = (_replaced(value, moved) for value in data)
-        return type(data)(*parts) if hasattr(data, "_fields") else tuple(parts)
+        return replacements[id(data)]
+    if isinstance(data, BaseDataElement | Mapping):
+        values = {}
+        for name, value in data.items():
+            values[name] = _replace_tensors(value, replacements)
+        return data.new(**values) if isinstance(data, BaseDataElement) else values
+    if isinstance(data, list | tuple):
+        items = []
+        for item in data:
+            items.append(_replace_tensors(item, replacements))
+        if isinstance(data, list):
+            return items
+        return type(data)._make(items) if hasattr(data, "_make") else tuple(items)
     return data

@@ -1,4 +1,4 @@
-"""The detector: cameras (and LiDAR) to BEV features to map elements."""
+"""The detector: from images and LiDAR over BEV features to map elements."""
 
 import logging
 from collections.abc import Sequence
@@ -30,37 +30,38 @@ Samples = Sequence[Det3DDataSample]
 
 @MODELS.register_module()
 class MapDetector(Base3DDetector):
-    """Image backbone and neck, BEV encoder, map head; with LiDAR, its encoder and their fusion.
+    """Detector of map elements: image backbone and neck, BEV encoder and head.
 
-    Parts are configs; a part that a model does not have is None.
+    A model with LiDAR also has a LiDAR encoder, and with both sensors a fusion of their BEV
+    features. Modules are given as configs, or as None if the model does not have them.
 
     Args:
-        grid: The map: ``x_range`` and ``y_range`` in metres, optionally ``forward``; it reaches
-            encoders, head, masks and coder from here.
+        grid: Extent of the map: ``x_range`` and ``y_range`` in metres, optionally ``forward``.
+            Encoders, head, masks and coder receive it.
         classes: Names of the classes.
-        map_head: The head.
-        bev_encoder: The cameras' BEV encoder, on backbone and neck.
-        img_backbone: The image backbone.
-        img_neck: The image neck.
-        img_augment: An augmentation of the normalised images in training (GridMask).
-        lidar_encoder: The LiDAR's BEV encoder.
-        bev_fuser: The fusion of both, with cameras and LiDAR.
-        temporal: Settings of `StreamMemory`, for a model that remembers earlier frames.
-        fold_batch_norms: Whether the image backbone runs without gradients as a copy whose batch
-            norms are folded into its convolutions (faster, for a second copy of its weights).
-        allow_untrained: Whether a checkpoint may lack the parts that start without effect, as
-            MapTR's lack GSMap's Gaussians: so a training may start, and nothing else does unless it
-            is asked. Other weights must all be there, by our names or upstream's, and no further.
-        autocast: ``"bfloat16"`` lets backbone, neck and encoders compute in it in training, where
-            nearly all arithmetic is; head, matching and losses stay in float32. It needs no loss
-            scale. None leaves training as it is (``--amp`` then casts the head, too).
-        compiled: Compile backbone, neck, encoders and head once a training starts, which takes a
-            minute or more. True, or a mode of ``torch.compile``: with ``"reduce-overhead"`` what is
-            compiled is also captured in CUDA graphs.
+        map_head: Head.
+        bev_encoder: BEV encoder of the cameras.
+        img_backbone: Image backbone.
+        img_neck: Image neck.
+        img_augment: Augmentation of the normalised images in training, such as GridMask.
+        lidar_encoder: BEV encoder of the LiDAR.
+        bev_fuser: Fusion of the BEV features of cameras and LiDAR.
+        temporal: Settings of `StreamMemory`, for a model with memory of earlier frames.
+        fold_batch_norms: Run the image backbone without gradients as a copy whose batch norms are
+            folded into its convolutions. It is faster and needs a second copy of the weights.
+        allow_untrained: Accept checkpoints without the weights of modules that start without
+            effect, such as GSMap's Gaussians in a checkpoint of MapTR. Trainings accept them.
+            Everything else does so on request only. All other weights must be present, under the
+            names here or those of the release, and no further ones.
+        autocast: ``"bfloat16"``: backbone, neck and encoders, which do nearly all arithmetic, use
+            this type in training. Head, matching and losses stay in float32, and no loss scale is
+            needed. None: no autocast here; ``--amp`` then includes the head.
+        compiled: Compile backbone, neck, encoders and head at the start of a training, which takes
+            a minute or more. True, or a mode of ``torch.compile``; ``"reduce-overhead"`` also
+            captures CUDA graphs.
 
     Raises:
-        ValueError: If there is neither camera nor LiDAR, or both but no fusion, or ``autocast`` is
-            another type.
+        ValueError: If there is no encoder, two encoders without a fusion, or another ``autocast``.
     """
 
     compiler: ClassVar[str] = "inductor"  # backend of torch.compile
@@ -87,16 +88,17 @@ class MapDetector(Base3DDetector):
         super().__init__(data_preprocessor=data_preprocessor, init_cfg=init_cfg)
         self.img_backbone = MODELS.build(img_backbone) if img_backbone else None
         self.folded_backbone = FoldedBackbone() if fold_batch_norms else None
-        # channels last is what CPU and tensor-core convolutions are fastest with; mmcv's deformable
-        # convolution takes them for channels first and is silently wrong
-        parts = () if self.img_backbone is None else self.img_backbone.modules()
-        self.channels_last = not any(isinstance(part, ModulatedDeformConv2d) for part in parts)
+        # Convolutions on CPUs and tensor cores are fastest with channels last. mmcv's deformable
+        # convolution reads such tensors as channels first, without an error.
+        modules = () if self.img_backbone is None else self.img_backbone.modules()
+        self.channels_last = not any(isinstance(m, ModulatedDeformConv2d) for m in modules)
         self.loss_check = LossCheck()
-        self.half_backbone: HalfBackbone | None = None  # in place of both, for inference
+        self.half_backbone: HalfBackbone | None = None  # replaces backbone and neck in inference
         self.allow_untrained = allow_untrained
         if autocast not in (None, "bfloat16"):
             raise InputError(f"autocast must be None or 'bfloat16', got {autocast!r}.")
-        self.autocast, self.compiled = autocast, compiled
+        self.autocast = autocast
+        self.compiled = compiled
         self.img_neck = MODELS.build(img_neck) if img_neck else None
         self.img_augment = MODELS.build(img_augment) if img_augment else None
         if not (bev_encoder or lidar_encoder):
@@ -112,14 +114,14 @@ class MapDetector(Base3DDetector):
         self.temporal = None if temporal is None else StreamMemory(self.map_head, **temporal)
 
     def train(self, mode: bool = True) -> "MapDetector":
-        """Switch between training and prediction; the first training compiles what is wanted."""
+        """Set the mode. With ``compiled``, the first training compiles the modules."""
         super().train(mode)
         if mode and self.compiled:
-            chosen = None if self.compiled is True else self.compiled
+            compile_mode = None if self.compiled is True else self.compiled
             parts = (self.img_backbone, self.img_neck, self.bev_encoder, self.lidar_encoder)
             for part in (*parts, self.map_head):
                 if part is not None:
-                    part.compile(backend=self.compiler, mode=chosen)
+                    part.compile(backend=self.compiler, mode=compile_mode)
             self.compiled = False  # it is now
         return self
 
@@ -130,23 +132,27 @@ class MapDetector(Base3DDetector):
         images = imgs.flatten(0, 1)
         if self.training and self.img_augment is not None:
             images = self.img_augment(images)
-        folded, backbone = self.folded_backbone, self.img_backbone
         if self.half_backbone is not None and not torch.is_grad_enabled():
-            halved = self.half_backbone(backbone, self.img_neck, images, self.channels_last)
-            return [feat.unflatten(0, (len(imgs), -1)) for feat in halved]
+            maps = self.half_backbone(
+                self.img_backbone, self.img_neck, images=images, channels_last=self.channels_last
+            )
+            return [feat.unflatten(0, (len(imgs), -1)) for feat in maps]
         if self.channels_last:
             images = images.contiguous(memory_format=torch.channels_last)
-        feats = backbone(images) if folded is None else folded(backbone, images)
+        if self.folded_backbone is None:
+            feats = self.img_backbone(images)
+        else:
+            feats = self.folded_backbone(self.img_backbone, images)
         if self.img_neck is not None:
             feats = self.img_neck(feats)
         return [feat.unflatten(0, (len(imgs), -1)) for feat in feats]
 
     def halve_backbone(self) -> None:
-        """Let inference run image backbone and neck in float16 (`HalfBackbone`)."""
+        """Run image backbone and neck in float16 in inference (`HalfBackbone`)."""
         self.half_backbone = HalfBackbone()
 
     def extract_feat(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
-        """Return the BEV encoder's outputs: ``bev_feats`` (B, C, H, W) and what its losses need."""
+        """Outputs of the BEV encoder: ``bev_feats`` (B, C, H, W), and the inputs of its losses."""
         if not (self.training and self.autocast):
             return self._encode(batch_inputs, batch_data_samples)
         device = next(self.parameters()).device.type
@@ -155,7 +161,7 @@ class MapDetector(Base3DDetector):
         return tree_map_only(Tensor, _in_float32, outputs)
 
     def _encode(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
-        """Do what `extract_feat` does, in whatever types hold."""
+        """Outputs of the BEV encoder, in the types of the autocast context."""
         outputs: dict[str, Tensor] = {}
         if self.bev_encoder is not None:
             imgs = batch_inputs["imgs"]
@@ -172,15 +178,22 @@ class MapDetector(Base3DDetector):
     def over_time(
         self, outputs: dict[str, Any], batch_data_samples: Samples
     ) -> AbstractContextManager[BatchMemory]:
-        """Return a context in which a batch has its memory, if the model has any."""
+        """Context of a batch with its memory, or without if the model has none."""
         if self.temporal is None:
             return nullcontext(BatchMemory(outputs))
-        return self.temporal.remember_batch(
-            outputs, [sample.metainfo for sample in batch_data_samples]
-        )
+        metas = [sample.metainfo for sample in batch_data_samples]
+        return self.temporal.remember_batch(outputs, metas)
 
     def loss(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
-        """Return all losses as scalars; FloatingPointError if one is not finite (`LossCheck`)."""
+        """All losses as scalars, by name.
+
+        Args:
+            batch_inputs: Inputs of the batch: ``imgs``, ``voxels`` or both.
+            batch_data_samples: Samples with ground truth.
+
+        Raises:
+            FloatingPointError: If a loss is not finite (`LossCheck`).
+        """
         outputs = self.extract_feat(batch_inputs, batch_data_samples)
         with self.over_time(outputs, batch_data_samples) as batch:
             losses = self.map_head.loss(batch.outputs, batch_data_samples, **batch.hooks)
@@ -190,12 +203,16 @@ class MapDetector(Base3DDetector):
         return losses
 
     def parse_losses(self, losses: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the sum of what is named a loss, and all figures of a step, that sum first."""
+        """Sum the values whose name contains "loss".
+
+        Returns:
+            The sum; and all values by name for the log, with the sum first.
+        """
         total = torch.stack([value for name, value in losses.items() if "loss" in name]).sum()
         return total, {"loss": total, **losses}
 
     def predict(self, batch_inputs: Inputs, batch_data_samples: Samples) -> list[Det3DDataSample]:
-        """Add ``pred_instances_3d``, as the head's ``predict`` returns them, to the samples."""
+        """Predict, and add the result of the head as ``pred_instances_3d`` to the samples."""
         outputs = self.extract_feat(batch_inputs, batch_data_samples)
         with self.over_time(outputs, batch_data_samples) as batch:
             results = self.map_head.predict(batch.outputs, batch_data_samples, **batch.hooks)
@@ -204,13 +221,13 @@ class MapDetector(Base3DDetector):
         return self.add_pred_to_datasample(batch_data_samples, results)
 
     def _forward(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
-        """Return the head's raw outputs."""
+        """Raw outputs of the head."""
         outputs = self.extract_feat(batch_inputs, batch_data_samples)
         with self.over_time(outputs, batch_data_samples) as batch:
             return self.map_head(batch.outputs, **batch.hooks)
 
     def _dump_init_info(self) -> None:
-        """Log how each weight was initialised, which takes hundreds of lines, to debug only."""
+        """Log the initialisation of each weight, hundreds of lines, at debug level only."""
         handlers = MMLogger.get_current_instance().handlers
         if min(handler.level for handler in handlers) <= logging.DEBUG:
             super()._dump_init_info()
@@ -218,13 +235,14 @@ class MapDetector(Base3DDetector):
     def _load_from_state_dict(
         self, state_dict: dict[str, Tensor], prefix: str, *args: Any, **kwargs: Any
     ) -> None:
-        """Accept upstream's names too; ValueError if a key is missing or matches none."""
-        own, neutral = self.state_dict(prefix=prefix), neutral_keys(self, prefix)
+        """Load weights under the names here or those of a release; see `adapt_state`."""
+        expected = self.state_dict(prefix=prefix)
+        neutral = neutral_keys(self, prefix)
         fit = partial(self.map_head.fit_state, prefix=f"{prefix}map_head.")
-        adapt_state(state_dict, own, prefix, neutral, fit, self.allow_untrained)
+        adapt_state(state_dict, expected, prefix, neutral, fit, self.allow_untrained)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
 
 def _in_float32(values: Tensor) -> Tensor:
-    """Return half-precision features in float32."""
+    """Convert half-precision features to float32."""
     return at_least_float32(values) if values.is_floating_point() else values

@@ -1,4 +1,4 @@
-"""Whether the losses of a step are finite."""
+"""Check that the losses of a step are finite."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -11,44 +11,47 @@ from gsmap.utils.errors import NotFiniteError
 
 
 class LossCheck:
-    """End a run whose losses are not finite: at once on a CPU, on a GPU at the next step.
+    """Raises an error if losses are not finite: at once on a CPU, in the next step on a GPU.
 
-    There the answer takes its way to the host while the step goes on; `finish` waits for it. A copy
-    of a check has nothing to finish.
+    On a GPU the result is copied to the host while the step continues, and `finish` waits for it.
+    A copy of the object has no pending check.
     """
 
     def __init__(self) -> None:
-        self._open: tuple[LateValues, list[str], list[Any]] | None = None
+        self._pending: tuple[LateValues, list[str], list[Any]] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"_open": None}
+        return {"_pending": None}
 
     def start(self, losses: Mapping[str, Tensor], tokens: Sequence[Any]) -> None:
-        """Check the losses of a step, once those of the step before are found finite.
+        """Finish the check of the previous step, and start the one of this step.
 
         Args:
             losses: Scalars by name.
-            tokens: Names of the samples, for the message.
+            tokens: Tokens of the samples, for the message.
 
         Raises:
-            FloatingPointError: If one was not, or is not on a CPU, with the losses and samples.
+            FloatingPointError: If a loss of the previous step is not finite; on a CPU also if one
+                of this step is not. The message names losses and samples.
         """
         self.finish()
         values = torch.stack([loss.detach().float().reshape(()) for loss in losses.values()])
-        self._open = LateValues(values.isfinite()), list(losses), list(tokens)
+        self._pending = (LateValues(values.isfinite()), list(losses), list(tokens))
         if values.device.type == "cpu":
             self.finish()
 
     def finish(self) -> None:
-        """Wait for the answer of the latest check, if it is not known yet.
+        """Wait for the result of a pending check.
 
         Raises:
             FloatingPointError: If a loss is not finite.
         """
-        if self._open is None:
+        if self._pending is None:
             return
-        (finite, names, tokens), self._open = self._open, None
-        bad = [name for name, good in zip(names, finite.read().tolist(), strict=True) if not good]
+        result, names, tokens = self._pending
+        self._pending = None
+        is_finite = dict(zip(names, result.read().tolist(), strict=True))
+        bad = [name for name in names if not is_finite[name]]
         if bad:
             raise NotFiniteError(
                 f"losses {bad} are not finite; samples {tokens}: look at their images and ground "
