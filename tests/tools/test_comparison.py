@@ -2,6 +2,8 @@
 
 import json
 import os
+import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -227,3 +229,23 @@ def test_rules_of_both_metrics_may_change(minicity_annotations):
     assert raster.grid.y_range == (-30.0, 30.0)
     with pytest.raises(ValueError, match=r"no metric has the setting \['threshold'\]"):
         evaluator_for(path, {"threshold": 1})
+
+
+class PrintingRun(Run):
+    """A run whose training prints two errors and fails."""
+
+    def commands(self) -> dict[str, list[str]]:
+        program = "print('error: the cause'); print('error: of a peer'); raise SystemExit(2)"
+        return {"train": [sys.executable, "-c", program], "test": []}
+
+
+def test_a_run_that_fails_says_the_first_error_of_this_attempt(tmp_path):
+    run = PrintingRun("a", 0, tmp_path / "a", "a.py", (), 1, 1, 1, {})
+    run.folder.mkdir()
+    (run.folder / "train.log").write_text("error: of an attempt before\n")
+    job = Job(run, None)
+    while not job.ended():
+        time.sleep(0.01)
+    record = json.loads((run.folder / "run.json").read_text())
+    assert record["state"] == "train ended with exit code 2 (train.log: error: the cause)"
+    assert record["peak_mib"] > 0

@@ -1,11 +1,11 @@
-"""Runs of a comparison under way: their processes, their end, and how far the whole is."""
+"""Runs of a comparison under way: their processes, how they end, and the progress of all."""
 
 import json
 import os
 import re
 import shlex
-import socket
 import subprocess
+import sys
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -22,7 +22,7 @@ from gsmap.utils.parallel import die_with_parent
 from gsmap.utils.progress import Progress
 
 _PAUSE_S = 2.0  # between two looks at the runs
-_SAID = 200  # characters of a failed run's last line
+_SAID = 200  # characters of a failed run's error
 
 
 def devices() -> list[str | None]:
@@ -41,11 +41,11 @@ def machine() -> str:
 
 
 class Job:
-    """A run under way on one device: its processes, which die with this one.
+    """A run under way on one device: a process, which dies with this one.
 
     Args:
         run: The run; its folder is locked while the job lives.
-        device: GPU that it has; None for the CPU.
+        device: GPU for the run; None for the CPU.
 
     Raises:
         RuntimeError: If another process works in its folder.
@@ -58,68 +58,71 @@ class Job:
         self._lock = lock_folder(run.folder, ".lock", "wait for its end")
         write_text(run.folder / SETTINGS, json.dumps(plain(run.settings), indent=1))
         self.record: dict[str, Any] = {"machine": machine(), "load_at_start": os.getloadavg()[0]}
-        self.record |= {k: shlex.join(command) for k, command in run.commands().items()}
+        for stage, command in run.commands().items():
+            self.record[stage] = shlex.join(command)
         self._peak_mib = 0
         self.stage = "test" if run.trained else "train"
         self._start()
 
+    @property
+    def _log(self) -> Path:
+        """File with the output of the stage."""
+        return self.run.folder / f"{self.stage}.log"
+
     def _start(self) -> None:
-        """Start the processes of a stage."""
-        count = self.run.processes if self.stage == "train" else 1
-        environment = {**os.environ, "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "1")}
-        if self.device is not None:
-            environment = {**os.environ, "CUDA_VISIBLE_DEVICES": self.device}
-        if count > 1:
-            with socket.socket() as probe:
-                probe.bind(("127.0.0.1", 0))
-                port = str(probe.getsockname()[1])
-            environment |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
-            environment["WORLD_SIZE"] = str(count)
-        command = self.run.commands()[self.stage]
-        with open_to_append(self.run.folder / f"{self.stage}.log") as log:
-            self._processes = [
-                subprocess.Popen(
-                    command,
-                    env=environment | {"RANK": str(rank), "LOCAL_RANK": str(rank)}
-                    if count > 1
-                    else environment,
-                    stdout=log,
-                    stderr=subprocess.STDOUT,
-                    preexec_fn=partial(die_with_parent, os.getpid()),
-                )
-                for rank in range(count)
-            ]
+        """Start the process of a stage."""
+        environment = {**os.environ, "PYTHON": sys.executable}  # for the script of several ranks
+        if self.device is None:
+            environment.setdefault("OMP_NUM_THREADS", "1")
+        else:
+            environment["CUDA_VISIBLE_DEVICES"] = self.device
+        with open_to_append(self._log) as log:
+            self._begin = log.seek(0, os.SEEK_END)  # an attempt that was killed may stand before
+            self._process = subprocess.Popen(
+                self.run.commands()[self.stage],
+                env=environment,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                preexec_fn=partial(die_with_parent, os.getpid()),
+            )
 
     def ended(self) -> bool:
-        """Look at the processes, go on to the test after training, and note how the run ends."""
-        for process in self._processes:
-            if process.returncode is None:
-                pid, status, usage = os.wait4(process.pid, os.WNOHANG)
-                if pid:
-                    process.returncode = os.waitstatus_to_exitcode(status)
-                    self._peak_mib = max(self._peak_mib, usage.ru_maxrss // 1024)
-        codes = [process.returncode for process in self._processes]
-        failed = [code for code in codes if code]
-        if not failed and None in codes:
+        """Look at the process, go on to the test after training, and note how the run ends."""
+        if not self._has_ended():
             return False
-        if failed:
-            last = (self.run.folder / f"{self.stage}.log").read_text().splitlines()[-1:]
-            said = " ".join(last)[:_SAID]
-            self.end(f"{self.stage} ended with exit code {failed[0]} ({self.stage}.log: {said})")
-        elif self.stage == "train":
+        code = self._process.returncode
+        if code != 0:
+            self.end(f"{self.stage} ended with exit code {code} ({self._log.name}: {self._said()})")
+            return True
+        if self.stage == "train":
             self.stage = "test"
             self._start()
             return False
-        else:
-            self.end("done")
+        self.end("done")
         return True
 
+    def _has_ended(self) -> bool:
+        """Whether the process has ended; the most memory of it, a rank or a worker is noted."""
+        pid, status, usage = os.wait4(self._process.pid, os.WNOHANG)
+        if pid == 0:
+            return False
+        self._process.returncode = os.waitstatus_to_exitcode(status)
+        self._peak_mib = max(self._peak_mib, usage.ru_maxrss // 1024)
+        return True
+
+    def _said(self) -> str:
+        """First error in the output of the stage, which is the cause of later ones; or its end."""
+        text = self._log.read_bytes()[self._begin :].decode(errors="replace")
+        lines = text.splitlines()
+        errors = [line for line in lines if line.startswith("error: ")]
+        found = errors[:1] or lines[-1:]
+        return " ".join(found)[:_SAID]
+
     def end(self, state: str) -> None:
-        """Stop what still runs, note the run's end and free its folder."""
-        for process in self._processes:
-            if process.returncode is None:
-                process.kill()
-                process.wait()
+        """Stop the process if it still runs, note the run's end and free its folder."""
+        if self._process.returncode is None:
+            self._process.kill()
+            self._process.wait()
         self.record |= {"state": state, "load_at_end": os.getloadavg()[0]}
         self.record["peak_mib"] = self._peak_mib
         write_text(self.run.folder / RECORD, json.dumps(self.record, indent=1))
@@ -127,32 +130,35 @@ class Job:
 
 
 def execute(runs: Sequence[Run]) -> Iterator[tuple[Run, str]]:
-    """Train and test the runs that are not done, one a device, and show how far all are.
+    """Train and test the runs that are not done, one after another on each device.
 
     Args:
         runs: From `plan`.
 
     Yields:
-        Each run with its state, as it ends: ``done``, or what went wrong.
+        Each run with its state, as it ends: ``done``, or the fault.
     """
     waiting = deque(run for run in runs if not run.done)
-    free, jobs = devices(), list[Job]()
-    before, total = sum(run.position for run in runs), sum(run.iterations for run in runs)
+    jobs: dict[str | None, Job] = {}
+    places = devices()
+    initial = sum(run.position for run in runs)
+    total = sum(run.iterations for run in runs)
     options = {"unit": "iterations", "smoothing": 0, "disable": not waiting}
-    with Progress(initial=before, total=total, **options) as bar:
+    with Progress(initial=initial, total=total, **options) as bar:
         try:
             while waiting or jobs:
-                while waiting and free:
-                    jobs.append(Job(waiting.popleft(), free.pop(0)))
-                for job in [job for job in jobs if job.ended()]:
-                    jobs.remove(job)
-                    free.append(job.device)
-                    yield job.run, job.record["state"]
-                stages = [f"{job.run.label} {job.stage}s" for job in jobs]
+                for device in places:
+                    if device not in jobs and waiting:
+                        jobs[device] = Job(waiting.popleft(), device)
+                for job in list(jobs.values()):
+                    if job.ended():
+                        del jobs[job.device]
+                        yield job.run, job.record["state"]
+                stages = [f"{job.run.label} {job.stage}s" for job in jobs.values()]
                 done = f"{sum(run.done for run in runs)} of {len(runs)} runs done"
                 bar.set_description(", ".join([done, *stages]), refresh=False)
                 bar.update(sum(run.position for run in runs) - bar.n)
                 time.sleep(_PAUSE_S if jobs else 0)
         finally:
-            for job in jobs:
+            for job in jobs.values():
                 job.end("cut off")

@@ -131,15 +131,22 @@ class Run:
 
     def commands(self) -> dict[str, list[str]]:
         """Return the commands that train and test it."""
-        test = ["--work-dir", str(self.folder / "test"), "--out", str(self.folder / "results.json")]
+        train = [str(shipped("tools/train.py")), self.config]
+        train += ["--work-dir", str(self.folder), "--resume"]
+        python = [sys.executable, "-u"]
+        launcher = python
+        if self.processes > 1:  # torchrun chooses a free port itself if it stands alone
+            launcher = [str(shipped("tools/dist_run.sh")), str(self.processes)]
+            launcher += ["--standalone", "--local_addr=127.0.0.1"]
+            train += ["--launcher", "pytorch"]
+        test = [str(shipped("tools/test.py")), self.config, str(self.checkpoint)]
+        test += ["--work-dir", str(self.folder / "test")]
+        test += ["--out", str(self.folder / "results.json")]
         test += ["--metrics-out", str(self.folder / "metrics.json")]
-        train = ["--work-dir", str(self.folder), "--resume"]
-        train += ["--launcher", "pytorch"] if self.processes > 1 else []
-        options, python = ["--cfg-options", *self.options], [sys.executable, "-u"]
-        words = {"train": [*train, *options], "test": [str(self.checkpoint), *test, *options]}
+        options = ["--cfg-options", *self.options]
         return {
-            stage: [*python, str(shipped(f"tools/{stage}.py")), self.config, *own]
-            for stage, own in words.items()
+            "train": [*launcher, *train, *options],
+            "test": [*python, *test, *options],
         }
 
 
