@@ -12,6 +12,7 @@ from typing import TypeVar
 
 import torch
 
+from gsmap.utils.errors import WorkError
 from gsmap.utils.parallel import ordered_map
 
 Result = TypeVar("Result")
@@ -94,7 +95,7 @@ def _peak_bytes(function: Callable[[], object], device: torch.device) -> int:
         function()
         return torch.cuda.max_memory_allocated(device) - before
     if platform.system() != "Linux":
-        raise RuntimeError("Peak memory on the CPU is read from /proc, which only Linux has.")
+        raise WorkError("Peak memory on the CPU is read from /proc, which only Linux has.")
     libc = ctypes.CDLL(None)
     libc.mallopt(M_MMAP_THRESHOLD, 64 * 1024)  # tensors go back to the system when they are freed,
     libc.malloc_trim(0)  # as memory kept for reuse would hide the next use or add to it
@@ -110,7 +111,7 @@ def _status_bytes(field: str) -> int:
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith(field + ":"):
             return int(line.split()[1]) * 1024
-    raise RuntimeError(f"/proc/self/status has no {field}.")
+    raise WorkError(f"/proc/self/status has no {field}.")
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

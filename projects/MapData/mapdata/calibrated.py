@@ -11,6 +11,7 @@ import numpy as np
 from gsmap.datasets.annotations.record import AnnotationMeta, MapSample
 from gsmap.datasets.errors import naming
 from gsmap.datasets.source import Mount, ground_from_frame, reframed
+from gsmap.utils.errors import InputError
 from mapdata.folders.images import read_vehicle
 from mapdata.folders.rig import RigCamera, RigFrame, rig_samples
 
@@ -57,10 +58,10 @@ def calibrated_records(
             frame = _rig_frame(record, by_name, file)
             given_pose = record.get(_POSE)
             if pose_at is not None and given_pose is not None:
-                raise ValueError(f"{_POSE} is given, and {file} has poses, too: leave out one.")
+                raise InputError(f"{_POSE} is given, and {file} has poses, too: leave out one.")
             samples = rig_samples(str(record.get("scene") or ""), rig, [frame], pose_at)
             if not samples:
-                raise ValueError(f"{file} has no pose near timestamp_ns {frame.time_ns}.")
+                raise InputError(f"{file} has no pose near timestamp_ns {frame.time_ns}.")
             sample = _in_frame(samples[0], record, meta)
             completed = {**record, "ego_from_frame": sample.ego_from_frame}
             if pose_at is not None:
@@ -80,7 +81,7 @@ def _require_keys(camera: Mapping[str, Any], file: Path) -> None:
     """Refuse keys of a camera that the calibration file defines."""
     others = sorted(set(camera) - _KEYS)
     if others:
-        raise ValueError(
+        raise InputError(
             f"camera {camera.get('name')!r} has {others}: beside a calibration file it may have "
             f"{sorted(_KEYS)}, and the others come from {file}."
         )
@@ -100,7 +101,7 @@ def _rig_frame(record: Mapping[str, Any], by_name: Mapping[str, RigCamera], file
     for camera in record["cameras"]:
         name = str(camera["name"])
         if name not in by_name:
-            raise ValueError(f"camera {name!r} is not in {file}, which has {sorted(by_name)}.")
+            raise InputError(f"camera {name!r} is not in {file}, which has {sorted(by_name)}.")
         images[name] = (str(camera["path"]), _time_of(camera, record))
     time_ns = int(record.get("timestamp_ns") or 0)
     return RigFrame(str(record["token"]), time_ns, images)

@@ -2,6 +2,8 @@
 
 from mmengine.config import Config
 
+from gsmap.utils.errors import InputError
+
 LOG_LINES = 10  # of the losses of a run
 WARM_UP = 20  # iterations
 
@@ -24,16 +26,16 @@ def overfit(cfg: Config, samples: int, iterations: int) -> None:
     """
     for name, number in (("--overfit", samples), ("--overfit-iterations", iterations)):
         if number < 1:
-            raise ValueError(f"{name} must be >= 1, got {number}.")
+            raise InputError(f"{name} must be >= 1, got {number}.")
     loader = cfg.train_dataloader
     if "dataset" in loader.dataset or "datasets" in loader.dataset:
-        raise ValueError(
+        raise InputError(
             f"--overfit: train_dataloader.dataset of {cfg.filename} is a {loader.dataset.type} of "
             "other data sets: name one of these instead."
         )
     sampler = loader.sampler.type
     if sampler != "DefaultSampler":
-        raise ValueError(
+        raise InputError(
             f"--overfit takes samples one by one, but train_dataloader.sampler of {cfg.filename} "
             f"is a {sampler}: take a config of a model without memory."
         )

@@ -3,6 +3,11 @@
 numpy's own functions trust what a pickle tells them: a crafted state turns a dtype into one of
 Python objects, and bytes of the file into pointers. Those below stand in for them under their
 names. They admit numbers, booleans and strings, and sizes that the file has bytes for.
+
+Two readers rebuild numpy's values by these functions. Torch's reader (``weights_only``) reads
+checkpoints (`checkpoints.safe_globals`), as it alone knows how torch stores tensors. It has no
+instructions of the protocols 3 to 5, in which info files are written, so these have a reader of
+their own (`mapdata.infos.plain_pickle`).
 """
 
 import math

@@ -155,6 +155,7 @@ def ordered_map(
         try:
             yield from _in_order(pool, tasks, 3 * workers, timeout_s)
         except BaseException as error:  # the generator's end before its time as well
+            # Python 3.14 has a public `terminate_workers`; before, only this dictionary knows them
             for process in list((pool._processes or {}).values()):
                 process.kill() if isinstance(error, TimeoutError) else process.terminate()
             if isinstance(error, BrokenProcessPool):
