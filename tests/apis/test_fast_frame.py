@@ -98,11 +98,11 @@ def test_training_does_not_use_half_copies(inferencer):
 def test_fused_convolutions_are_those_of_the_blocks(depth, monkeypatch):
     """The operators exist on a GPU alone; here plain ones stand in for them."""
 
-    def plain(x, weight, bias, *geometry):
-        return F.conv2d(x, weight, bias, *geometry).relu()
+    def plain(x, weight, bias, **geometry):
+        return F.conv2d(x, weight, bias, **geometry).relu()
 
-    def plain_add(x, weight, identity, alpha, bias, *geometry):
-        return (F.conv2d(x, weight, bias, *geometry) + alpha * identity).relu()
+    def plain_add(x, weight, z, alpha, bias, **geometry):
+        return (F.conv2d(x, weight, bias, **geometry) + alpha * z).relu()
 
     monkeypatch.setattr(torch, "cudnn_convolution_relu", plain)
     monkeypatch.setattr(torch, "cudnn_convolution_add_relu", plain_add)
