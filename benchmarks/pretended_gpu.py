@@ -15,8 +15,9 @@ import bisect
 import contextlib
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -27,7 +28,6 @@ import torch.utils._foreach_utils as foreach_utils
 import torch.utils.backend_registration as registration
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
-from torch.utils._pytree import tree_leaves, tree_map_only
 
 from gsmap.ops import backends
 from gsmap.ops.deformable_sampling import deformable_sample
@@ -211,7 +211,7 @@ class PretendedGPU(TorchDispatchMode):
 
     def run(self, func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         """Compute an operation on the CPU and count it."""
-        tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
+        tensors = [*_tensors_in(args), *_tensors_in(kwargs.values())]
         on_gpu = any(isinstance(tensor, PretendedTensor) for tensor in tensors)
         target = kwargs.get("device")
         to_gpu = target is not None and torch.device(target).type == NAME
@@ -242,14 +242,15 @@ class PretendedGPU(TorchDispatchMode):
         kwargs = {key: value for key, value in kwargs.items() if key != "pin_memory"}
         if "device" in kwargs:
             kwargs["device"] = torch.device("cpu")
-        inner, options = tree_map_only(PretendedTensor, lambda tensor: tensor.host, (args, kwargs))
+        inner = _on_host(args)
+        options = {key: _on_host(value) for key, value in kwargs.items()}
         if name.startswith("gsmap."):
             result = _by_cpu_kernel(name, inner)
         else:
             result = _OWN_MATHS.get(func, func)(*inner, **options)
         if func in _READS:
             return result
-        result = tree_map_only(Tensor, PretendedTensor, result)
+        result = _on_gpu(result)
         if not on_gpu or name.startswith("gsmap.") or func in _OWN_MATHS:
             return result
         return return_and_correct_aliasing(func, args, kwargs, result)
@@ -320,19 +321,54 @@ class PretendedGPU(TorchDispatchMode):
         self.waits[self._part, reason, _line_of_project()] += 1
 
 
+def _tensors_in(values: Iterable[Any]) -> Iterator[Tensor]:
+    """Yield the tensors among an operation's arguments, which may be lists of tensors."""
+    for value in values:
+        if isinstance(value, Tensor):
+            yield value
+        elif isinstance(value, list | tuple):
+            yield from _tensors_in(value)
+
+
+def _on_host(value: Any) -> Any:
+    """An argument of an operation with each pretended tensor replaced by its values."""
+    if isinstance(value, PretendedTensor):
+        return value.host
+    if isinstance(value, list | tuple):
+        return type(value)(_on_host(item) for item in value)
+    return value
+
+
+def _on_gpu(result: Any) -> Any:
+    """The result of an operation with each tensor on the pretended GPU."""
+    if isinstance(result, Tensor):
+        return PretendedTensor(result)
+    if isinstance(result, list | tuple):
+        return type(result)(_on_gpu(item) for item in result)
+    return result
+
+
 def _line_of_project() -> str:
     """Return the innermost line outside of torch and of this file, as ``file:line``."""
     frame: FrameType | None = sys._getframe(2)
     while frame is not None:
-        path = Path(frame.f_code.co_filename)
-        if path.is_relative_to(ROOT) and "site-packages" not in path.parts:
-            if path != Path(__file__):
-                return f"{path.relative_to(ROOT)}:{frame.f_lineno}"
-        elif any(part.startswith("mm") for part in path.parts):
-            packages = path.parts[path.parts.index("site-packages") + 1 :]
-            return f"{'/'.join(packages)}:{frame.f_lineno}"
+        name = _name_of_file(frame.f_code.co_filename)
+        if name is not None:
+            return f"{name}:{frame.f_lineno}"
         frame = frame.f_back
     return "?"
+
+
+@cache
+def _name_of_file(file: str) -> str | None:
+    """Short name of a file whose lines are waited for; None for those of torch and this one."""
+    path = Path(file)
+    if path.is_relative_to(ROOT) and "site-packages" not in path.parts:
+        return str(path.relative_to(ROOT)) if path != Path(__file__) else None
+    if any(part.startswith("mm") for part in path.parts):
+        packages = path.parts[path.parts.index("site-packages") + 1 :]
+        return "/".join(packages)
+    return None
 
 
 def _num_launches(name: str, args: Any) -> int:

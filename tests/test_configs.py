@@ -144,7 +144,8 @@ def test_one_word_makes_a_gsmap_of_any_config(path):
 def small(cfg: Config) -> Config:
     """Keep a config's structure, with two decoder layers and no weights from elsewhere.
 
-    There are few queries, and cells of the features of the map are twice as wide.
+    There are few queries and channels of the backbone, and cells of the features of the map are
+    twice as wide.
     Images of a fixed size become a quarter as large, others half as large, and with them feature
     maps whose pixels all attend to each other: at full size a step takes gigabytes and minutes.
     """
@@ -153,6 +154,7 @@ def small(cfg: Config) -> Config:
             part.init_cfg = None
             if part.type == "BiFPN":
                 part.size = (6, 14)
+    shrink_backbone(cfg.model)
     head = cfg.model.map_head
     if head.type == "HDMapNetHead":  # before it has learned, every pixel of its maps is a line
         head.pixel_m, cfg.model.bev_encoder.bev_pixel_m = 0.6, 1.2
@@ -168,6 +170,25 @@ def small(cfg: Config) -> Config:
         encoder.num_cams = 6  # MiniCity's
     shrink_images(cfg)
     return cfg
+
+
+def shrink_backbone(model: ConfigDict) -> None:
+    """Divide the channels of ResNets and Swin Transformers by four, and keep all of their stages.
+
+    `benchmarks parameters` and the golden quantities hold the published widths.
+    """
+    backbone = model.get("img_backbone") or {}
+    neck = model.get("img_neck") or {}
+    if "in_channels" not in neck:
+        return
+    if backbone.type == "mmdet.ResNet":
+        backbone.base_channels = backbone.get("base_channels", 64) // 4
+    elif backbone.type == "mmdet.SwinTransformer":
+        backbone.embed_dims //= 4
+        backbone.depths = (2, 2, 2, 2)
+    else:  # its name says its widths
+        return
+    neck.in_channels = [channels // 4 for channels in neck.in_channels]
 
 
 def shrink_queries(model: ConfigDict) -> None:
