@@ -23,43 +23,16 @@ from gsmap.checkpoints.convert import (
     ours_from_upstream,
     upstream_from_ours,
 )
-from gsmap.checkpoints.key_map import find_key_map, key_maps
+from gsmap.checkpoints.key_map import key_maps
 from gsmap.checkpoints.key_rules import KeyMap
 from gsmap.checkpoints.reading import load_weights, read_weights
 from gsmap.checkpoints.strict import AddsWeights, adapt_state, neutral_keys
 from gsmap.models.gsmap.reference import GaussianReference
 from gsmap.models.gsmap.uncertainty import ErrorReference
-from gsmap.models.maptr.keys import MAPTR, MAPTR_BEVFORMER
+from gsmap.models.maptr.keys import MAPTR
 from gsmap.structures.grid import BEVGrid
 
 REPO = Path(__file__).resolve().parents[2]
-LAYER = "pts_bbox_head.transformer.encoder.layers.0."
-PAIRS = {
-    "img_backbone.layer1.0.conv1.weight": "img_backbone.layer1.0.conv1.weight",
-    "pts_bbox_head.transformer.level_embeds": "bev_encoder.level_embeds",
-    "pts_bbox_head.transformer.can_bus_mlp.norm.bias": "bev_encoder.can_bus_mlp.norm.bias",
-    "pts_bbox_head.transformer.decoder.layers.11.attentions.0.attn.in_proj_weight": (
-        "map_head.decoder.layers.11.self_attn.in_proj_weight"
-    ),
-    "pts_bbox_head.transformer.decoder.layers.3.attentions.1.value_proj.bias": (
-        "map_head.decoder.layers.3.cross_attn.value_proj.bias"
-    ),
-    "pts_bbox_head.reg_branches.5.4.weight": "map_head.reference.branches.5.4.weight",
-    LAYER + "attentions.1.output_proj.weight": "bev_encoder.layers.0.cross_attn.output_proj.weight",
-}
-
-
-@pytest.mark.parametrize(("upstream", "ours"), PAIRS.items())
-def test_names_by_hand_in_both_directions(upstream, ours):
-    assert MAPTR.to_ours(upstream) == ours
-    assert MAPTR.to_upstream(ours) == upstream
-
-
-def test_the_architecture_is_found_by_its_keys():
-    deformable = LAYER + "attentions.1.deformable_attention.sampling_offsets.bias"
-    assert find_key_map([deformable, "img_neck.x"]) is MAPTR_BEVFORMER
-    assert find_key_map([MAPTR_BEVFORMER.to_ours(deformable)]) is MAPTR_BEVFORMER
-    assert find_key_map([LAYER + "attentions.1.attention.value_proj.bias"]) is MAPTR
 
 
 def test_a_state_survives_the_way_to_upstream_and_back():

@@ -6,6 +6,24 @@ from pkgutil import iter_modules
 from gsmap.methods import METHODS
 from gsmap.utils.collection import collection_paused
 
+MODULES = (
+    "gsmap.apis.rig_fit",
+    "gsmap.datasets.stream_samplers",
+    "gsmap.datasets.vectorized_map_dataset",
+    "gsmap.engine.checkpoint_hook",
+    "gsmap.engine.cpu_autocast",
+    "gsmap.engine.figures",
+    "gsmap.engine.gaussian_health_hook",
+    "gsmap.engine.log_processor",
+    "gsmap.engine.optimizers",
+    "gsmap.engine.run_log",
+    "gsmap.evaluation.gaussian_metric",
+    "gsmap.evaluation.map_metric",
+    "gsmap.models.data_preprocessor",
+    "gsmap.models.detector",
+    "gsmap.visualization.map_visualization_hook",
+    "gsmap.visualization.map_visualizer",
+)
 FOLDERS = (  # every module of these is imported, and of the methods' folders
     "gsmap.datasets.transforms",
     "gsmap.models.encoders",
@@ -16,23 +34,8 @@ FOLDERS = (  # every module of these is imported, and of the methods' folders
 )
 
 with collection_paused():
-    import gsmap.apis.rig_fit
-    import gsmap.datasets.stream_samplers
-    import gsmap.datasets.vectorized_map_dataset
-    import gsmap.engine.checkpoint_hook
-    import gsmap.engine.cpu_autocast
-    import gsmap.engine.figures
-    import gsmap.engine.gaussian_health_hook
-    import gsmap.engine.log_processor
-    import gsmap.engine.optimizers
-    import gsmap.engine.run_log
-    import gsmap.evaluation.gaussian_metric
-    import gsmap.evaluation.map_metric
-    import gsmap.models.data_preprocessor
-    import gsmap.models.detector
-    import gsmap.visualization.map_visualization_hook
-    import gsmap.visualization.map_visualizer
-
+    for name in MODULES:
+        import_module(name)
     for folder in FOLDERS:
         for module in iter_modules(import_module(folder).__path__, f"{folder}."):
             import_module(module.name)

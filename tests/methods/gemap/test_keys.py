@@ -1,51 +1,20 @@
-"""The table between GeMap's upstream keys and ours."""
+"""Whole states of GeMap; ../test_keys.py asks what holds of every table."""
 
 import json
+from pathlib import Path
 
-import pytest
 import torch
 
 from gsmap.checkpoints.convert import ours_from_upstream, upstream_from_ours
-from gsmap.checkpoints.key_map import find_key_map
 from gsmap.models.gemap.attention import GeometryDecoupledAttention
-from gsmap.models.gemap.keys import GEMAP, GEMAP_FULL
 from gsmap.models.maptr.keys import MAPTR
-from gsmap.models.maptrv2.keys import MAPTRV2
+from gsmap.utils.files import read_json
 
-LAYER = "pts_bbox_head.transformer.decoder.layers.3."
-OURS = "map_head.decoder.layers.3."
-PAIRS = {
-    LAYER + "attentions.0.inter_attention.in_proj_bias": (
-        OURS + "self_attn.inter.attention.in_proj_bias"
-    ),
-    LAYER + "attentions.0.inter_norm1.weight": OURS + "self_attn.inter.norm1.weight",
-    LAYER + "attentions.0.intra_ffn.2.weight": OURS + "self_attn.intra.ffn.2.weight",
-    LAYER + "attentions.1.value_proj.weight": OURS + "cross_attn.value_proj.weight",
-    LAYER + "ffns.0.layers.1.bias": OURS + "ffn.layers.1.bias",
-    LAYER + "norms.2.weight": OURS + "norms.2.weight",
-}
-DEPTH = "pts_bbox_head.transformer.encoder.depth_net.depth_conv.4.bias"
+PAIRS = read_json(Path(__file__).with_name("keys.json"))["gemap"]["pairs"]
 
 
 def read_keys(golden_dir, name):
     return json.loads((golden_dir / f"models/{name}_state.json").read_text())["state"]
-
-
-@pytest.mark.parametrize("key_map", [GEMAP, GEMAP_FULL])
-@pytest.mark.parametrize(("upstream", "ours"), PAIRS.items())
-def test_names_by_hand_in_both_directions(key_map, upstream, ours):
-    assert key_map.to_ours(upstream) == ours
-    assert key_map.to_upstream(ours) == upstream
-
-
-def test_the_architecture_is_found_by_its_attention_and_its_depth_net():
-    attention = next(iter(PAIRS))
-    assert find_key_map([attention, "img_neck.x"]) is GEMAP
-    assert find_key_map([PAIRS[attention], "img_neck.x"]) is GEMAP
-    assert find_key_map([attention, DEPTH]) is GEMAP_FULL
-    assert find_key_map([PAIRS[attention], GEMAP_FULL.to_ours(DEPTH)]) is GEMAP_FULL
-    assert find_key_map([DEPTH]) is MAPTRV2
-    assert find_key_map(["img_neck.x"]) is MAPTR
 
 
 def test_every_key_of_the_simple_model_has_its_place(golden_dir):

@@ -8,14 +8,11 @@ from mmengine.registry import init_default_scope
 
 import gsmap.registered  # noqa: F401
 from gsmap.apis.export import ExportedDetector
-from gsmap.checkpoints.convert import ours_from_upstream
-from gsmap.checkpoints.key_map import find_key_map
 from gsmap.datasets.annotations.record import MapInstance
 from gsmap.datasets.elements import elements_of_predictions
 from gsmap.models.hdmapnet.decoder import LineMaps
 from gsmap.models.hdmapnet.encoder import ViewTransformEncoder, sample_maps
 from gsmap.models.hdmapnet.head import HDMapNetHead
-from gsmap.models.hdmapnet.keys import HDMAPNET
 from gsmap.models.hdmapnet.layout import metres_from_pixels, orient_forward, pixels_from_metres
 from gsmap.models.hdmapnet.losses import LineMapLosses
 from gsmap.models.hdmapnet.targets import MakeLineMaps
@@ -231,24 +228,3 @@ def test_an_onnx_file_is_refused_with_its_reason():
 
     with pytest.raises(ValueError, match="HDMapNetHead cannot be exported: its lines are"):
         ExportedDetector(Model())
-
-
-PAIRS = {
-    "view_fusion.hw_mat.3.2.bias": "bev_encoder.views.3.2.bias",
-    "camencode.trunk._blocks.5._se_expand.bias": "img_backbone.layers.4.0.se.conv2.conv.bias",
-    "camencode.trunk._blocks.15._bn2.weight": "img_backbone.layers.5.4.linear_conv.bn.weight",
-    "camencode.up1.conv.4.bias": "img_neck.joined.4.bias",
-    "bevencode.layer2.0.downsample.1.bias": "map_head.decoder.stages.1.0.downsample.1.bias",
-    "bevencode.up2_direction.4.bias": "map_head.decoder.maps.2.3.bias",
-}
-
-
-def test_names_of_weights_by_hand_in_both_directions():
-    for upstream, ours in PAIRS.items():
-        assert HDMAPNET.to_ours(upstream) == ours
-        assert HDMAPNET.to_upstream(ours) == upstream
-    assert find_key_map(PAIRS) is HDMAPNET
-    assert find_key_map(PAIRS.values()) is HDMAPNET
-    idle = ["camencode.trunk._fc.bias", "bevencode.up1_direction.conv.4.running_var"]
-    state = {key: torch.ones(()) for key in (*PAIRS, *idle)}
-    assert ours_from_upstream(state).keys() == set(PAIRS.values())
