@@ -9,7 +9,8 @@ with calibration.yaml, or a bag of ROS 1 or 2 (docs/inference.md).
 
 import argparse
 import sys
-from contextlib import nullcontext, suppress
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -253,6 +254,18 @@ def run_settings(args: argparse.Namespace) -> dict[str, str]:
     return settings
 
 
+def open_log(
+    args: argparse.Namespace,
+    settings: dict[str, str],
+    tokens: list[str],
+    classes: Sequence[str],
+) -> AbstractContextManager[ResultLog | None]:
+    """Return the log of the run's predictions, or an empty context without ``--out``."""
+    if not args.out:
+        return nullcontext()
+    return ResultLog(args.shard.path_of(args.out), settings, tokens=tokens, classes=classes)
+
+
 def predict(
     args: argparse.Namespace,
     inferencer: "MapInferencer",
@@ -341,8 +354,8 @@ def main(argv: list[str] | None = None) -> str | None:
     run = {**settings, "input": str(args.input.resolve()), "samples": made_from}
     run["images"] = str(source.data_root)  # its folder tells content and calibration
     wanted = [tokens[index] for index in chosen]
-    log = ResultLog(args.shard.path_of(args.out), run, wanted) if args.out else nullcontext()
-    with log as results:
+    classes = dataset.metainfo["classes"]
+    with open_log(args, run, tokens=wanted, classes=classes) as results:
         broken = predict(args, inferencer, dataset, chosen, results)
         if chosen and len(broken) == len(chosen):
             noted = "".join(f"; as said: {note}" for note in source.notes[-1:])

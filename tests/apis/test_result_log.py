@@ -24,7 +24,8 @@ def test_two_processes_cannot_write_one_file(tmp_path):
 
 
 HEAD = '{"model": "a"}'
-FRAME = '{"sample_token":"t0","vectors":[{}]}'
+FRAME = '{"sample_token":"t0","vectors":[]}'
+LINE = '{"sample_token":"t0","vectors":[{"pts":%s,"cls_name":"%s","confidence_level":%s}]}'
 
 
 @pytest.mark.parametrize(
@@ -40,6 +41,10 @@ FRAME = '{"sample_token":"t0","vectors":[{}]}'
         [HEAD, '{"sample_token":["t0"],"vectors":[]}'],
         [HEAD, '{"sample_token":"t0","vectors":[1]}'],
         [HEAD, '{"sample_token":"t0","broken":2}'],
+        [HEAD, '{"sample_token":"t0","vectors":[{}]}'],
+        [HEAD, LINE % ("[[0,0],[NaN,1]]", "divider", "0.5")],
+        [HEAD, LINE % ("[[0,0],[1,1]]", "divider", "7")],
+        [HEAD, LINE % ("[[0,0],[1,1]]", "of another model", "0.5")],
         [HEAD, '["sample_token"]'],
         [HEAD, "[" * 100_000],
     ],
@@ -50,11 +55,21 @@ def test_a_file_that_is_no_log_of_the_run_is_left_as_it_is(lines, tmp_path):
     (tmp_path / "map.json.unfinished").write_text(text)
     with (
         pytest.raises(ValueError, match=r"map.json.unfinished, line \d, is no frame of this run"),
-        ResultLog(out, {"model": "a"}, ["t0", "t1"]),
+        ResultLog(out, {"model": "a"}, ["t0", "t1"], ["divider"]),
     ):
         pass
     assert (tmp_path / "map.json.unfinished").read_text() == text
     assert not out.exists()
+
+
+def test_elements_of_a_class_of_the_run_are_taken_up(tmp_path):
+    out = tmp_path / "map.json"
+    line = LINE % ("[[0,0],[1,1]]", "divider", "0.5")
+    (tmp_path / "map.json.unfinished").write_text(f"{HEAD}\n{line}\n")
+    with ResultLog(out, {"model": "a"}, ["t0"], ["divider"]) as log:
+        assert log.done == {"t0"}
+        log.finish({})
+    assert json.loads(out.read_text())["results"] == [json.loads(line)]
 
 
 def test_frames_of_other_settings_are_counted(tmp_path):

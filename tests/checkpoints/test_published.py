@@ -39,6 +39,7 @@ class Server:
         self.files: dict[str, bytes] = {}
         self.sent: dict[str, int] = {}
         self.hangs: set[str] = set()
+        self.drips: set[str] = set()
         self.asked: list[str] = []
         self.go_on = threading.Event()
         server = self
@@ -46,6 +47,11 @@ class Server:
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
                 server.asked.append(self.path)
+                if self.path in server.drips:
+                    self.wfile.write(b"HTTP/1.0 200 OK\r\n")
+                    while not server.go_on.wait(0.05):
+                        self.wfile.write(b"X")
+                    return
                 if self.path not in server.files:
                     self.send_error(404)
                     return
@@ -113,6 +119,13 @@ def test_a_server_that_falls_silent_is_given_up(server, monkeypatch):
     monkeypatch.setattr(published, "SILENCE_S", 0.2)
     server.files, server.sent, server.hangs = {"/x.pth": content(1.0)}, {"/x.pth": 9}, {"/x.pth"}
     with pytest.raises(OSError, match="timed out"):
+        find_weights(server.address("/x.pth"))
+
+
+def test_a_server_whose_header_never_ends_is_given_up(server, monkeypatch):
+    monkeypatch.setattr(published, "HEADER_S", 0.3)
+    server.drips = {"/x.pth"}
+    with pytest.raises(OSError, match="no whole header after"):
         find_weights(server.address("/x.pth"))
 
 

@@ -1,3 +1,4 @@
+import copy
 import json
 import zipfile
 
@@ -113,7 +114,7 @@ def test_weights_that_are_not_finite_are_refused(tmp_path, value):
     ids=["number", "list", "sparse", "meta", "quantised", "float8", "huge", "meta is a list"],
 )
 def test_what_is_no_plain_state_dict_is_refused_in_words(content, tmp_path):
-    with pytest.raises(ValueError, match=r"odd.pth (holds no state|is not a whole checkpoint)"):
+    with pytest.raises(ValueError, match=r"odd.pth (holds no state|is not a whole|repeats)"):
         read_weights(save(tmp_path / "odd.pth", content))
 
 
@@ -274,3 +275,34 @@ def test_a_checkpoint_with_packed_parts_is_refused(tmp_path):
         read_checked(packed)
     with pytest.raises(ValueError, match=r"b.pth .*is packed, as torch packs nothing"):
         load_from_file(str(packed))
+
+
+def test_a_checkpoint_whose_parts_overlap_is_refused(tmp_path):
+    """Many names for one part stand for any number of weights."""
+    whole = save(tmp_path / "a.pth", {"state_dict": {"x": torch.ones(10_000), "y": torch.ones(1)}})
+    overlapping = tmp_path / "b.pth"
+    with (
+        zipfile.ZipFile(whole) as source,
+        zipfile.ZipFile(overlapping, "w") as target,
+    ):
+        for name in source.namelist():
+            target.writestr(name, source.read(name))
+        part = next(info for info in target.filelist if info.filename.endswith("data/0"))
+        for number in range(2, 5):
+            other = copy.copy(part)
+            other.filename = part.filename.replace("data/0", f"data/{number}")
+            target.filelist.append(other)
+    with pytest.raises(ValueError, match=r"b.pth is not a whole .*its parts overlap"):
+        read_checked(overlapping)
+
+
+def test_weights_that_repeat_few_values_are_refused_before_they_fill_the_memory(tmp_path):
+    one = torch.ones(1)
+    huge = save(tmp_path / "a.pth", {"state_dict": {"x": one.expand(10**9)}})
+    with pytest.raises(ValueError, match=r"a.pth repeats 4 bytes of weights until they are 4"):
+        read_checked(huge)
+    many = {f"x{number}": one.expand(10**6) for number in range(100)}
+    with pytest.raises(ValueError, match=r"b.pth repeats 4 bytes"):
+        read_checked(save(tmp_path / "b.pth", {"state_dict": many}))
+    tied = {"x": one.expand(7), "y": one}
+    assert read_checked(save(tmp_path / "c.pth", {"state_dict": tied})).state["x"].shape == (7,)

@@ -7,7 +7,7 @@ from io import BytesIO
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, PngImagePlugin
 
 from gsmap.datasets.errors import BrokenSampleError
 from gsmap.datasets.image_files import (
@@ -69,6 +69,42 @@ def test_grey_of_fewer_bits_in_sixteen_is_named_in_place_of_a_black_image(bits):
     message = f"a.png cannot be used: .* end at {(1 << bits) - 1} of 65535, .* {bits} bits"
     with pytest.raises(BrokenSampleError, match=message):
         decoded(saved(RAMP >> (16 - bits), "PNG"))
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_sixteen_bits_of_colour_are_read_as_those_of_grey_are(channels):
+    colours = np.full((*RAMP.shape, channels), 65535, np.uint16)
+    colours[..., :3] = RAMP[:, :, None]
+    content = cv2.imencode(".png", colours)[1].tobytes()
+    assert decoded(content)[0, -1].tolist() == [255, 255, 255]
+    colours[..., :3] >>= 4
+    message = r"a\.png cannot be used: its values end at 4095 of 65535, .* 12 bits"
+    with pytest.raises(BrokenSampleError, match=message):
+        decoded(cv2.imencode(".png", colours)[1].tobytes())
+
+
+@pytest.mark.parametrize("kind", ["PNG", "WEBP"])
+def test_an_animation_is_no_image_of_a_camera(kind):
+    first = Image.fromarray(COLOURS)
+    second = Image.fromarray(255 - COLOURS)
+    stream = BytesIO()
+    first.save(stream, kind, save_all=True, append_images=[second])
+    with pytest.raises(BrokenSampleError, match="it is an animation of 2 images"):
+        decoded(stream.getvalue())
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP"])
+def test_an_orientation_of_xmp_counts_in_every_format(kind):
+    description = '<rdf:Description xmlns:tiff="http://ns.adobe.com/tiff/1.0/" '
+    xmp = f'<x:xmpmeta xmlns:x="adobe:ns:meta/">{description}tiff:Orientation="6"/></x:xmpmeta>'
+    if kind == "PNG":
+        notes = PngImagePlugin.PngInfo()
+        notes.add_itxt("XML:com.adobe.xmp", xmp)
+        content = saved(COLOURS, kind, pnginfo=notes)
+    else:
+        content = saved(COLOURS, kind, xmp=xmp.encode())
+    with pytest.raises(BrokenSampleError, match="wants it turned, orientation 6"):
+        decoded(content)
 
 
 @pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP"])

@@ -22,6 +22,7 @@ import gsmap.registered  # noqa: F401
 from gsmap.checkpoints.reading import read_checked
 from gsmap.checkpoints.safe_globals import mmengine_globals
 from gsmap.engine.checkpoint_hook import AtomicCheckpointHook, AtomicLocalBackend
+from gsmap.engine.resuming import check_optimizer_state
 from gsmap.engine.run_log import MapRunner
 from gsmap.utils.files import SUFFIX
 from gsmap.utils.shards import digest
@@ -258,6 +259,9 @@ def test_a_validation_that_a_kill_prevented_is_made_up_for(tmp_path):
         ("", {"param_schedulers": []}, "it has 0 schedules, and the config 1"),
         ("", {"param_schedulers": [{"step": 5}]}, "a schedule has a state 'step'"),
         ("", {"param_schedulers": [7]}, "are no list of states"),
+        ("", {"param_schedulers": [{"last_step": "x"}]}, "a schedule has last_step = 'x'"),
+        ("", {"param_schedulers": [{"base_values": ["x"]}]}, r"has base_values = \['x'\]"),
+        ("message_hub", {"log_scalars": {"loss": [1.0]}}, "has 'loss' without a history"),
     ],
 )
 def test_a_checkpoint_that_cannot_be_resumed_from_says_why(part, values, reason, tmp_path):
@@ -270,6 +274,32 @@ def test_a_checkpoint_that_cannot_be_resumed_from_says_why(part, values, reason,
     with pytest.raises(ValueError, match=reason):
         learn(tmp_path, 2, tmp_path / "odd.pth", schedule=schedule)
     assert learn(tmp_path, 2, tmp_path / "epoch_1.pth", schedule=schedule) == 1
+
+
+@pytest.mark.parametrize(
+    ("setting", "entry", "reason"),
+    [
+        ({"lr": "x"}, {}, "lr = 'x'"),
+        ({"lr": float("nan")}, {}, "lr = nan"),
+        ({"betas": 3}, {}, "betas = 3"),
+        ({"betas": (0.9, "x")}, {}, "betas = "),
+        ({"eps": None}, {}, "eps = None"),
+        ({}, {"step": "x"}, "a 'step' that does not fit"),
+        ({}, {"exp_avg": torch.zeros(3)}, "a 'exp_avg' that does not fit"),
+        ({}, {"exp_avg_sq": torch.full((2,), float("nan"))}, "a 'exp_avg_sq' that does not fit"),
+    ],
+)
+def test_an_optimizers_state_fits_its_parameters(setting, entry, reason):
+    weight = torch.nn.Parameter(torch.ones(2))
+    optimizer = torch.optim.AdamW([weight])
+    weight.grad = torch.ones(2)
+    optimizer.step()
+    state = optimizer.state_dict()
+    check_optimizer_state(state, optimizer, path="good.pth")
+    state["param_groups"][0].update(setting)
+    state["state"][0].update(entry)
+    with pytest.raises(ValueError, match=f"odd.pth cannot be resumed from: its .*{reason}"):
+        check_optimizer_state(state, optimizer, path="odd.pth")
 
 
 def test_weights_alone_cannot_be_resumed_from(tmp_path):

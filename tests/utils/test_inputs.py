@@ -1,15 +1,19 @@
 """No output of a command is one of its inputs."""
 
+import json
 import os
+import re
+import socket
 from pathlib import Path
 
 import pytest
 from processes import REPO, run_tool
 
-from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.files import write_text
 from gsmap.utils.inputs import InputReplacedError, heed_input
+from gsmap.utils.parallel import ordered_map
 
 
 def copying(folder: Path, *words: str, reads: str = "given") -> None:
@@ -87,6 +91,65 @@ def test_an_output_may_be_read_once_it_is_written(folder):
     run_command(command)
     assert out.read_text() == "new"
     heed_input(out)  # the command has ended
+
+
+@pytest.mark.parametrize("kind", ["pipe", "socket", "device", "link to a pipe"])
+def test_a_command_reads_plain_files_alone(kind, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    if kind == "socket":
+        socket.socket(socket.AF_UNIX).bind("in")
+    elif kind == "device":
+        Path("in").symlink_to("/dev/zero")
+    else:
+        os.mkfifo("pipe")
+        Path("in").symlink_to("pipe")
+    name = "pipe" if kind == "pipe" else "in"
+    with pytest.raises(SystemExit) as end:
+        copying(tmp_path, name, "--out", "out")
+    assert end.value.code == 2
+    assert f"error: {name} is a pipe, a socket or a device" in capsys.readouterr().err
+    copying(tmp_path, os.devnull, "--out", "out")
+    assert Path("out").read_text() == ""
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "tools/evaluate.py @pipe @a.arrow",
+        "tools/build_map.py @pipe --ann @a.arrow --out @maps",
+        "tools/report.py @pipe --ann @a.arrow --out @page.html",
+        "tools/compact_results.py @pipe @out.json",
+        "tools/convert_config.py @pipe @out.py",
+        "tools/infer.py @pipe.mcap --check-calibration @out.png",
+        "tools/infer.py @pipe.db3 --check-calibration @out.png",
+        "tools/build_map.py @r.json --ann @a.arrow --out @maps --formats mcap",
+        "tools/report.py @r.json --ann @a.arrow --out @page.html",
+    ],
+)
+def test_no_command_waits_for_a_pipe(words, minicity_annotations, tmp_path):
+    """Each file that it reads may be one; the last two find it in the place of an image."""
+    annotations = AnnotationFile(minicity_annotations["val"])
+    sample = annotations[0]
+    write_annotations(tmp_path / "a.arrow", annotations.meta, [sample])
+    results = {"results": [{"sample_token": sample.token, "vectors": []}]}
+    (tmp_path / "r.json").write_text(json.dumps(results))
+    image = tmp_path / sample.cameras[0].path
+    image.parent.mkdir(parents=True)
+    for pipe in ("pipe", "pipe.mcap", "pipe.db3"):
+        os.mkfifo(tmp_path / pipe)
+    os.mkfifo(image)
+    tool, *rest = words.replace("@", f"{tmp_path}/").split()
+    ended = run_tool(REPO / tool, *rest)
+    assert ended.returncode == 2, ended.stderr
+    last = ended.stderr.splitlines()[-1]
+    assert re.search("error: .*(is a pipe, a socket or a device|no readable image at)", last)
+
+
+@pytest.mark.faults
+def test_no_worker_waits_for_a_pipe(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(ValueError, match="is a pipe, a socket or a device"):
+        list(ordered_map(Path.read_bytes, 2 * [tmp_path / "pipe"], workers=2))
 
 
 def test_two_options_cannot_name_one_file(folder, capsys):

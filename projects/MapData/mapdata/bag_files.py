@@ -8,6 +8,7 @@ from pathlib import Path
 import yaml
 
 from gsmap.utils.errors import InputError
+from gsmap.utils.inputs import heed_input
 from mapdata.mcap_bag import MAGIC, McapBag, is_plain_ros2
 from mapdata.ros_bag import RosBag
 
@@ -50,9 +51,10 @@ def bag_at(path: Path) -> Bag:
         path: A file, a folder of rosbag2, or a folder of the parts of one recording.
 
     Raises:
-        ValueError: If the files of a folder are not the parts of one recording.
+        ValueError: If the files of a folder are not the parts of one recording, or it is a pipe.
     """
     if not path.is_dir():
+        heed_input(path)
         return _bag_of([path], _notes_on([path]))
     parts = parts_in(path)
     if not (path / _METADATA).is_file():
@@ -155,6 +157,8 @@ def _listed_names(file: Path) -> list[str] | None:
 
 def _damage_of(path: Path) -> str | None:
     """Say how a bag's file is damaged, and how to mend it."""
+    if not path.is_file():
+        return "it is a pipe, a socket or a device: give a plain file"
     size = path.stat().st_size
     if not size:
         return "it is empty: the recorder or the copy was stopped before anything was written"

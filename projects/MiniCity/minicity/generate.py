@@ -15,7 +15,7 @@ from typing import Any
 import cv2
 
 from gsmap.utils.errors import InputError, WorkError
-from gsmap.utils.files import SUFFIX, require_no_link, try_lock
+from gsmap.utils.files import SUFFIX, read_json, require_no_link, try_lock
 from gsmap.utils.parallel import default_workers, ordered_map
 from gsmap.utils.progress import Progress
 from minicity.config import TRAIN_LOCATIONS, VAL_LOCATIONS, VERSION, MiniCityConfig, make_token
@@ -135,10 +135,12 @@ def is_complete(root: Path, config: MiniCityConfig) -> bool:
     """
     marker = root / MARKER
     if marker.is_file():
-        present = json.loads(marker.read_text())
+        present = read_json(marker)
         requested = config.as_dict()
         if present == requested:
             return True
+        if not isinstance(present, dict):
+            raise InputError(f"{marker} is another program's file: choose another --root.")
         parts = []
         for key in sorted({*present, *requested}):
             if present.get(key) != requested.get(key):

@@ -2,11 +2,12 @@
 
 import io
 import json
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from gsmap.evaluation.core.results_json import write_results
+from gsmap.evaluation.core.results_json import THREE_D, read_vectors, write_results
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import lock, naming_file, open_to_append
 
@@ -22,6 +23,7 @@ class ResultLog:
         out: The result file.
         settings: What decides the predictions, as plain values.
         tokens: The frames of the run; by default any may be in the file.
+        classes: Classes of the model; by default any may be in the file.
 
     Raises:
         RuntimeError: If another process is at work on the same result file.
@@ -35,11 +37,16 @@ class ResultLog:
     """
 
     def __init__(
-        self, out: Path, settings: dict[str, Any], tokens: Iterable[str] | None = None
+        self,
+        out: Path,
+        settings: dict[str, Any],
+        tokens: Iterable[str] | None = None,
+        classes: Sequence[str] | None = None,
     ) -> None:
         self.out = out
         self.dropped = 0
         self._tokens = None if tokens is None else frozenset(tokens)
+        self._classes = classes
         self.path = out.with_name(out.name + _SUFFIX)
         self._head = json.dumps(settings, sort_keys=True) + "\n"
         self.done: set[str] = set()
@@ -91,9 +98,21 @@ class ResultLog:
             return False
         token, vectors = frame["sample_token"], frame.get("vectors", [])
         known = not same or self._tokens is None or token in self._tokens
-        vectors_fit = isinstance(vectors, list) and all(isinstance(v, dict) for v in vectors)
         reason_fits = isinstance(frame.get("broken", ""), str)
-        return known and token not in self.done and vectors_fit and reason_fits
+        first = known and token not in self.done
+        return first and reason_fits and self._are_elements(vectors, same)
+
+    def _are_elements(self, vectors: Any, same: bool) -> bool:
+        """Whether the elements of a frame can be read, and are of classes of the run."""
+        if not isinstance(vectors, list):
+            return False
+        classes = self._classes if same else None
+        others = Counter[str]()
+        try:
+            read_vectors(vectors, classes or (), others, gaussians=True)
+        except (ValueError, KeyError, TypeError, OverflowError):
+            return False
+        return classes is None or not others.keys() - {THREE_D}
 
     def _require(self, good: bool, number: int) -> None:
         if not good:

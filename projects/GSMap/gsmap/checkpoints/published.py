@@ -10,10 +10,13 @@ import json
 import logging
 import os
 import re
+import threading
 import time
 import urllib.request
 from collections.abc import Iterator, Mapping
+from http.client import HTTPResponse
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
@@ -31,6 +34,7 @@ from gsmap.utils.shards import digest
 
 WEIGHTS = "GSMAP_WEIGHTS"
 SILENCE_S = 30.0  # a server that sends nothing for so long is given up
+HEADER_S = 60.0  # so is one whose header is not whole by then
 LIMIT_S = 3600.0  # so is a download that takes longer
 _BLOCK_BYTES = 1 << 20
 _DIGEST = re.compile(r"-([0-9a-f]{8,64})(\.\w+)?\Z")  # torch's and OpenMMLab's file names
@@ -165,7 +169,7 @@ def _blocks(address: str) -> Iterator[bytes]:
     """Yield a file of the network in blocks, within `LIMIT_S`."""
     end_s = time.monotonic() + LIMIT_S
     try:
-        with urllib.request.urlopen(address, timeout=SILENCE_S) as answer:
+        with _open_address(address) as answer:
             length = answer.headers.get("Content-Length")
             received = 0
             while block := answer.read1(_BLOCK_BYTES):
@@ -177,6 +181,29 @@ def _blocks(address: str) -> Iterator[bytes]:
                 raise ConnectionError(f"cut after {received} of {length} bytes")
     except (OSError, http.client.HTTPException, ValueError) as error:
         raise _unreachable(address, str(getattr(error, "reason", None) or error)) from error
+
+
+def _open_address(address: str) -> HTTPResponse:
+    """Connect to a server and read the header of its answer, both within `HEADER_S`.
+
+    The timeout of a socket begins anew with each byte, so another thread waits for the header.
+    """
+    answers: SimpleQueue[HTTPResponse | Exception] = SimpleQueue()
+
+    def connect() -> None:
+        try:
+            answers.put(urllib.request.urlopen(address, timeout=SILENCE_S))
+        except Exception as error:  # raised again by the thread that waits
+            answers.put(error)
+
+    threading.Thread(target=connect, daemon=True).start()
+    try:
+        answer = answers.get(timeout=HEADER_S)
+    except Empty:
+        raise TimeoutError(f"no whole header after {HEADER_S:.0f} s") from None
+    if isinstance(answer, Exception):
+        raise answer
+    return answer
 
 
 def _unreachable(address: str, reason: str) -> OSError:

@@ -129,8 +129,8 @@ def load_tensors(path: str | Path, map_location: Any = "cpu") -> Any:
         Its contents: tensors and plain data.
 
     Raises:
-        ValueError: If it is an archive with compressed parts, whose sizes in memory have no bound;
-            torch writes none.
+        ValueError: If it is an archive with compressed parts, or with parts that overlap: their
+            sizes in memory have no bound, and torch writes none.
         UnpicklingError: If it holds more than tensors and plain data.
     """
     if zipfile.is_zipfile(path):
@@ -139,6 +139,9 @@ def load_tensors(path: str | Path, map_location: Any = "cpu") -> Any:
                 if part.compress_type != zipfile.ZIP_STORED:
                     name = f"{part.filename!r:.60}"
                     raise InputError(f"{name} in it is packed, as torch packs nothing")
+            total = sum(part.file_size for part in archive.infolist())
+            if total > Path(path).stat().st_size:
+                raise InputError(f"its parts overlap: they have {total} bytes in all")
     return torch.load(path, map_location=map_location, weights_only=True)
 
 

@@ -1,6 +1,6 @@
 """The weights in a checkpoint, whatever a training loop wrapped them in."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,6 +17,8 @@ _PARALLEL = "module."
 _INNER = ("_orig_mod", "_fsdp_wrapped_module", "_checkpoint_wrapped_module")
 _AVERAGED = "ema_"
 _SHOWN = 8  # keys in a message
+_MOST_REPEATED = 4  # times that the values of all weights may be more than those stored
+_SPARE_BYTES = 1 << 26  # that may be repeated however few are stored
 
 
 class UnfitError(InputError):
@@ -67,6 +69,7 @@ def unwrap(content: Any) -> Unwrapped:
     if not all(map(_is_plain, weights.values())):
         odd = next(key for key, value in weights.items() if not _is_plain(value))
         raise UnfitError(f"holds no state dict of plain tensors: {odd!r:.80} is another kind")
+    _require_stored(weights.values())
     left_out = {"entries that are no tensors": len(found) - len(weights)}
     counters = {key for key, value in weights.items() if _is_counter(key, value)}
     if _is_dotted(weights):
@@ -115,6 +118,25 @@ def _is_counter(key: str, value: Tensor) -> bool:
 def _is_plain(value: Tensor) -> bool:
     """Whether a tensor has plain values that can be a weight's."""
     return value.layout is torch.strided and not (value.is_quantized or value.is_meta)
+
+
+def _require_stored(weights: Iterable[Tensor]) -> None:
+    """Refuse tensors that repeat few stored values until they fill all memory.
+
+    Raises:
+        UnfitError: If they do.
+    """
+    stored: dict[int, int] = {}
+    total = 0
+    for value in weights:
+        storage = value.untyped_storage()
+        stored[storage.data_ptr()] = storage.nbytes()
+        total += value.numel() * value.element_size()
+    if total > _MOST_REPEATED * sum(stored.values()) + _SPARE_BYTES:
+        raise UnfitError(
+            f"repeats {sum(stored.values())} bytes of weights until they are {total}: save it with "
+            "its tensors cloned"
+        )
 
 
 def _plain_keys(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -19,7 +19,7 @@ _PLUGINS = (JpegImagePlugin, PngImagePlugin, WebPImagePlugin, BmpImagePlugin)  #
 FORMATS = ("JPEG", "PNG", "WEBP", "BMP")
 _STARTS = {b"\xff\xd8": "jpeg", b"\x89PNG": "png", b"RIFF": "webp", b"BM": "bmp"}
 _JPEG_START = b"\xff\xd8"
-_EXIF = b"Exif\0\0"
+_TURNING = (b"Exif\0\0", b"tiff:Orientation")  # entries of EXIF and XMP may say how it is turned
 _ORIENTATION = 0x0112  # EXIF's tag
 _TURNED = range(2, 9)  # 1 is upright, 0 is not set, others mean nothing
 _MOST_PIXELS = 10**8  # of an image; a decoder takes memory for all that its header says
@@ -170,7 +170,7 @@ def _decoded_jpeg(
     content: bytes, size: tuple[int, int] | None
 ) -> tuple[tuple[int, int], np.ndarray | None]:
     """Return a JPEG's size, and its pixels, BGR, unless another size is asked for."""
-    if _EXIF in content:
+    if any(entry in content for entry in _TURNING):
         with Image.open(BytesIO(content), formats=FORMATS) as picture:
             _require_upright(picture)
     height, width = simplejpeg.decode_jpeg_header(content)[:2]
@@ -190,10 +190,16 @@ def _decoded_other(
         if size not in (None, picture.size):
             return picture.size, None
         _require_moderate(picture.size)
+        frames = getattr(picture, "n_frames", 1)
+        if frames > 1:
+            raise _UnfitError(f"it is an animation of {frames} images: save each as a file")
+        deep_mode = ";16" in str(picture.tile[0][3]) if picture.tile else False
         picture.load()  # a PNG may say only behind its pixels how it is turned
         _require_upright(picture)
         if picture.mode.startswith("I"):
             return picture.size, _from_deep_grey(np.asarray(picture))
+        if deep_mode:
+            _require_bright(cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED))
         return picture.size, np.ascontiguousarray(np.asarray(picture.convert("RGB"))[:, :, ::-1])
 
 
@@ -216,13 +222,19 @@ def _require_upright(picture: Image.Image) -> None:
         )
 
 
-def _from_deep_grey(grey: np.ndarray) -> np.ndarray:
-    """Return 16-bit grey values in 8 bits, as BGR. (H, W, 3)"""
-    brightest = int(grey.max())
+def _require_bright(values: np.ndarray) -> None:
+    """Refuse 16-bit values that would be next to black in 8 bits. (H, W) or (H, W, 3 or 4)"""
+    colours = values[..., :3] if values.ndim == 3 else values
+    brightest = int(colours.max())
     if 0 < brightest < _DIM:
         raise _UnfitError(
-            f"its grey values end at {brightest} of 65535, as those of a camera of "
+            f"its values end at {brightest} of 65535, as those of a camera of "
             f"{brightest.bit_length()} bits or of depth do, and it would be next to black: spread "
             "them over 16 bits, or save 8 bits"
         )
+
+
+def _from_deep_grey(grey: np.ndarray) -> np.ndarray:
+    """Return 16-bit grey values in 8 bits, as BGR. (H, W, 3)"""
+    _require_bright(grey)
     return cv2.cvtColor((grey >> 8).clip(0, 255).astype(np.uint8), cv2.COLOR_GRAY2BGR)

@@ -9,6 +9,7 @@ import torch
 from mmdet3d.registry import HOOKS
 from mmengine.fileio import LocalBackend, register_backend
 from mmengine.hooks import CheckpointHook
+from mmengine.optim import OptimWrapper
 from mmengine.runner import BaseLoop, CheckpointLoader, EpochBasedTrainLoop, Runner
 from mmengine.runner import checkpoint as mmengine_checkpoint
 
@@ -20,7 +21,7 @@ from gsmap.checkpoints.settings import IMAGE_SIZE, MODEL_SETTINGS, SIGNALS, plai
 from gsmap.checkpoints.unwrapping import unwrap
 from gsmap.engine.figures import finish_checks
 from gsmap.engine.optimizers import fit_optimizer_state
-from gsmap.engine.resuming import check_resumable
+from gsmap.engine.resuming import check_optimizer_state, check_resumable, refusing_state
 from gsmap.engine.run_log import innermost
 from gsmap.utils.errors import InputError, NotFiniteError
 from gsmap.utils.files import read_text, take_from_link, write_bytes, write_text
@@ -113,7 +114,12 @@ class AtomicCheckpointHook(CheckpointHook):
         meta = meta if isinstance(meta, dict) else {}
         meta.pop("config", None)
         if "optimizer" in checkpoint and runner._resume:
-            fit_optimizer_state(checkpoint, runner.optim_wrapper)
+            wrapper = runner.optim_wrapper
+            fit_optimizer_state(checkpoint, wrapper)
+            if isinstance(wrapper, OptimWrapper):
+                path = runner._load_from
+                with refusing_state(path):
+                    check_optimizer_state(checkpoint["optimizer"], wrapper.optimizer, path=path)
         trained = meta.get("dataset_meta")
         for loop in (runner._val_loop, runner._test_loop):
             if isinstance(loop, BaseLoop) and isinstance(trained, dict):

@@ -49,12 +49,14 @@ class CommandParser(argparse.ArgumentParser):
     def parse_known_args(  # type: ignore[override]
         self, *args: Any, **kwargs: Any
     ) -> tuple[argparse.Namespace, list[str]]:
-        """Parse arguments, and refuse an output that is an input."""
+        """Parse arguments, and refuse NaN and an output that is an input."""
         found, rest = super().parse_known_args(*args, **kwargs)
         inputs: list[Path] = []
         outputs: list[tuple[Path, str]] = []
         for action in self._actions:
             option = action.option_strings[0] if action.option_strings else action.metavar
+            if _holds_nan(getattr(found, action.dest, None)):
+                self.error(f"{option or action.dest} must be a number, got nan")
             for path in _files_in(getattr(found, action.dest, None)):
                 if action.type is output_file:
                     outputs.append((path, str(option or action.dest)))
@@ -62,6 +64,13 @@ class CommandParser(argparse.ArgumentParser):
                     inputs.append(path)
         declare_files(inputs, outputs)
         return found, rest
+
+
+def _holds_nan(value: Any) -> bool:
+    """Whether an argument is NaN or a list with NaN, with which every comparison is false."""
+    if isinstance(value, list | tuple):
+        return any(map(_holds_nan, value))
+    return isinstance(value, float) and math.isnan(value)
 
 
 def _files_in(value: Any) -> Iterator[Path]:

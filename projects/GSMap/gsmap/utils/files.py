@@ -12,6 +12,7 @@ import secrets
 import shutil
 import stat
 import time
+import unicodedata
 import zipfile
 import zlib
 from collections import Counter
@@ -48,8 +49,9 @@ def file_name(foreign: str) -> str:
     """Make the name of a file or folder from a name that a file brings.
 
     It is one part of a path and leads nowhere else. Letters, digits and ``_.+=-`` stay. A name that
-    has others, is empty or long, begins with a dot or hyphen, or ends as such a name does is
-    changed and gets a digest, so that two names never make one file.
+    has others, is empty or long, begins with a dot or hyphen, ends with a dot, is not in Unicode's
+    form NFC, or ends as a changed name does is changed and gets a digest, so that two names never
+    make one file.
     """
     name = _plain_name(foreign)
     if name == foreign and not _CHANGED.search(name):
@@ -85,8 +87,10 @@ def file_names(foreign: Iterable[str], endings: Sequence[str] = ("",)) -> dict[s
 
 
 def _plain_name(foreign: str) -> str:
-    plain = re.sub(r"[^\w.+=-]", "_", foreign).lstrip(".-").encode()[:_LONGEST_NAME]
-    return plain.decode(errors="ignore") or "unnamed"
+    composed = unicodedata.normalize("NFC", foreign)  # some disks do not tell the forms apart
+    letters = re.sub(r"[^\w.+=-]", "_", composed)
+    plain = letters.lstrip(".-").encode()[:_LONGEST_NAME]
+    return plain.decode(errors="ignore").rstrip(".") or "unnamed"
 
 
 def _changed_name(foreign: str) -> str:

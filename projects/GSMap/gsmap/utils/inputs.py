@@ -1,4 +1,4 @@
-"""What a command reads, which none of its outputs may replace."""
+"""The files that a command reads: plain files, none of which its outputs may replace."""
 
 import os
 import stat
@@ -12,6 +12,7 @@ from gsmap.utils.errors import InputError, WorkError
 
 _Identity = tuple[int, int, int]  # device and number of a file, and when it was last changed
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
+_OF_THE_SYSTEM = ("/dev/", "/proc/", "/sys/")  # pipes and devices that are no stranger's
 
 
 class InputReplacedError(WorkError):
@@ -27,10 +28,18 @@ class _Command:
     hooked = False
 
 
+def watch_files() -> None:
+    """Check every file that this process opens from now on (`heed_input`)."""
+    _Command.runs = True
+    if not _Command.hooked:
+        sys.addaudithook(_on_event)
+        _Command.hooked = True
+
+
 @contextmanager
 def inputs_kept() -> Iterator[None]:
-    """Refuse, while the block runs, whatever would write over an input (`declare_files`)."""
-    _Command.runs = True
+    """Refuse, while the block runs, to write over an input (`declare_files`) or to read a pipe."""
+    watch_files()
     try:
         yield
     finally:
@@ -67,19 +76,32 @@ def declare_files(inputs: Iterable[Path], outputs: Sequence[tuple[Path, str]]) -
         return
     _Command.inputs |= {i: path for path in inputs if (i := _identity(path))}
     _Command.outputs |= there
-    if there and not _Command.hooked:
-        sys.addaudithook(_on_event)
-        _Command.hooked = True
 
 
 def heed_input(path: str | bytes | os.PathLike) -> None:
-    """Refuse to read a file that the command is to write; for what Python does not open itself.
+    """Check a file before it is read; for libraries that open files without Python.
+
+    Args:
+        path: The file.
 
     Raises:
-        InputReplacedError: If it is one of the outputs.
+        InputReplacedError: If it is an output of the command.
+        ValueError: If it is a pipe, a socket or a device outside the folders of the system. A pipe
+            in a data set would let the command wait forever, and a link to a device never ends.
     """
-    if _Command.outputs:
-        _require_other(path, _Command.outputs)
+    if not _Command.runs:
+        return
+    try:
+        status = os.stat(path)
+    except (OSError, ValueError):  # its reader says why
+        return
+    if stat.S_ISREG(status.st_mode):
+        if _Command.outputs:
+            _require_other(path, _Command.outputs)
+    elif not stat.S_ISDIR(status.st_mode):
+        name = os.fsdecode(path)
+        if not os.path.abspath(name).startswith(_OF_THE_SYSTEM):
+            raise InputError(f"{name} is a pipe, a socket or a device: give a plain file.")
 
 
 def _require_other(path: str | bytes | os.PathLike, outputs: Mapping[_Identity, str]) -> None:
@@ -114,8 +136,8 @@ def forget_output(path: Path) -> None:
 
 
 def _on_event(event: str, arguments: tuple[Any, ...]) -> None:
-    """Look at each file that Python opens (an audit hook), and at SQLite's."""
-    if not _Command.outputs:
+    """Check each file that Python opens (an audit hook), and each of SQLite."""
+    if not _Command.runs:
         return
     if event == "open":
         path, _, flags = arguments

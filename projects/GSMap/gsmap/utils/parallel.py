@@ -19,6 +19,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 from gsmap.utils.errors import InputError, WorkError
+from gsmap.utils.inputs import watch_files
 from gsmap.utils.terminal import print_safely
 
 Task = TypeVar("Task")
@@ -87,6 +88,7 @@ class _Worker:
 def _start_worker(setup: Path) -> None:
     """Prepare a worker process, which ends with its parent, however that ends."""
     print_safely()
+    watch_files()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C for all
     signal.signal(signal.SIGTERM, _stop_worker)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})

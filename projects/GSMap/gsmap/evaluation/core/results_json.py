@@ -119,35 +119,59 @@ class SampleFile:
             raise InputError(f"{self.path}: {item!r:.80} has no sample_token or no vectors.")
         token = str(item["sample_token"])
         try:
-            return token, self._elements(item["vectors"], ignored)
+            scored = self._key == RESULTS_KEY
+            elements = read_vectors(
+                item["vectors"], self._classes, ignored, scored=scored, gaussians=self._gaussians
+            )
+            return token, elements
         except (ValueError, KeyError, TypeError, OverflowError) as error:
             raise InputError(
                 f"{self.path}, sample {token!r}: {error!r}; each vector needs pts, "
                 "cls_name and, in results, confidence_level."
             ) from error
 
-    def _elements(self, vectors: Sequence[Mapping[str, Any]], ignored: Counter[str]) -> MapElements:
-        """Convert the vectors of one sample; other classes get label -1."""
-        label_of = {name: label for label, name in enumerate(self._classes)}
-        if not all(isinstance(v["cls_name"], str) for v in vectors):
-            raise TypeError("cls_name is no text")
-        ignored.update(v["cls_name"] for v in vectors if v["cls_name"] not in label_of)
-        polylines = [_points_of(vector) for vector in vectors]
-        if any(len(point) == 3 for points in polylines for point in points[:1]):
-            ignored[THREE_D] += 1
-        extra = {
-            name: [v[f"gaussian_{name}"] for v in vectors]
-            for name in ("scales", "rotations")
-            if self._gaussians and vectors and all(f"gaussian_{name}" in v for v in vectors)
-        }
-        elements = MapElements.from_polylines(
-            polylines,
-            [label_of.get(v["cls_name"], -1) for v in vectors],
-            [v["confidence_level"] for v in vectors] if self._key == RESULTS_KEY else None,
-            **extra,
-        )
-        _require_near(elements)
-        return elements
+
+def read_vectors(
+    vectors: Sequence[Mapping[str, Any]],
+    classes: Sequence[str],
+    ignored: Counter[str],
+    scored: bool = True,
+    gaussians: bool = False,
+) -> MapElements:
+    """Convert the ``vectors`` of one sample of a file.
+
+    Args:
+        vectors: Elements as the file has them.
+        classes: Names of the classes; elements of others get the label -1.
+        ignored: Counts elements of other classes by their class, and samples with heights.
+        scored: Whether each element needs a confidence.
+        gaussians: Whether to read the Gaussians where all elements have them.
+
+    Raises:
+        KeyError: If an entry is missing.
+        TypeError: If an entry has another type.
+        ValueError: If a value is not allowed.
+    """
+    label_of = {name: label for label, name in enumerate(classes)}
+    if not all(isinstance(v["cls_name"], str) for v in vectors):
+        raise TypeError("cls_name is no text")
+    ignored.update(v["cls_name"] for v in vectors if v["cls_name"] not in label_of)
+    polylines = [_points_of(vector) for vector in vectors]
+    if any(len(point) == 3 for points in polylines for point in points[:1]):
+        ignored[THREE_D] += 1
+    extra = {
+        name: [v[f"gaussian_{name}"] for v in vectors]
+        for name in ("scales", "rotations")
+        if gaussians and vectors and all(f"gaussian_{name}" in v for v in vectors)
+    }
+    elements = MapElements.from_polylines(
+        polylines,
+        [label_of.get(v["cls_name"], -1) for v in vectors],
+        [v["confidence_level"] for v in vectors] if scored else None,
+        **extra,
+    )
+    _require_near(elements)
+    return elements
 
 
 def _require_near(elements: MapElements) -> None:
