@@ -187,7 +187,7 @@ class AnnotationMeta:
             )
         if self.frame not in RANGES:
             raise InputError(f"frame must be one of {tuple(RANGES)}, got {self.frame!r}.")
-        if self.dim not in (2, 3):
+        if type(self.dim) is not int or self.dim not in (2, 3):
             raise InputError(f"dim must be 2 or 3, got {self.dim!r}.")
         object.__setattr__(self, "classes", _names(self.classes))
         for name, usual in zip(("x_range", "y_range"), RANGES[self.frame], strict=True):
