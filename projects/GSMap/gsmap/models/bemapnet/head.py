@@ -237,8 +237,8 @@ class BezierHead(LineHead):
                     "and pieces of FormatBezierTargets to those of the head."
                 )
             pieces = (numbers - 1) // curve.degree - 1
-            missing = max(largest - points.shape[1], 0)
-            controls = F.pad(points[is_class, :largest], (0, 0, 0, missing))
+            num_missing = max(largest - points.shape[1], 0)
+            controls = F.pad(points[is_class, :largest], (0, 0, 0, num_missing))
             controls = controls * curve.control_mask(pieces)[..., None]
             curves = curve(controls, pieces)
             if self.losses.redrawn_in_px:

@@ -87,16 +87,16 @@ class BiFPNRound(nn.Module):
         """
         top_down = [levels[-1]]
         for conv, feats in zip(self.down, reversed(levels[:-1]), strict=True):
-            coarser = F.interpolate(top_down[-1], size=feats.shape[-2:], mode="nearest")
-            top_down.append(conv(feats, coarser))
+            coarse_feats = F.interpolate(top_down[-1], size=feats.shape[-2:], mode="nearest")
+            top_down.append(conv(feats, coarse_feats))
         top_down.reverse()  # the finest first
         results = [top_down[0]]
         for level, conv in enumerate(self.up, start=1):
-            finer = downsample(results[-1])
+            fine_feats = downsample(results[-1])
             if level == NUM_LEVELS - 1:
-                results.append(conv(again[level], finer))
+                results.append(conv(again[level], fine_feats))
             else:
-                results.append(conv(again[level], top_down[level], finer))
+                results.append(conv(again[level], top_down[level], fine_feats))
         return results
 
 
@@ -140,8 +140,8 @@ class BiFPN(BaseModule):
         for fuse in self.rounds:
             levels = fuse(levels, again)
             again = levels
-        resized = []
+        resized_levels = []
         for level in levels:
             level = F.interpolate(level, size=self.size, mode="bilinear", align_corners=True)
-            resized.append(level)
-        return [torch.cat(resized, dim=1)]
+            resized_levels.append(level)
+        return [torch.cat(resized_levels, dim=1)]

@@ -183,10 +183,10 @@ class ViewTransformEncoder(CameraEncoder):
             matrices = cam_from_ground.float()
             cells = self.cell_coordinates(matrices.device)
             rotations = matrices[..., [0, 2], :2]  # right and forward axis of the camera
-            rotated = torch.einsum("bvij,hwj->bvhwi", rotations, cells)
+            rotated_cells = torch.einsum("bvij,hwj->bvhwi", rotations, cells)
             unit = 1.0 if self.released_units else self.view_pixel_m
             offsets = matrices[..., [0, 2], 3] / unit  # (B, V, 2)
-            right, depth = (rotated + offsets[:, :, None, None]).unbind(dim=-1)
+            right, depth = (rotated_cells + offsets[:, :, None, None]).unbind(dim=-1)
         height, width = self.view_size
         return torch.stack([depth - width / 8, right + height / 2], dim=-1)
 

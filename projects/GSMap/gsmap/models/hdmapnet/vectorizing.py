@@ -184,8 +184,8 @@ def top_directions(direction: Tensor) -> IntArray:
 def clean_mask(mask: BoolArray, min_area_px: int) -> BoolArray:
     """Close the gaps of a class's mask, and remove its small components. (H, W) -> (H, W)"""
     ellipse = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, ksize=(5, 5))
-    closed = cv2.morphologyEx(mask.astype(np.uint8), op=cv2.MORPH_CLOSE, kernel=ellipse)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
+    closed_mask = cv2.morphologyEx(mask.astype(np.uint8), op=cv2.MORPH_CLOSE, kernel=ellipse)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(closed_mask, connectivity=8)
     is_large = stats[:, cv2.CC_STAT_AREA] > min_area_px
     is_large[0] = False  # the background
     return is_large[labels]
@@ -206,8 +206,8 @@ def cluster_pixels(mask: BoolArray, embedding: FloatArray, config: VectorizeConf
 
     clusters = np.zeros(mask.shape, dtype=np.int64)
     if mask.any():
-        scaled = StandardScaler().fit_transform(embedding[:, mask].T).astype(np.float64)
-        labels = dense_clusters(scaled, config.eps, min_neighbours=config.min_neighbours)
+        scaled_embeddings = StandardScaler().fit_transform(embedding[:, mask].T).astype(np.float64)
+        labels = dense_clusters(scaled_embeddings, config.eps, min_neighbours=config.min_neighbours)
         clusters[mask] = labels + 1
     return clusters
 

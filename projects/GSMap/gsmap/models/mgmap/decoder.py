@@ -139,10 +139,10 @@ class MGMapDecoder(MapDecoder):
         Returns:
             Outputs of the layers (`MaskedDecoded`) and of the stages (`RefinedDecoded`).
         """
-        fused, levels = self.neck(bev_feats)
-        masks = self.mask_net(fused)[:, : query.shape[1] // self.num_points]  # (B, N, H, W)
-        activated = self.activation(self.instance_features(fused, masks))  # (B, N, C)
-        query = query + activated.repeat_interleave(self.num_points, dim=1)
+        fused_feats, levels = self.neck(bev_feats)
+        masks = self.mask_net(fused_feats)[:, : query.shape[1] // self.num_points]  # (B, N, H, W)
+        mask_embeddings = self.activation(self.instance_features(fused_feats, masks))  # (B, N, C)
+        query = query + mask_embeddings.repeat_interleave(self.num_points, dim=1)
         layers = super().forward(
             query,
             query_pos,
@@ -152,7 +152,7 @@ class MGMapDecoder(MapDecoder):
             attn_mask=attn_mask,
             between=between,
         )
-        stages = self.refine_points(layers[-1], fused, refine=refine, attn_mask=attn_mask)
+        stages = self.refine_points(layers[-1], fused_feats, refine=refine, attn_mask=attn_mask)
         outputs: list[Decoded] = []
         for layer in layers:
             outputs.append(MaskedDecoded(**vars(layer), mask_logits=masks))
@@ -174,13 +174,13 @@ class MGMapDecoder(MapDecoder):
         return torch.einsum("bnhw,bchw->bnc", weights, feats.float()) / total[..., None]
 
     def refine_points(
-        self, last: Decoded, fused: Tensor, refine: Refine, attn_mask: Tensor | None
+        self, last: Decoded, fused_feats: Tensor, refine: Refine, attn_mask: Tensor | None
     ) -> list[Decoded]:
         """Refine the points of the last layer in several stages.
 
         Args:
             last: Output of the last layer.
-            fused: BEV features of all levels of the neck. (B, C, H, W)
+            fused_feats: BEV features of all levels of the neck. (B, C, H, W)
             refine: Function from the number of a branch, point states and references to refined
                 references.
             attn_mask: True where an instance does not attend to another one, or None. (N, N)
@@ -188,21 +188,21 @@ class MGMapDecoder(MapDecoder):
         Returns:
             Outputs of the stages.
         """
-        segmentation = self.segmentation(fused)
-        feats = self.mask_feature(fused, segmentation) if self.patches else None
+        segmentation = self.segmentation(fused_feats)
+        feats = self.mask_feature(fused_feats, segmentation) if self.patches else None
         mask = mask_of_points(attn_mask, self.num_points)
         states = last.point_states.flatten(1, 2)  # (B, N * P, C)
         references = last.references.flatten(1, 2)  # (B, N * P, D)
-        patches = fused.new_zeros(1, 1, fused.shape[1], BINS, BINS)
+        patches = fused_feats.new_zeros(1, 1, fused_feats.shape[1], BINS, BINS)
         outputs: list[Decoded] = []
         branches = self.branches[len(self.layers) :]
         for branch, stage in zip(branches, self.refinements, strict=True):
             references = references.detach()
             if feats is not None:
                 patches = crop_patches(feats, references[..., :2])
-            corrected, glimpses = stage(states, patches, mask=mask)
+            corrected_states, glimpses = stage(states, patches, mask=mask)
             states = torch.cat([states, glimpses], dim=-1)
-            references = refine(branch, corrected, references)
-            output = self.read(corrected, references)
+            references = refine(branch, corrected_states, references)
+            output = self.read(corrected_states, references)
             outputs.append(RefinedDecoded(**vars(output), segmentation=segmentation))
         return outputs

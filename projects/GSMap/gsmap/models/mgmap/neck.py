@@ -99,7 +99,7 @@ class EnhancedNeck(nn.Module):
             feats = stage(feats)
             maps.append(feats)
         size = bev_feats.shape[2:]
-        fused = self.fusion(torch.cat([enlarged(feats, size) for feats in maps], dim=1))
-        maps.append(enlarged(fused, stem.shape[2:]))
+        fused_feats = self.fusion(torch.cat([enlarged(feats, size) for feats in maps], dim=1))
+        maps.append(enlarged(fused_feats, stem.shape[2:]))
         levels = [level(feats) for level, feats in zip(self.levels, maps, strict=True)]
-        return fused, levels
+        return fused_feats, levels

@@ -161,8 +161,8 @@ class PatchRefinement(BaseModule):
         glimpses = glimpses.expand(states.shape[0], states.shape[1], -1)
         memory = self.memory(states)
         glimpses = self.norm(self.layer(glimpses, memory, tgt_mask=mask, memory_mask=mask))
-        corrected = self.fuser(torch.cat([states.detach(), glimpses], dim=-1))
-        return corrected, glimpses
+        corrected_states = self.fuser(torch.cat([states.detach(), glimpses], dim=-1))
+        return corrected_states, glimpses
 
 
 def mask_network(embed_dims: int, masks: int, activation: nn.Module) -> nn.Sequential:

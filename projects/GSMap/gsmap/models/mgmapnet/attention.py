@@ -75,8 +75,8 @@ class PerPointSampling(SamplingAttention):
         """
         query = state.instances + position
         samples = self.compute_samples(query, reference, feats=feats, frames=frames)
-        updated = self.update(state, feats, samples=samples)
-        return updated._replace(mean_locations=samples.locations.mean(dim=(3, 4, 5)))
+        state = self.update(state, feats, samples=samples)
+        return state._replace(mean_locations=samples.locations.mean(dim=(3, 4, 5)))
 
     def update(
         self, state: Granularities, feats: Sequence[Tensor], samples: Samples
@@ -187,8 +187,8 @@ class MultiPointAttention(PerPointSampling):
         # (B, N, P, levels, heads, K, ...) -> (B, N, levels, heads, P * K, ...)
         locations = samples.locations.movedim(2, 4).flatten(4, 5)
         weights = samples.weights.movedim(2, 4).flatten(4, 5)
-        sampled = self.sample(feats, locations, weights=weights).sum(dim=2)  # (B, N, heads, C')
-        instances = state.instances + self.dropout(self.output_proj(sampled.flatten(2)))
+        features = self.sample(feats, locations, weights=weights).sum(dim=2)  # (B, N, heads, C')
+        instances = state.instances + self.dropout(self.output_proj(features.flatten(2)))
         points = self.point_proj(instances).unflatten(-1, (self.layout[1], -1))
         return Granularities(instances, points)
 
@@ -294,11 +294,11 @@ class MultiGranularityAttention(PerPointSampling):
         instance_code: Tensor | float = 0.0
         # Differs from the poster's MLP(S, W): the released model encodes their product.
         if self.point_code is not None:
-            weighted = locations * samples.point_weights.mean(dim=(3, 4))[..., None]
-            point_code = self.point_code(weighted.flatten(3))
+            weighted_locations = locations * samples.point_weights.mean(dim=(3, 4))[..., None]
+            point_code = self.point_code(weighted_locations.flatten(3))
         if self.instance_code is not None:
-            weighted = locations * samples.weights.mean(dim=(3, 4))[..., None]
-            instance_code = self.instance_code(weighted.flatten(2))
+            weighted_locations = locations * samples.weights.mean(dim=(3, 4))[..., None]
+            instance_code = self.instance_code(weighted_locations.flatten(2))
         return point_code, instance_code
 
     def interact_points(
@@ -323,13 +323,13 @@ class MultiGranularityAttention(PerPointSampling):
         if before.points is not None:
             value = torch.cat([before.points, value], dim=2)  # (B, N, 2 P, C)
             key = torch.cat([before.points + before.point_code, key], dim=2)
-        updated = self.p2p(
+        updated_points = self.p2p(
             points.flatten(0, 1),
             query=query.flatten(0, 1),
             key=key.flatten(0, 1),
             value=value.flatten(0, 1),
         )
-        return updated.unflatten(0, points.shape[:2])
+        return updated_points.unflatten(0, points.shape[:2])
 
     def interact_instances(
         self, points: Tensor, code: Tensor | float, instances: Tensor, instance_code: Tensor | float
@@ -349,8 +349,8 @@ class MultiGranularityAttention(PerPointSampling):
             return points
         query = (points + code).flatten(1, 2)  # (B, N * P, C)
         key = instances + instance_code
-        updated = self.p2i(points.flatten(1, 2), query=query, key=key, value=instances)
-        return updated.unflatten(1, points.shape[1:3])
+        updated_points = self.p2i(points.flatten(1, 2), query=query, key=key, value=instances)
+        return updated_points.unflatten(1, points.shape[1:3])
 
 
 class Interaction(nn.Module):
@@ -382,6 +382,6 @@ class Interaction(nn.Module):
         Returns:
             Updated content. (B, Q, C)
         """
-        attended, _ = self.attn(query, key, value, need_weights=False)
-        content = self.norms[0](content + self.dropout(attended))
+        attention_output, _ = self.attn(query, key, value, need_weights=False)
+        content = self.norms[0](content + self.dropout(attention_output))
         return self.norms[1](self.ffn(content))

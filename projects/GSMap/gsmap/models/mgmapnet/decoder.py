@@ -108,8 +108,8 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
             Updated queries.
         """
         position = self.guide_position(query_pos, reference)
-        attended = self.self_attn(state.instances, position, attn_mask)
-        state = state._replace(instances=self.norms[0](attended))
+        attention_output = self.self_attn(state.instances, position, attn_mask)
+        state = state._replace(instances=self.norms[0](attention_output))
         by_instance = reference.unflatten(1, (-1, self.num_points))  # (B, N, P, D)
         position = query_pos
         if self.reference_code is not None:

@@ -76,16 +76,17 @@ def with_granularities(decoder: PARTS) -> PARTS:
     if decoder_class is not None and issubclass(decoder_class, MGMapNetDecoder):
         return decoder
     layer = dict(decoder.get("layer", {}))
-    replaced = {}
+    replaced_parts = {}
     layer_class = class_of(layer)
     if layer_class is None or not issubclass(layer_class, MGMapNetDecoderLayer):
-        replaced["type"] = layer.pop("type", None)
+        replaced_parts["type"] = layer.pop("type", None)
     if class_of(layer.get("self_attn") or {}) is DecoupledSelfAttention:
-        replaced["self_attn"] = layer.pop("self_attn")
+        replaced_parts["self_attn"] = layer.pop("self_attn")
     cross_attn = layer.get("cross_attn") or {}
     if class_of(cross_attn) in (None, BEVDeformableAttention):
-        replaced["cross_attn"] = layer.pop("cross_attn", None)
-    named = {name: part for name, part in replaced.items() if part}
-    if named:
-        print_log(f"MGMapHead replaces {named} of its decoder's layers.", "current", logging.INFO)
+        replaced_parts["cross_attn"] = layer.pop("cross_attn", None)
+    logged_parts = {name: part for name, part in replaced_parts.items() if part}
+    if logged_parts:
+        text = f"MGMapHead replaces {logged_parts} of its decoder's layers."
+        print_log(text, "current", logging.INFO)
     return {**decoder, "type": MGMapNetDecoder, "layer": layer}

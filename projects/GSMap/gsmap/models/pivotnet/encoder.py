@@ -177,8 +177,8 @@ class PivotBEVEncoder(CameraEncoder):
         sources = self.sources(feats)
         position = self.bev_pos.weight
         uv, visible = self.project(calibration["img_from_ground"], img_shape)
-        learned = self.unseen_reference(position).sigmoid()
-        source_reference = torch.where(visible[..., None], uv, learned)  # (B, H * W, 2)
+        learned_reference = self.unseen_reference(position).sigmoid()
+        source_reference = torch.where(visible[..., None], uv, learned_reference)  # (B, H * W, 2)
         shapes = [front_size(self.grid)]
         cell_reference = centres(shapes, position.device).expand_as(source_reference)
         cells = self.bev_embedding.weight.expand(len(uv), -1, -1)  # (B, H * W, C)

@@ -61,8 +61,8 @@ def pack_lines(lines: list[Lines]) -> LinePredictions:
         ends = torch.ones_like(pivot[:, :, :1])
         pivot = torch.cat([ends, pivot[:, :, 1:-1], ends], dim=2)  # (B, n, p, 1)
         reference = torch.cat([class_lines.points, pivot], dim=-1)  # (B, n, p, 3)
-        missing = longest - reference.shape[2]
-        references.append(F.pad(reference, (0, 0, 0, missing), value=-1.0))
+        num_missing = longest - reference.shape[2]
+        references.append(F.pad(reference, (0, 0, 0, num_missing), value=-1.0))
         logits.append(class_lines.logits)
     return LinePredictions(
         scores=class_scores(logits), references=torch.cat(references, dim=1), lines=lines
@@ -141,13 +141,13 @@ class PivotHead(LineHead):
         for label, class_lines in enumerate(layer):
             feature = self.point_branches[label](class_lines.states).float()
             points = (feature.unflatten(-1, (2, -1)) @ mean).sigmoid()  # (B, n, p, 2)
-            predicted = Lines(
+            predicted_lines = Lines(
                 logits=class_lines.logits.float(),
                 points=points,
                 point_logits=self.kind_branches[label](feature).float(),
                 masks=class_lines.masks.float(),
             )
-            lines.append(predicted)
+            lines.append(predicted_lines)
         return pack_lines(lines)
 
     def truth(self, sample: Det3DDataSample) -> list[TrueLines]:

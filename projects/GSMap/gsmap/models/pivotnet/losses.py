@@ -90,7 +90,7 @@ class PivotLosses(LineLosses):
         rows, cols = assigned(torch.from_numpy(total), names, img_meta={"token": case.token})
         num_points = differences.shape[-1]
         is_pivot = torch.zeros(len(rows), num_points, dtype=torch.bool)
-        expected = torch.zeros(len(rows), num_points, 2)
+        target_points = torch.zeros(len(rows), num_points, 2)
         points = np.arange(num_points)
         for pair, (row, col) in enumerate(zip(rows.tolist(), cols.tolist(), strict=True)):
             line = pivots[col, : counts[col]]
@@ -98,8 +98,8 @@ class PivotLosses(LineLosses):
             is_pivot[pair, path] = True
             u = np.interp(points, path, line[:, 0])
             v = np.interp(points, path, line[:, 1])
-            expected[pair] = torch.from_numpy(np.stack([u, v], axis=-1))
-        return Pairs(rows, cols, is_pivot=is_pivot, expected=expected)
+            target_points[pair] = torch.from_numpy(np.stack([u, v], axis=-1))
+        return Pairs(rows, cols, is_pivot=is_pivot, expected=target_points)
 
     def __call__(self, cases: Sequence[Case], matches: Sequence[Pairs]) -> dict[str, Tensor]:
         """Compute the weighted losses of one layer and class.

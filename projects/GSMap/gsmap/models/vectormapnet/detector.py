@@ -83,8 +83,8 @@ class KeyPointLayer(nn.Module):
         """
         value = self.norms[0](states)
         query = value + pos
-        attended, _ = self.self_attn(query, query, value, need_weights=False)
-        states = states + self.dropout(attended)
+        attention_output, _ = self.self_attn(query, query, value, need_weights=False)
+        states = states + self.dropout(attention_output)
         states = states + self.cross_attn(self.norms[1](states) + pos, reference, context)
         return self.ffn(self.norms[2](states), states)
 
@@ -311,11 +311,11 @@ class KeyPointHead(DetectionHead):
         Returns:
             Weighted costs of classes, corner distances and overlaps. (3, N, K)
         """
-        predicted = InstanceData(scores=scores)
-        annotated = InstanceData(labels=truth.labels_3d)
+        pred_instances = InstanceData(scores=scores)
+        gt_instances = InstanceData(labels=truth.labels_3d)
         distance = torch.cdist(boxes, truth.keypoints, p=1)
         overlap = bbox_overlaps(boxes, truth.keypoints, mode="giou")
-        cls_cost = self.cost_cls(predicted, annotated)
+        cls_cost = self.cost_cls(pred_instances, gt_instances)
         return torch.stack([cls_cost, self.box_weight * distance, -self.giou_weight * overlap])
 
 

@@ -148,9 +148,11 @@ class HeightPlanesEncoder(CameraEncoder):
         total = feats.new_zeros(())
         for view in range(feats.shape[1]):
             grid = uv[:, view].unflatten(1, (-1, width)).to(feats.dtype)  # (B, Z * H, W, 2)
-            sampled = F.grid_sample(feats[:, view], grid, align_corners=False)  # (B, C, Z * H, W)
+            view_feats = F.grid_sample(
+                feats[:, view], grid, align_corners=False
+            )  # (B, C, Z * H, W)
             mask = visible[:, view].view(-1, 1, num_planes * height, width)
-            total = total + sampled * mask
+            total = total + view_feats * mask
         num_views = visible.sum(dim=1).clamp(min=1).view(-1, 1, num_planes, height, width)
         return total.unflatten(2, (num_planes, height)) / num_views
 

@@ -243,8 +243,8 @@ class PolylineGenerator(BaseModule):
         """
         number = torch.arange(tokens.shape[1], device=tokens.device)
         source = number // 2 * 2 if by_x else number
-        shifted = (tokens + noise)[:, source].clamp(min=1)
-        return shifted.minimum(constant(tokens, self.canvas.size)[number % 2])
+        shifted_tokens = (tokens + noise)[:, source].clamp(min=1)
+        return shifted_tokens.minimum(constant(tokens, self.canvas.size)[number % 2])
 
     @torch.no_grad()
     def generate(self, bev_feats: Tensor, elements: Elements, draw: Draw) -> Tensor:

@@ -16,8 +16,8 @@ class CachedAttention(nn.MultiheadAttention):
     def keys_values(self, tokens: Tensor) -> Cache:
         """Compute the keys and values of tokens. (n, S, C)"""
         C = self.embed_dim
-        projected = F.linear(tokens, self.in_proj_weight[C:], self.in_proj_bias[C:])
-        keys, values = projected.chunk(2, dim=-1)
+        keys_and_values = F.linear(tokens, self.in_proj_weight[C:], self.in_proj_bias[C:])
+        keys, values = keys_and_values.chunk(2, dim=-1)
         return self.split_heads(keys), self.split_heads(values)
 
     def forward(self, query: Tensor, cache: Cache, mask: Tensor | None = None) -> Tensor:  # type: ignore[override]
@@ -34,14 +34,14 @@ class CachedAttention(nn.MultiheadAttention):
         C = self.embed_dim
         queries = F.linear(query, self.in_proj_weight[:C], self.in_proj_bias[:C])
         keys, values = cache
-        attended = F.scaled_dot_product_attention(
+        attention_output = F.scaled_dot_product_attention(
             self.split_heads(queries),
             keys,
             values,
             attn_mask=mask,
             dropout_p=self.dropout if self.training else 0.0,
         )
-        return self.out_proj(attended.transpose(1, 2).flatten(2))
+        return self.out_proj(attention_output.transpose(1, 2).flatten(2))
 
     def split_heads(self, tokens: Tensor) -> Tensor:
         """Split the channels among the heads. (n, S, C) -> (n, heads, S, C / heads)"""
@@ -94,11 +94,11 @@ class GatedLayer(nn.Module):
         Returns:
             Updated states. (n, T, C)
         """
-        attended = self.self_attn(self.norms[0](states), cache, mask=mask)
-        states = states + self.gates[0] * self.dropout(attended)
+        attention_output = self.self_attn(self.norms[0](states), cache, mask=mask)
+        states = states + self.gates[0] * self.dropout(attention_output)
         query = self.norms[1](states).flatten(0, 1)[None]  # (1, n * T, C)
-        attended = self.cross_attn(query, memory).view(states.shape)
-        states = states + self.gates[1] * self.dropout(attended)
+        attention_output = self.cross_attn(query, memory).view(states.shape)
+        states = states + self.gates[1] * self.dropout(attention_output)
         return states + self.gates[2] * self.dropout(self.ffn(self.norms[2](states)))
 
 
@@ -122,8 +122,8 @@ def keep_most_likely(logits: Tensor, share: float) -> Tensor:
     Returns:
         Logits with -1e9 for masked tokens. (..., tokens)
     """
-    ordered, index = logits.sort(dim=-1, descending=True)
-    law = ordered.softmax(dim=-1)
+    sorted_logits, index = logits.sort(dim=-1, descending=True)
+    law = sorted_logits.softmax(dim=-1)
     is_tail = law.cumsum(dim=-1) - law > share
     is_tail[..., 0] = False
     ranks = index.argsort(dim=-1)

@@ -32,9 +32,9 @@ def bounding_box(line: Floats, smallest: float) -> Floats:
         Corners x0, y0, x1, y1. (4,)
     """
     shape = shapely.LineString(line)
-    missing = smallest - np.ptp(line, axis=0).min()
-    if missing > 0:
-        shape = shape.buffer(missing / 2, quad_segs=16)
+    missing_side = smallest - np.ptp(line, axis=0).min()
+    if missing_side > 0:
+        shape = shape.buffer(missing_side / 2, quad_segs=16)
     return np.array(shape.bounds)
 
 
