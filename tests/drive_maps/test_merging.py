@@ -238,6 +238,21 @@ def test_the_work_grows_with_the_frames_of_a_drive(monkeypatch):
     assert work[1] < 2.3 * work[0]
 
 
+def test_lines_that_no_drive_has_are_refused_before_they_are_merged():
+    drive = drive_of()
+    frame = drive.frames[0]
+    fine = np.stack([np.arange(50_000) % 2, np.linspace(-30.0, 30.0, 50_000)], axis=1)
+    long = [np.array([[0.0, -49_500.0], [float(i), 49_500.0]]) for i in range(9)]
+    for lines, reason in (
+        ([fine], "lie too close together"),
+        (long, r"has 891 km of 'divider' in 1 frames: at most 250 km and 5 km a frame"),
+    ):
+        elements = MapElements.from_polylines(lines, [0] * len(lines), [0.9] * len(lines))
+        one_frame = replace(drive, frames=[replace(frame, elements=elements)])
+        with pytest.raises(ValueError, match=reason):
+            merge(one_frame)
+
+
 def test_what_a_frame_sees_and_how_often_is_that_of_all_elements_looked_at():
     drive = drive_of(0.1, scored=True)
     found = suppress(drive)

@@ -17,12 +17,17 @@ from drivemaps.drive import MIN_LENGTH_M, Drive
 from drivemaps.stitching import JOIN_M, stitch
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray
 from gsmap.structures.polylines import arc_lengths
+from gsmap.utils.errors import InputError
 
 _REACH_M = 1.5  # how far across its line a vertex looks for the same line in another frame
 _MAX_TURN_DEG = 30.0  # between two lines that may be the same
 _STEP_M = 1.0  # largest distance between vertices while lines are merged
 _AT_ONCE = 2000  # vertices whose crossings are looked for together; memory grows with them
 _ROUNDS = 3  # how many times vertices move to the mean
+_MOST_M = 250_000.0  # length of all lines of a class of a drive, beside _MOST_PER_FRAME_M
+_MOST_PER_FRAME_M = 5_000.0
+_MOST_PAIRS = 2 * 10**7  # of vertices and segments that are near each other
+_MOST_PAIRS_PER_FRAME = 16  # of a vertex, where there are more
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +87,11 @@ def merge_lines(drive: Drive, label: int, config: MergeConfig) -> list[tuple[Flo
     Returns:
         Vertices (n, 2) and confidence of each line: the mean over its length of the share of
         frames, of those that see the place, that found it, weighted by their scores.
+
+    Raises:
+        InputError: If the lines are longer or lie closer together than those of a drive do.
     """
+    _require_moderate_length(drive, label)
     strands = _strands(drive, label, config)
     if not len(strands.points):
         return []
@@ -98,6 +107,25 @@ def merge_lines(drive: Drive, label: int, config: MergeConfig) -> list[tuple[Flo
     merged = stitch([np.column_stack([strands.points[p], confidence[p]]) for p in parts])
     long = [line for line in merged if arc_lengths(line)[-1] >= MIN_LENGTH_M]
     return [(line[:, :2], float(line[:, 2].mean())) for line in long]
+
+
+def _require_moderate_length(drive: Drive, label: int) -> None:
+    """Refuse lines that take longer to merge than any drive does.
+
+    Raises:
+        InputError: If the lines of a class are too long.
+    """
+    total_m = 0.0
+    for frame in drive.frames:
+        chosen = frame.elements.select(frame.elements.labels == label)
+        total_m += sum(float(arc_lengths(line)[-1]) for line in chosen.polylines)
+    most_m = _MOST_M + _MOST_PER_FRAME_M * len(drive.frames)
+    if total_m > most_m:
+        raise InputError(
+            f"drive {drive.scene!r} has {total_m / 1000:.0f} km of {drive.classes[label]!r} in "
+            f"{len(drive.frames)} frames: at most {_MOST_M / 1000:g} km and "
+            f"{_MOST_PER_FRAME_M / 1000:g} km a frame are merged; raise --score-thr."
+        )
 
 
 def _strands(drive: Drive, label: int, config: MergeConfig) -> _Strands:
@@ -146,18 +174,29 @@ def _crossings(strands: _Strands) -> _Crossings:
     ends = np.stack([points[inner], points[inner + 1]])
     low, high = ends.min(axis=0), ends.max(axis=0)
     tree = shapely.STRtree(shapely.box(*low.T, *high.T))
-    found = [
-        _crossings_of(np.arange(start, min(start + _AT_ONCE, len(points))), strands, normals, tree)
-        for start in range(0, len(points), _AT_ONCE)
-    ]
+    frames = len(np.unique(strands.frames))
+    budget = max(_MOST_PAIRS, _MOST_PAIRS_PER_FRAME * frames * len(points))
+    found = []
+    for start in range(0, len(points), _AT_ONCE):
+        chosen = np.arange(start, min(start + _AT_ONCE, len(points)))
+        pairs = _near_pairs(chosen, strands, normals, tree)
+        budget -= pairs.shape[1]
+        if budget < 0:
+            raise InputError(
+                f"the {len(points)} vertices of lines of one class, at most {_STEP_M:g} m apart, "
+                f"lie too close together: more than {_MOST_PAIRS:.0e} pairs, and "
+                f"{_MOST_PAIRS_PER_FRAME} of a vertex and frame, are within {_REACH_M:g} m; raise "
+                "--score-thr."
+            )
+        found.append(_crossings_of(chosen, strands, normals, pairs))
     vertices, segments, distances = map(np.concatenate, zip(*found, strict=True))
     return _Crossings(vertices, segments, distances, normals)
 
 
-def _crossings_of(
+def _near_pairs(
     chosen: IntArray, strands: _Strands, normals: FloatArray, tree: shapely.STRtree
-) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return vertices, segments and distances of the crossings of some vertices. (C,) each
+) -> IntArray:
+    """Find the segments near some vertices: positions in ``chosen`` and in the tree. (2, n)
 
     Args:
         chosen: The vertices, one after another. (m,)
@@ -165,11 +204,25 @@ def _crossings_of(
         normals: Direction to the left at every vertex. (M, 2)
         tree: Boxes of the segments, in the order of ``strands.inner``.
     """
-    points, owners = strands.points, strands.owners
+    centres = strands.points[chosen]
     reach = np.abs(_REACH_M * normals[chosen])
-    across = shapely.box(*(points[chosen] - reach).T, *(points[chosen] + reach).T)
-    vertices, segments = tree.query(across)
-    vertices, segments = chosen[vertices], strands.inner[segments]
+    across = shapely.box(*(centres - reach).T, *(centres + reach).T)
+    return tree.query(across)
+
+
+def _crossings_of(
+    chosen: IntArray, strands: _Strands, normals: FloatArray, pairs: IntArray
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return vertices, segments and distances of the crossings of some vertices. (C,) each
+
+    Args:
+        chosen: The vertices, one after another. (m,)
+        strands: The lines.
+        normals: Direction to the left at every vertex. (M, 2)
+        pairs: Vertices and segments that are near each other (`_near_pairs`). (2, n)
+    """
+    points, owners = strands.points, strands.owners
+    vertices, segments = chosen[pairs[0]], strands.inner[pairs[1]]
     other = owners[vertices] != owners[segments]
     vertices, segments = vertices[other], segments[other]
     n, here = normals[vertices], points[vertices]
