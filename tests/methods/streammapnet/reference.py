@@ -223,14 +223,14 @@ def fusion_rows(
     bev.convz.register_forward_pre_hook(
         lambda _, args: seen["h"].append(flipped(args[0].detach()[:, :256]))
     )
-    own = bev.places
+    original = bev.source_locations
 
-    def places(*args: Any) -> Tensor:
-        grid = own(*args)
+    def source_locations(*args: Any, **kwargs: Any) -> Tensor:
+        grid = original(*args, **kwargs)
         seen["grid"].append(grid.flip(1) * grid.new_tensor([1.0, -1.0]))
         return grid
 
-    bev.places = places  # type: ignore[method-assign]
+    bev.source_locations = source_locations  # type: ignore[method-assign]
     feats = [
         parts.normal(f"smn_bev_t{frame}", (BATCH, 256, ROWS, COLS)).requires_grad_()
         for frame in range(FRAMES)
