@@ -12,6 +12,7 @@ import gsmap  # noqa: F401 - first: Ctrl-C is one line from here on, foreign set
 # isort: split
 import argparse
 import json
+import math
 import time
 from collections.abc import Mapping
 from functools import partial
@@ -25,7 +26,8 @@ from drivemaps.config import MergeConfig
 from drivemaps.drive import Drive, read_drive
 from drivemaps.geodetic import MapGrid, MapOrigin, known_origin, require_near
 from drivemaps.geojson import write_geojson
-from drivemaps.lanelet2 import write_lanelet2
+from drivemaps.lanelet2 import SPEED_LIMIT_KMH, write_lanelet2
+from drivemaps.lanelets import lane_graph_of
 from drivemaps.mcap import write_mcap
 from drivemaps.merging import confident, merge, suppress
 from drivemaps.replay import Replay
@@ -94,6 +96,13 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         "--crs", help="grid that the poses are in, such as EPSG:32650 (UTM), instead of --origin"
     )
     parser.add_argument(
+        "--speed-limit",
+        type=float,
+        default=SPEED_LIMIT_KMH,
+        metavar="KMH",
+        help="speed limit of lanelets (osm) in km/h, as maps have none (default: %(default)g)",
+    )
+    parser.add_argument(
         "--allow-other-split",
         action="store_true",
         help="score maps of a model that was trained on another split, whose places it may share",
@@ -106,6 +115,8 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
 
 def check_formats(args: argparse.Namespace, ann: AnnotationFile) -> None:
     """Raise an error, before anything is written, if a format lacks its package or an origin."""
+    if not 0 < args.speed_limit < math.inf:
+        raise ValueError(f"--speed-limit must be > 0, got {args.speed_limit}.")
     for key in EXTRAS.keys() & set(args.formats):
         import_extra(*EXTRAS[key])
     origins = {name: origin_of(args, ann, name) for name in set(ann.column("map_name"))}
@@ -144,13 +155,24 @@ def write_map(
     replay = Replay(drive, elements, ann.meta.frame, colours, root, ann.meta.ground_z_m)
     writers = {
         "geojson": partial(write_geojson, classes=classes, origin=None),
-        "osm": partial(write_lanelet2, classes=classes, origin=origin),
+        "osm": lambda path, _: write_lanelet2(
+            path,
+            elements,
+            classes=classes,
+            origin=origin,
+            lanes=lanes,
+            speed_limit_kmh=args.speed_limit,
+        ),
         "rrd": lambda path, _: write_rerun(path, replay),
         "mcap": lambda path, _: write_mcap(path, replay),
         "mp4": lambda path, _: write_video(path, replay),
     }
     for key in {"png", "svg"} & set(args.formats):
         writers[key] = lambda path, _: draw(path, drive, elements, ann, style)
+    lanes = None
+    if "osm" in args.formats:
+        lanes = lane_graph_of(drive, elements)
+        print(f"{counted(len(lanes.lanelets), 'lanelet')} of centre lines: {stem}.osm")
     paths = []
     for key in args.formats:
         paths.append(f"{stem}.{key}")
