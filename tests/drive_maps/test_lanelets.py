@@ -84,7 +84,8 @@ def test_bounds_lie_on_the_borders_beside_a_lane(tmp_path) -> None:
     np.testing.assert_allclose(lanes.left[:, 1], 1.5)
     np.testing.assert_allclose(lanes.right[:, 1], -2.4)
     np.testing.assert_allclose(lanes.lanelets[0].left[:, 1], 1.5)
-    far = lane_graph(fork()[:1], [divider + [0, 5], kerb - [0, 5]])
+    aside = np.array([0.0, 5.0])
+    far = lane_graph(fork()[:1], [divider + aside, kerb - aside])
     np.testing.assert_allclose(far.left[:, 1], 1.75)
 
 
@@ -94,7 +95,7 @@ def test_the_direction_is_that_of_the_frames() -> None:
     sample = drive_of().frames[0].sample
     frames = [
         DriveFrame(sample, MapElements.from_polylines([piece], [2]))
-        for piece in (whole, whole + [20, 0])
+        for piece in (whole, whole + np.array([20.0, 0.0]))
     ]
     drive = Drive("scene", CLASSES, (-30.0, 30.0), (-15.0, 15.0), frames)
     merged = MapElements.from_polylines([np.array([[60.0, 0.0], [0.0, 0.0]])], [2])

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import shapely
@@ -194,7 +195,7 @@ def _split(lines: Sequence[FloatArray]) -> list[FloatArray]:
                 if near and alike and inside:
                     cuts.append(cut)
         cuts.sort()
-        for low, high in zip(cuts[:-1], cuts[1:], strict=True):
+        for low, high in pairwise(cuts):
             part = shapely.ops.substring(shape, low, high)
             parts.append(_resampled(shapely.get_coordinates(part)))
     return parts
