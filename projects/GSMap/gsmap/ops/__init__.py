@@ -1,8 +1,9 @@
 """Rasterizers and other tensor operations.
 
-``ops/<op>/__init__.py`` holds the public functions, which check and choose a backend;
-``reference.py`` plain torch, the definition of right; ``numba.py`` and ``triton.py`` fused kernels,
-imported when they are first used. What torch itself does fast is one file.
+``ops/<op>/__init__.py`` has the public functions, which check their arguments and choose a backend.
+``reference.py`` is the implementation in plain torch, against which the others are tested.
+``numba.py`` and ``triton.py`` are fused kernels for a CPU and a GPU, imported at their first use.
+An operation that is fast in plain torch is a single file.
 """
 
 from gsmap.utils.lazy import lazy_names

@@ -1,53 +1,76 @@
-"""What the numba kernels share: ranges of pixels, and threads over instances.
+"""Helpers of the numba kernels: ranges of pixels, and threads over instances.
 
-Numba's cache watches the file of a kernel alone: delete ``__pycache__`` after a change here.
+Numba's cache watches only the file of a kernel: delete ``__pycache__`` after a change in this file.
 """
 
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
 from typing import Any
 
 import torch
 from numba import njit
 from torch import Tensor
 
-import gsmap.utils.compilation  # noqa: F401 - says that kernels are compiled
+import gsmap.utils.compilation  # noqa: F401 - logs that kernels are compiled
 
-SERIAL_BELOW = 1 << 16  # pixels; starting a thread costs about as much as filling so many
+SERIAL_BELOW = 1 << 16  # pixels; starting a thread costs about as much as filling this many
 
-# Associative sums may be split into vector lanes (always in the same way, so results repeat);
+# Associative sums may be split into vector lanes, always in one order, so that results repeat.
 # NaN and infinity keep their meaning.
 FASTMATH = {"reassoc", "contract", "nsz", "arcp"}
 
 
 def run_in_threads(kernel: Callable[..., None], pixels: int, *arguments: Any) -> None:
-    """Call ``kernel(*arguments, first, last)`` on slices of the instances, one a torch thread.
+    """Run a kernel on slices of the instances, one slice per torch thread.
 
-    The kernel works on instances ``first`` to ``last - 1`` of its first argument, each from start
-    to end in one thread, so the result does not depend on the number of threads. A tensor becomes
-    an array; one that is written to must be contiguous. Threads live for one call: nothing survives
-    into a forked process, and calls from several Python threads (torch's autograd engine) cannot
-    meet.
+    A thread computes each of its instances from start to end, so the result does not depend on the
+    number of threads. Threads live for one call. None survives into a forked process, and calls
+    from several Python threads, as of torch's autograd engine, do not share any.
+
+    Args:
+        kernel: Called as ``kernel(*arguments, first, last)`` for the instances ``first`` to
+            ``last - 1``.
+        pixels: Number of pixels of an instance.
+        *arguments: Arguments of the kernel. The length of the first one is the number of instances.
+            A tensor becomes an array, and an output must be a contiguous tensor.
     """
     arrays = [a.contiguous().numpy() if isinstance(a, Tensor) else a for a in arguments]
     count = len(arrays[0])
+
+    def run(first: int, last: int) -> None:
+        kernel(*arrays, first, last)
+
+    if count == 0:
+        return
     workers = min(torch.get_num_threads(), count)
     if workers <= 1 or count * pixels < SERIAL_BELOW:
-        if count:
-            kernel(*arrays, 0, count)
+        run(0, count)
         return
     bounds = [round(i * count / workers) for i in range(workers + 1)]
     with ThreadPoolExecutor(workers - 1) as pool:
-        jobs = [pool.submit(kernel, *arrays, *pair) for pair in pairwise(bounds[1:])]
-        kernel(*arrays, bounds[0], bounds[1])
+        jobs = [pool.submit(run, bounds[i], bounds[i + 1]) for i in range(1, workers)]
+        run(bounds[0], bounds[1])
         for job in jobs:
             job.result()
 
 
 @njit(inline="always")
 def pixel_range(low, high, origin, step, size):  # type: ignore[no-untyped-def]
-    """Return the first and one past the last of the pixels whose centres lie in [low, high]."""
-    first, last = (low - origin) / step - 0.5, (high - origin) / step - 0.5
-    return math.ceil(min(max(first, 0.0), size)), math.floor(max(min(last, size - 1.0), -1.0)) + 1
+    """Find the pixels whose centres lie in an interval, along one axis of a raster.
+
+    Args:
+        low: Start of the interval, in the unit of the raster.
+        high: End of the interval, included.
+        origin: Coordinate of the raster's lower edge.
+        step: Size of a pixel.
+        size: Number of pixels along the axis.
+
+    Returns:
+        Index of the first pixel, and one past the index of the last.
+    """
+    first = (low - origin) / step - 0.5
+    last = (high - origin) / step - 0.5
+    start = math.ceil(min(max(first, 0.0), size))
+    end = math.floor(max(min(last, size - 1.0), -1.0)) + 1
+    return start, end

@@ -1,4 +1,4 @@
-"""The choice between plain torch and the fused kernels, which become operators of torch."""
+"""Choice between plain torch and the fused kernels, which are registered as operators of torch."""
 
 import os
 import warnings
@@ -15,43 +15,45 @@ PACKAGES = {"cpu": "numba", "triton": "triton"}
 DEVICES = {"cpu": "cpu", "triton": "cuda"}
 INSTALLED = {backend: find_spec(package) is not None for backend, package in PACKAGES.items()}
 
-# The functions that have a Triton kernel, and whether "auto" takes it on a GPU: only if a GPU has
-# run it and found it equal to the reference. backend="triton" takes any of them.
+# Functions with a Triton kernel, and whether "auto" takes it on a GPU: only kernels that were equal
+# to the reference on a GPU. backend="triton" takes any of them.
 TRITON_KERNELS = {
     "deformable_sample": True,
     "draw_polylines": True,
     "pairwise_soft_iou": True,
     "raster_loss": False,
     "render_gaussians": True,
-    "render_gaussians_in_warps": False,  # in place of that of render_gaussians, "triton", too
+    "render_gaussians_in_warps": False,  # replaces the kernel of render_gaussians where enabled
     "sample_kernels": True,
     "soft_rasters": False,
 }
-SWITCH = "GSMAP_TRITON_KERNELS"  # environment: further kernels for "auto", with commas, or "all"
-UNORDERED = (
-    "deformable_sample",
-    "sample_kernels",
-)  # their gradients are added up in any order (atomics)
+SWITCH = "GSMAP_TRITON_KERNELS"  # environment variable: further kernels for "auto", or "all"
+UNORDERED = ("deformable_sample", "sample_kernels")  # atomics add their gradients in any order
 
 
 def triton_kernels(switch: str) -> set[str]:
-    """Return the functions whose Triton kernels ``"auto"`` takes.
+    """Select the functions whose Triton kernels ``"auto"`` takes.
 
     Args:
-        switch: Names of further ones, separated by commas, or ``"all"``.
+        switch: Names of further functions, separated by commas, or ``"all"``.
+
+    Returns:
+        Names of the functions, keys of ``TRITON_KERNELS``.
 
     Raises:
-        ValueError: If a name has no kernel.
+        ValueError: If a function without a kernel is named.
     """
     names = {name.strip() for name in switch.split(",")} - {""}
     if names == {"all"}:
         return set(TRITON_KERNELS)
-    if unknown := names - TRITON_KERNELS.keys():
+    unknown = names - TRITON_KERNELS.keys()
+    if unknown:
         raise ValueError(
             f"{SWITCH} names {sorted(unknown)}, which are no Triton kernels: choose from "
             f"{sorted(TRITON_KERNELS)}, or 'all'."
         )
-    return names | {name for name, trusted in TRITON_KERNELS.items() if trusted}
+    trusted = {name for name, is_trusted in TRITON_KERNELS.items() if is_trusted}
+    return names | trusted
 
 
 AUTO_KERNELS = triton_kernels(os.environ.get(SWITCH, ""))
@@ -60,29 +62,32 @@ AUTO_KERNELS = triton_kernels(os.environ.get(SWITCH, ""))
 def choose_backend(
     backend: str, tensor: Tensor, fused: Collection[str] = ("cpu", "triton"), kernel: str = ""
 ) -> str:
-    """Name the backend that is to work on a tensor: ``"reference"``, ``"cpu"`` or ``"triton"``.
+    """Choose the backend of an operation.
 
     Args:
-        backend: ``"auto"``: the fused kernels that serve the tensor's device and type, else the
-            reference; or the backend itself.
-        tensor: What is worked on.
-        fused: Which fused kernels there are: ``"cpu"`` (numba), ``"triton"``.
+        backend: ``"auto"`` for the fused kernels of the tensor's device and type, or the reference
+            if there are none; or the name of a backend.
+        tensor: Input of the operation, whose device and type decide.
+        fused: Fused kernels of the operation: ``"cpu"`` (numba), ``"triton"``.
         kernel: Name of the function in ``TRITON_KERNELS``, if it has a Triton kernel.
 
+    Returns:
+        ``"reference"``, ``"cpu"`` or ``"triton"``.
+
     Raises:
-        ValueError: If ``backend`` is unknown, does not serve the tensor, is not installed, or is
-            not as deterministic as torch is told to be.
+        ValueError: If ``backend`` is unknown, does not support the tensor, is not installed, or
+            is not deterministic although torch's deterministic algorithms are enabled.
     """
-    known = ("auto", "reference", *fused)
-    if backend not in known:
-        raise ValueError(f"backend must be one of {known}, got {backend!r}.")
+    choices = ("auto", "reference", *fused)
+    if backend not in choices:
+        raise ValueError(f"backend must be one of {choices}, got {backend!r}.")
     if backend == "reference":
         return backend
     unordered = kernel in UNORDERED and torch.are_deterministic_algorithms_enabled()
     if backend == "auto":
         trusted = "triton" in fused and kernel in AUTO_KERNELS and not unordered
-        serving = [name for name in fused if name != "triton" or trusted]
-        return _serving_backend(serving, tensor)
+        candidates = [name for name in fused if name != "triton" or trusted]
+        return _automatic_backend(candidates, tensor)
     if tensor.dtype != torch.float32:
         raise ValueError(
             f"backend {backend!r} computes in float32, got {tensor.dtype}: use 'reference'."
@@ -100,18 +105,19 @@ def choose_backend(
     return backend
 
 
-def _serving_backend(fused: Collection[str], tensor: Tensor) -> str:
-    """Return the installed backend that serves a tensor, else the reference."""
-    serving = [name for name in fused if DEVICES[name] == tensor.device.type]
-    if tensor.dtype != torch.float32 or not serving:
+def _automatic_backend(fused: Collection[str], tensor: Tensor) -> str:
+    """Return the installed fused backend for a tensor, or ``"reference"``."""
+    candidates = [name for name in fused if DEVICES[name] == tensor.device.type]
+    if tensor.dtype != torch.float32 or not candidates:
         return "reference"
-    if serving == ["cpu"] and not INSTALLED["cpu"]:
+    if candidates == ["cpu"] and not INSTALLED["cpu"]:
         warnings.warn(
             "numba is not installed: rasters are computed by the slow reference. "
             "Install it with `pip install numba`.",
             stacklevel=3,
         )
-    return serving[0] if INSTALLED[serving[0]] else "reference"
+    first = candidates[0]
+    return first if INSTALLED[first] else "reference"
 
 
 def fused_operator(
@@ -121,39 +127,49 @@ def fused_operator(
     differentiable: int = 0,
     dtype: torch.dtype | None = None,
 ) -> CustomOpDef:
-    """Register an operator of torch, ``gsmap::<function>``, that fused kernels compute.
+    """Register a function of the fused kernels as an operator of torch, ``gsmap::<function>``.
 
     Registered operators work under torch.compile, autocast, DistributedDataParallel and gradient
-    checkpointing. Only inputs are kept, so the backward pass can run twice (``retain_graph``). A
-    gradient of the gradient raises a RuntimeError.
+    checkpointing. Only inputs are saved for the backward pass, which can therefore run twice
+    (``retain_graph``). Differentiating a gradient raises a RuntimeError.
 
     Args:
-        name: ``<folder>.<function>``. The folder's modules, imported when first used, have the
-            function, which returns a tensor, and, of the gradient in it and the same arguments,
-            ``<function>_backward``, which returns contiguous gradients.
-        arguments: The function's arguments as in a schema of torch, tensors first; the operator
-            takes the backend after them.
-        shape: Of the arguments, the output's shape.
-        differentiable: In how many of the tensors, the first ones, there are gradients.
-        dtype: Type of the output; None is the first tensor's.
+        name: ``<folder>.<function>``. The folder's modules, imported at their first use, define the
+            function, which returns a tensor. They also define ``<function>_backward``, which takes
+            the gradient of the output before the function's arguments and returns contiguous
+            gradients.
+        arguments: Arguments of the function in the syntax of a torch schema, tensors first. The
+            operator takes the backend as a further, last argument.
+        shape: Function from the arguments to the shape of the output.
+        differentiable: Number of tensors, from the first one, that have gradients.
+        dtype: Type of the output; None for the type of the first tensor.
+
+    Returns:
+        The operator.
     """
     folder, function = name.split(".")
-    tensors = arguments.count("Tensor ")
+    num_tensors = arguments.count("Tensor ")
 
-    def fused(backend: str, function: str) -> Callable[..., Any]:
-        return getattr(import_module(f"gsmap.ops.{folder}.{PACKAGES[backend]}"), function)
+    def load_kernel(backend: str, function: str) -> Callable[..., Any]:
+        module = import_module(f"gsmap.ops.{folder}.{PACKAGES[backend]}")
+        return getattr(module, function)
 
     def forward(*inputs: Any) -> Tensor:
-        return fused(inputs[-1], function)(*inputs[:-1])
+        kernel = load_kernel(inputs[-1], function)
+        return kernel(*inputs[:-1])
+
+    def fake_forward(*inputs: Any) -> Tensor:
+        return inputs[0].new_empty(shape(*inputs[:-1]), dtype=dtype)
 
     schema = f"({arguments}, str backend) -> Tensor"
     operator = custom_op(f"gsmap::{function}", forward, mutates_args=(), schema=schema)
-    operator.register_fake(lambda *inputs: inputs[0].new_empty(shape(*inputs[:-1]), dtype=dtype))
+    operator.register_fake(fake_forward)
     if not differentiable:
         return operator
 
     def backward(*inputs: Any) -> list[Tensor]:
-        return list(fused(inputs[-1], f"{function}_backward")(*inputs[:-1]))
+        kernel = load_kernel(inputs[-1], f"{function}_backward")
+        return list(kernel(*inputs[:-1]))
 
     schema = f"(Tensor grads, {arguments}, str backend) -> Tensor[]"
     gradient = custom_op(f"gsmap::{function}_backward", backward, mutates_args=(), schema=schema)
@@ -164,12 +180,13 @@ def fused_operator(
         return [torch.empty_like(x, memory_format=contiguous) for x in inputs[:differentiable]]
 
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.save_for_backward(*inputs[:tensors])
-        ctx.settings = inputs[tensors:]
+        ctx.save_for_backward(*inputs[:num_tensors])
+        ctx.settings = inputs[num_tensors:]
 
     def differentiate(ctx: Any, grads: Tensor) -> tuple[Any, ...]:
         gradients = gradient(grads, *ctx.saved_tensors, *ctx.settings)
-        return *gradients, *(None,) * (tensors + len(ctx.settings) - differentiable)
+        num_without = num_tensors + len(ctx.settings) - differentiable
+        return *gradients, *(None,) * num_without
 
     operator.register_autograd(differentiate, setup_context=setup_context)
     return operator

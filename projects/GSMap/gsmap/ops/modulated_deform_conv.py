@@ -1,4 +1,4 @@
-"""Modulated deformable convolution (DCNv2) in torch, for where mmcv has no compiled operator."""
+"""Modulated deformable convolution (DCNv2) in torch, for mmcv without compiled operators."""
 
 import torch
 import torch.nn.functional as F
@@ -19,40 +19,47 @@ def modulated_deform_conv(
     groups: int,
     deform_groups: int,
 ) -> Tensor:
-    """Convolve at shifted and weighted places, like mmcv's operator. -> (B, O, h, w)
+    """Convolve images with a filter whose taps are shifted and weighted, like mmcv's operator.
 
-    Outside the images everything is zero. All pairs are of rows and columns, in pixels.
+    Images are zero outside of their borders.
 
     Args:
-        images: The input. (B, C, H, W)
-        weight: The filters, of K = kh * kw taps. (O, C / groups, kh, kw)
-        bias: Added to each output channel (O,), or None.
-        offset: Shift of every tap along rows, then columns. (B, deform_groups * K * 2, h, w)
-        mask: Weight of every tap. (B, deform_groups * K, h, w)
-        stride: Steps of the filters.
-        padding: Zeros around the images.
-        dilation: Distances of the taps.
-        groups: Groups of channels that are convolved each by itself.
-        deform_groups: Groups of channels with shifts of their own.
+        images: Input images. (B, C, H, W)
+        weight: Filters of K = kh * kw taps. (O, C / groups, kh, kw)
+        bias: Bias of each output channel (O,), or None.
+        offset: Shift of each tap along rows, then columns, in pixels. (B, deform_groups * K * 2,
+            h, w)
+        mask: Weight of each tap. (B, deform_groups * K, h, w)
+        stride: Steps of the filters along rows and columns, in pixels.
+        padding: Zeros added on each side of the rows and columns.
+        dilation: Distances of the taps along rows and columns, in pixels.
+        groups: Number of groups of channels that are convolved separately.
+        deform_groups: Number of groups of channels with separate shifts and weights of the taps.
+
+    Returns:
+        Convolved images. (B, O, h, w)
     """
     batch, _, *size = images.shape
-    taps = weight.shape[2] * weight.shape[3]
-    shifts = offset.unflatten(1, (deform_groups, taps, 2)).unbind(3)
-    grid = torch.meshgrid(
-        *(torch.arange(n, device=images.device) for n in weight.shape[2:]), indexing="ij"
-    )
-    places = []
-    for axis, (shift, tap) in enumerate(zip(shifts, grid, strict=True)):
-        starts = torch.arange(offset.shape[2 + axis], device=images.device) * stride[axis]
+    out_size = offset.shape[2:]  # (h, w)
+    num_taps = weight.shape[2] * weight.shape[3]
+    shifts = offset.unflatten(1, (deform_groups, num_taps, 2)).unbind(3)
+    tap_rows = torch.arange(weight.shape[2], device=images.device)
+    tap_cols = torch.arange(weight.shape[3], device=images.device)
+    taps = torch.meshgrid(tap_rows, tap_cols, indexing="ij")
+    coordinates = []
+    for axis, (shift, tap) in enumerate(zip(shifts, taps, strict=True)):
+        starts = torch.arange(out_size[axis], device=images.device) * stride[axis]
         starts = (starts - padding[axis]).view((-1, 1) if axis == 0 else (1, -1))
-        place = shift + starts + tap.reshape(-1, 1, 1) * dilation[axis]  # (B, G, K, h, w)
-        places.append((2 * place + 1) / size[axis] - 1)
-    where = torch.stack(places[::-1], -1).flatten(0, 1).flatten(1, 2)  # (B * G, K * h, w, 2)
-    parts = images.reshape(batch * deform_groups, -1, *size)
-    sampled = F.grid_sample(parts, where, align_corners=False)
-    sampled = sampled.view(batch, deform_groups, -1, taps, *offset.shape[2:])
-    sampled = sampled * mask.unflatten(1, (deform_groups, 1, taps))
-    columns = sampled.reshape(batch, groups, -1, offset.shape[2] * offset.shape[3])
-    out = (weight.view(groups, len(weight) // groups, -1) @ columns).flatten(1, 2)
-    out = out if bias is None else out + bias[:, None]
-    return out.unflatten(2, offset.shape[2:])
+        pixels = shift + starts + tap.reshape(-1, 1, 1) * dilation[axis]  # (B, G, K, h, w)
+        coordinates.append((2 * pixels + 1) / size[axis] - 1)
+    rows, cols = coordinates
+    locations = torch.stack([cols, rows], dim=-1).flatten(0, 1).flatten(1, 2)  # (B G, K h, w, 2)
+    parts = images.reshape(batch * deform_groups, -1, size[0], size[1])
+    samples = F.grid_sample(parts, locations, align_corners=False)
+    samples = samples.view(batch, deform_groups, -1, num_taps, out_size[0], out_size[1])
+    samples = samples * mask.unflatten(1, (deform_groups, 1, num_taps))
+    columns = samples.reshape(batch, groups, -1, out_size[0] * out_size[1])
+    out = (weight.view(groups, len(weight) // groups, -1) @ columns).flatten(1, 2)  # (B, O, h w)
+    if bias is not None:
+        out = out + bias[:, None]
+    return out.unflatten(2, out_size)

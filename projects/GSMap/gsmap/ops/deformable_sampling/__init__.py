@@ -1,4 +1,4 @@
-"""Sampling of a map at weighted places: one weighted bag of table rows per output."""
+"""Sampling of a feature map at weighted locations: one weighted bag of table rows per output."""
 
 import torch
 import torch.nn.functional as F
@@ -16,16 +16,16 @@ _sum_rows = fused_operator(
 _deformable_sample = fused_operator(
     "deformable_sampling.deformable_sample",
     "Tensor value, Tensor locations, Tensor weights, int height, int width",
-    lambda value, locations, *_: (*locations.shape[:3], value.shape[3]),
+    lambda value, locations, *_: (*locations.shape[:3], value.shape[3]),  # (B, Q, heads, C)
     differentiable=3,
     dtype=torch.float32,
 )
 
 
 def has_kernel(value: Tensor) -> bool:
-    """Return whether `deformable_sample` samples a map by one kernel, if it chooses itself."""
+    """Whether `deformable_sample` takes its Triton kernel for a map by default."""
     like = at_least_float32(value[:0])
-    return choose_backend("auto", like, ("triton",), "deformable_sample") == "triton"
+    return choose_backend("auto", like, fused=("triton",), kernel="deformable_sample") == "triton"
 
 
 def deformable_sample(
@@ -35,81 +35,101 @@ def deformable_sample(
     weights: Tensor,
     backend: str = "auto",
 ) -> Tensor:
-    """Sum bilinear samples of a map, each head with its own places (Deformable DETR Eq. 2).
+    """Sum weighted bilinear samples of a feature map for each head (Deformable DETR Eq. 2).
 
-    Each output row is one weighted bag of table rows: no tensor of samples in between. The heads'
-    sums are concatenated, in the wider type of map and weights, at least float32.
-    -> (B, Q, heads * C)
+    Each output row is one weighted bag of table rows, without a tensor of all the samples.
 
     Args:
-        value: Flattened map, row-major, also in half precision. (B, H * W, heads, C)
-        shape: Rows and columns of the map.
+        value: Flattened feature map, row-major, float32 or half precision. (B, H * W, heads, C)
+        shape: Rows H and columns W of the map.
         locations: Sampling points (x, y), [0, 1] over the map. (B, Q, heads, S, 2)
         weights: Attention weights. (B, Q, heads, S)
-        backend: As in `sum_rows`; ``"triton"`` is one kernel forward and one backward, which adds
-            the map's gradient up in any order.
+        backend: A backend of `sum_rows`, or ``"triton"``: one kernel for the forward pass, and one
+            for the backward pass, which adds the gradient of the map in any order.
+
+    Returns:
+        Sums of all heads, concatenated, differentiable in ``value``, ``locations`` and
+        ``weights``. They have the wider type of value and weights, at least float32.
+        (B, Q, heads * C)
 
     Raises:
-        ValueError: If ``backend`` does not serve.
+        ValueError: If ``backend`` is unknown or does not support the inputs.
     """
-    dtype = torch.promote_types(torch.promote_types(value.dtype, weights.dtype), torch.float32)
-    locations, weights = locations.to(dtype), weights.to(dtype)
+    dtype = torch.promote_types(value.dtype, weights.dtype)
+    dtype = torch.promote_types(dtype, torch.float32)
+    locations = locations.to(dtype)
+    weights = weights.to(dtype)
     if backend in ("auto", "triton"):
-        fused = choose_backend(backend, weights, ("triton",), "deformable_sample")
+        fused = choose_backend(backend, weights, fused=("triton",), kernel="deformable_sample")
         if fused == "triton":
-            return _deformable_sample(value, locations, weights, *shape, fused).flatten(2)
+            height, width = shape
+            sums = _deformable_sample(value, locations, weights, height, width, fused)
+            return sums.flatten(2)
     value = value.to(dtype)
     batch, num_cells, heads, channels = value.shape
-    cells, cell_weights = bilinear_cells(locations, weights, shape)  # (B, Q, heads, 4 S)
+    cells, cell_weights = bilinear_cells(locations, weights, shape=shape)  # (B, Q, heads, 4 S)
     sample = torch.arange(batch, device=value.device).view(-1, 1, 1, 1)
     head = torch.arange(heads, device=value.device).view(1, 1, -1, 1)
     rows = (sample * num_cells + cells) * heads + head
-    return sum_rows(value.reshape(-1, channels), rows, cell_weights, backend).flatten(2)
+    table = value.reshape(-1, channels)
+    return sum_rows(table, rows, weights=cell_weights, backend=backend).flatten(2)
 
 
 def bilinear_cells(
     locations: Tensor, weights: Tensor, shape: tuple[int, int]
 ) -> tuple[Tensor, Tensor]:
-    """Return the cells (row-major) around sampling locations, and their weights. 2 x (..., 4 S)
+    """Find the four cells around each sampling point, and their weights.
 
-    The value of a cell lies at its centre (``align_corners=False``). Outside the map both are zero;
-    a location that is not a number has a valid index and its weight is not a number.
+    The value of a cell lies at its centre (``align_corners=False``).
 
     Args:
         locations: Sampling points (x, y), [0, 1] over the map. (..., S, 2)
-        weights: Their weights. (..., S)
+        weights: Weights of the sampling points. (..., S)
         shape: Rows and columns of the map.
+
+    Returns:
+        Row-major indices of the cells, and their weights, both (..., 4 S). Cells outside of the map
+        have the index and the weight zero. The cells of a NaN location have valid indices and NaN
+        weights.
     """
     height, width = shape
-    x, y = locations[..., 0] * width - 0.5, locations[..., 1] * height - 0.5
-    x0, y0 = x.detach().floor(), y.detach().floor()
-    right, lower = x - x0, y - y0
-    cells, cell_weights = [], []
-    for col, wx in ((x0, 1 - right), (x0 + 1, right)):
-        for row, wy in ((y0, 1 - lower), (y0 + 1, lower)):
+    x = locations[..., 0] * width - 0.5
+    y = locations[..., 1] * height - 0.5
+    x0 = x.detach().floor()
+    y0 = y.detach().floor()
+    right = x - x0
+    lower = y - y0
+    cells = []
+    cell_weights = []
+    for col, share_x in ((x0, 1 - right), (x0 + 1, right)):
+        for row, share_y in ((y0, 1 - lower), (y0 + 1, lower)):
             inside = (col >= 0) & (col < width) & (row >= 0) & (row < height)
             cells.append(torch.where(inside, row * width + col, 0))
-            cell_weights.append(wx * wy * weights * inside)
-    return torch.cat(cells, -1).long(), torch.cat(cell_weights, -1)
+            cell_weights.append(share_x * share_y * weights * inside)
+    return torch.cat(cells, dim=-1).long(), torch.cat(cell_weights, dim=-1)
 
 
 def sum_rows(table: Tensor, rows: Tensor, weights: Tensor, backend: str = "auto") -> Tensor:
-    """Sum weighted rows of a table, without a tensor of all the rows in between. (..., C)
-
-    The sums are differentiable in ``table`` and ``weights``.
+    """Sum weighted rows of a table, without a tensor of all the rows.
 
     Args:
-        table: The table. (R, C)
-        rows: Row indices. (..., S)
-        weights: Their weights. (..., S)
-        backend: ``"reference"`` (torch's embedding bags), ``"cpu"`` (the same forward pass with a
+        table: Rows of C channels. (R, C)
+        rows: Indices of the rows of each sum. (..., S)
+        weights: Weights of the rows. (..., S)
+        backend: ``"reference"`` (torch's embedding bags), ``"cpu"`` (torch's forward pass with a
             fused backward pass), or ``"auto"``.
+
+    Returns:
+        Sums, differentiable in ``table`` and ``weights``. (..., C)
+
+    Raises:
+        ValueError: If ``backend`` is unknown or does not support the table.
     """
     bags = rows.reshape(-1, rows.shape[-1])
     factors = weights.reshape(-1, rows.shape[-1]).to(table.dtype)
     wants_gradient = torch.is_grad_enabled() and (table.requires_grad or factors.requires_grad)
-    if not wants_gradient or choose_backend(backend, table, ("cpu",)) == "reference":
+    if not wants_gradient or choose_backend(backend, table, fused=("cpu",)) == "reference":
         out = F.embedding_bag(bags, table, per_sample_weights=factors, mode="sum")
     else:
         out = _sum_rows(table, factors, bags, "cpu")
-    return out.view(*rows.shape[:-1], table.shape[-1])
+    return out.view((*rows.shape[:-1], table.shape[-1]))

@@ -2,8 +2,8 @@
 # mypy: disable-error-code="no-untyped-def"
 """Weighted sums of table rows on a CPU: torch's forward pass with a fused backward pass (numba).
 
-Torch's own backward pass sorts all indices and walks the table twice. This one adds each bag's
-gradient to its rows in order, in one thread, so two runs give the same bits.
+The backward pass of torch sorts all indices and walks the table twice. This one adds the gradient
+of each bag to its rows in order, in one thread, so repeated runs are equal to the bit.
 """
 
 import torch
@@ -15,12 +15,23 @@ from gsmap.ops._numba import FASTMATH
 
 @njit(nogil=True, cache=True, fastmath=FASTMATH)
 def scatter_rows(grads, table, weights, rows, grad_table, grad_weights):
-    """Add each bag's gradient (n, C) to its rows (R, C); write that of the weights (n, S)."""
+    """Compute the gradients of weighted sums of table rows.
+
+    Args:
+        grads: Gradient of each sum. (n, C)
+        table: Rows of C channels. (R, C)
+        weights: Weights of the rows of each sum. (n, S)
+        rows: Indices of the rows of each sum. (n, S)
+        grad_table: Output, to which the gradient of the table is added. (R, C)
+        grad_weights: Output for the gradient of the weights. (n, S)
+    """
     for bag in range(rows.shape[0]):
         grad = grads[bag]
         for s in range(rows.shape[1]):
-            row, weight = rows[bag, s], weights[bag, s]
-            source, target = table[row], grad_table[row]
+            row = rows[bag, s]
+            weight = weights[bag, s]
+            source = table[row]
+            target = grad_table[row]
             total = grad[0] * 0
             for c in range(len(grad)):
                 total += grad[c] * source[c]
@@ -30,13 +41,39 @@ def scatter_rows(grads, table, weights, rows, grad_table, grad_weights):
 
 
 def sum_rows(table, weights, rows):
-    """Return each bag's weighted sum. (R, C), (n, S), (n, S) -> (n, C)"""
+    """Sum weighted rows of a table.
+
+    Args:
+        table: Rows of C channels. (R, C)
+        weights: Weights of the rows of each sum. (n, S)
+        rows: Indices of the rows of each sum. (n, S)
+
+    Returns:
+        Sums. (n, C)
+    """
     return F.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
 
 
 def sum_rows_backward(grads, table, weights, rows):
-    """Return the gradients in the table and in the weights."""
-    gradients = torch.zeros(table.shape), torch.empty(weights.shape)
-    arguments = grads, table, weights, rows, *gradients
-    scatter_rows(*(x.contiguous().numpy() for x in arguments))
-    return gradients
+    """Compute the gradients of `sum_rows`.
+
+    Args:
+        grads: Gradient of the sums. (n, C)
+        table: Rows of C channels. (R, C)
+        weights: Weights of the rows of each sum. (n, S)
+        rows: Indices of the rows of each sum. (n, S)
+
+    Returns:
+        Gradients of the table (R, C) and of the weights (n, S).
+    """
+    grad_table = torch.zeros(table.shape)
+    grad_weights = torch.empty(weights.shape)
+    scatter_rows(
+        grads.contiguous().numpy(),
+        table.contiguous().numpy(),
+        weights=weights.contiguous().numpy(),
+        rows=rows.contiguous().numpy(),
+        grad_table=grad_table.numpy(),
+        grad_weights=grad_weights.numpy(),
+    )
+    return grad_table, grad_weights

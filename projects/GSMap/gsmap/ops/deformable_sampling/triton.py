@@ -2,11 +2,11 @@
 # mypy: disable-error-code="no-untyped-def"
 """Triton kernels: deformable sampling of a map, forward and backward in one launch each.
 
-A row is the output of one head of one query, with all channels of the head; a program has as many
-rows as fill ``BLOCK`` values. The sums are float32, whatever the type of the map. Corners outside
-of the map have the value 0; a location that is not a number makes its own row not a number.
+A row is the output of one head of one query, with all channels of the head. A program computes as
+many rows as fill ``BLOCK`` values. Sums are float32 for every type of the map. Cells outside of the
+map count as zero, and a NaN location makes only its row NaN.
 
-The gradient of the map is added up by atomics, in any order, so two runs differ in the last bits.
+The gradient of the map is added by atomics in any order, so repeated runs differ in the last bits.
 No launch waits for the device, and nothing is autotuned.
 """
 
@@ -14,34 +14,50 @@ import torch
 import triton
 import triton.language as tl
 
-BLOCK = 512  # values of a program: 16 bytes a thread of float32
+BLOCK = 512  # values of a program: 16 bytes per thread in float32
 OPTIONS = {"num_warps": 4, "enable_fp_fusion": True}
 
 
 @triton.jit
 def _locate(locations, weights, sample, ok, height, width):
-    """Return a sample's upper left cell, its distances from that cell, and its weight. (ROWS,)"""
-    x = tl.load(locations + sample * 2, ok, 0.0) * width - 0.5
-    y = tl.load(locations + sample * 2 + 1, ok, 0.0) * height - 0.5
-    col, row = tl.floor(x), tl.floor(y)
-    return col, row, x - col, y - row, tl.load(weights + sample, ok, 0.0)
+    """Upper left cell of a sample (col, row), its distances from that cell, its weight. (ROWS,)"""
+    x = tl.load(locations + sample * 2, mask=ok, other=0.0) * width - 0.5
+    y = tl.load(locations + sample * 2 + 1, mask=ok, other=0.0) * height - 0.5
+    col = tl.floor(x)
+    row = tl.floor(y)
+    weight = tl.load(weights + sample, mask=ok, other=0.0)
+    return col, row, x - col, y - row, weight
 
 
 @triton.jit
 def find_corner(col, row, ok, height, width):
-    """Return the flat index of a cell, 0 if it is not on the map, and whether it is. (ROWS,)"""
+    """Find the flat index of a cell of a map.
+
+    Args:
+        col: Column of the cell, a whole number, also outside of the map. (ROWS,)
+        row: Row of the cell. (ROWS,)
+        ok: Whether the sample exists. (ROWS,)
+        height: Number of rows of the map.
+        width: Number of columns of the map.
+
+    Returns:
+        Index of the cell, zero outside of the map, and whether it lies on the map. (ROWS,)
+    """
     inside = (col >= 0) & (col < width) & (row >= 0) & (row < height) & ok
-    cell = tl.where(inside, row, 0.0).to(tl.int32) * width + tl.where(inside, col, 0.0).to(tl.int32)
-    return cell, inside
+    cell_row = tl.where(inside, row, 0.0).to(tl.int32)
+    cell_col = tl.where(inside, col, 0.0).to(tl.int32)
+    return cell_row * width + cell_col, inside
 
 
 @triton.jit
 def _rows(rows, queries, heads, cells, C: tl.constexpr, CP: tl.constexpr, ROWS: tl.constexpr):
-    """Return a program's rows, their validity, the start of their map, channels and theirs."""
+    """Rows of a program and their validity, start of their maps, channels and their validity."""
     row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
-    batch, head = row // (queries * heads), row % heads
+    batch = row // (queries * heads)
+    head = row % heads
+    start = (batch * cells * heads + head) * C
     channel = tl.arange(0, CP)
-    return row, row < rows, (batch * cells * heads + head) * C, channel, channel < C
+    return row, row < rows, start, channel, channel < C
 
 
 @triton.jit
@@ -60,20 +76,45 @@ def forward_kernel(
     CP: tl.constexpr,
     ROWS: tl.constexpr,
 ):
-    """Sum samples of value (B, H * W, heads, C) to out (B, Q, heads, C)."""
-    row, ok, start, channel, exists = _rows(rows, queries, heads, height * width, C, CP, ROWS)
-    total = tl.zeros((ROWS, CP), tl.float32)
+    """Sum weighted samples of a map for ``ROWS`` rows.
+
+    Args:
+        value: Flattened maps, row-major. (B, H * W, heads, C)
+        locations: Sampling points (x, y), [0, 1] over the map, float32. (B, Q, heads, S, 2)
+        weights: Attention weights, float32. (B, Q, heads, S)
+        out: Output for the sums, float32. (B, Q, heads, C)
+        rows: Number of rows, B * Q * heads.
+        queries: Number Q of queries.
+        heads: Number of heads.
+        height: Rows H of the map.
+        width: Columns W of the map.
+        S: Number of samples of a head.
+        C: Number of channels of a head.
+        CP: C rounded up to a power of two.
+        ROWS: Number of rows of a program.
+    """
+    row, ok, start, channel, exists = _rows(
+        rows, queries, heads=heads, cells=height * width, C=C, CP=CP, ROWS=ROWS
+    )
+    total = tl.zeros((ROWS, CP), dtype=tl.float32)
     for s in range(S):
-        left, top, dx, dy, weight = _locate(locations, weights, row * S + s, ok, height, width)
+        left, top, dx, dy, weight = _locate(
+            locations, weights, sample=row * S + s, ok=ok, height=height, width=width
+        )
         for corner in tl.static_range(4):
-            cell, inside = find_corner(left + corner % 2, top + corner // 2, ok, height, width)
-            share = weight * (dx if corner % 2 else 1 - dx) * (dy if corner // 2 else 1 - dy)
+            cell, inside = find_corner(
+                left + corner % 2, top + corner // 2, ok=ok, height=height, width=width
+            )
+            across = dx if corner % 2 else 1 - dx
+            down = dy if corner // 2 else 1 - dy
+            share = weight * across * down
             at = (start + cell * (heads * C))[:, None] + channel[None, :]
-            seen = tl.load(value + at, inside[:, None] & exists[None, :], 0.0).to(tl.float32)
-            # a product and no choice: what is not a number stays so outside of the map
-            total += seen * (share * inside.to(tl.float32))[:, None]
+            mask = inside[:, None] & exists[None, :]
+            pixel = tl.load(value + at, mask=mask, other=0.0).to(tl.float32)
+            # A product instead of tl.where keeps a NaN share outside of the map.
+            total += pixel * (share * inside.to(tl.float32))[:, None]
     output = out + row[:, None] * C + channel[None, :]
-    tl.store(output, total, ok[:, None] & exists[None, :])
+    tl.store(output, total, mask=ok[:, None] & exists[None, :])
 
 
 @triton.jit
@@ -95,65 +136,142 @@ def backward_kernel(
     CP: tl.constexpr,
     ROWS: tl.constexpr,
 ):
-    """Add to grad_value, float32, and write the other gradients, of grads (B, Q, heads, C)."""
-    row, ok, start, channel, exists = _rows(rows, queries, heads, height * width, C, CP, ROWS)
+    """Compute the gradients of ``ROWS`` rows.
+
+    Args:
+        grads: Gradient of the sums, float32. (B, Q, heads, C)
+        value: Flattened maps, row-major. (B, H * W, heads, C)
+        locations: Sampling points (x, y), [0, 1] over the map, float32. (B, Q, heads, S, 2)
+        weights: Attention weights, float32. (B, Q, heads, S)
+        grad_value: Output, float32, to which the gradient of the maps is added.
+            (B, H * W, heads, C)
+        grad_locations: Output for the gradient of the sampling points. (B, Q, heads, S, 2)
+        grad_weights: Output for the gradient of the weights. (B, Q, heads, S)
+        rows: Number of rows, B * Q * heads.
+        queries: Number Q of queries.
+        heads: Number of heads.
+        height: Rows H of the map.
+        width: Columns W of the map.
+        S: Number of samples of a head.
+        C: Number of channels of a head.
+        CP: C rounded up to a power of two.
+        ROWS: Number of rows of a program.
+    """
+    row, ok, start, channel, exists = _rows(
+        rows, queries, heads=heads, cells=height * width, C=C, CP=CP, ROWS=ROWS
+    )
     output = grads + row[:, None] * C + channel[None, :]
-    grad = tl.load(output, ok[:, None] & exists[None, :], 0.0)
+    grad = tl.load(output, mask=ok[:, None] & exists[None, :], other=0.0)
     for s in range(S):
         sample = row * S + s
-        left, top, dx, dy, weight = _locate(locations, weights, sample, ok, height, width)
-        grad_weight = tl.zeros((ROWS,), tl.float32)
-        grad_x = tl.zeros((ROWS,), tl.float32)
-        grad_y = tl.zeros((ROWS,), tl.float32)
+        left, top, dx, dy, weight = _locate(
+            locations, weights, sample=sample, ok=ok, height=height, width=width
+        )
+        grad_weight = tl.zeros((ROWS,), dtype=tl.float32)
+        grad_x = tl.zeros((ROWS,), dtype=tl.float32)
+        grad_y = tl.zeros((ROWS,), dtype=tl.float32)
         for corner in tl.static_range(4):
-            cell, inside = find_corner(left + corner % 2, top + corner // 2, ok, height, width)
+            cell, inside = find_corner(
+                left + corner % 2, top + corner // 2, ok=ok, height=height, width=width
+            )
             across = dx if corner % 2 else 1 - dx
             down = dy if corner // 2 else 1 - dy
             at = (start + cell * (heads * C))[:, None] + channel[None, :]
             mask = inside[:, None] & exists[None, :]
-            seen = tl.load(value + at, mask, 0.0).to(tl.float32)
+            pixel = tl.load(value + at, mask=mask, other=0.0).to(tl.float32)
             share = weight * across * down
             tl.atomic_add(grad_value + at, grad * share[:, None], mask=mask, sem="relaxed")
-            product = tl.sum(grad * seen, 1)
+            product = tl.sum(grad * pixel, axis=1)
             grad_weight += product * across * down
             grad_x += product * down * (1 if corner % 2 else -1)
             grad_y += product * across * (1 if corner // 2 else -1)
-        tl.store(grad_weights + sample, grad_weight, ok)
-        tl.store(grad_locations + sample * 2, grad_x * weight * width, ok)
-        tl.store(grad_locations + sample * 2 + 1, grad_y * weight * height, ok)
+        tl.store(grad_weights + sample, grad_weight, mask=ok)
+        tl.store(grad_locations + sample * 2, grad_x * weight * width, mask=ok)
+        tl.store(grad_locations + sample * 2 + 1, grad_y * weight * height, mask=ok)
 
 
 def _layout(value, weights):
-    """Return the kernels' sizes, and how many programs there are."""
+    """Number of rows, sizes that are compiled in, and grid of the programs."""
     channels = value.shape[3]
-    padded = max(16, triton.next_power_of_2(channels))
-    rows_each = max(1, BLOCK // padded)
-    sizes = {"S": weights.shape[3], "C": channels, "CP": padded, "ROWS": rows_each}
-    return sizes, (triton.cdiv(weights.shape[:3].numel(), rows_each),)
+    padded_channels = max(16, triton.next_power_of_2(channels))
+    rows_each = max(1, BLOCK // padded_channels)
+    rows = weights.shape[:3].numel()
+    sizes = {"S": weights.shape[3], "C": channels, "CP": padded_channels, "ROWS": rows_each}
+    return rows, sizes, (triton.cdiv(rows, rows_each),)
 
 
 def deformable_sample(value, locations, weights, height, width):
-    """Sum bilinear samples; locations and weights are float32. -> float32 (B, Q, heads, C)"""
-    out = torch.empty(*weights.shape[:3], value.shape[3], dtype=torch.float32, device=value.device)
+    """Sum weighted bilinear samples of a map.
+
+    Args:
+        value: Flattened maps, row-major. (B, H * W, heads, C)
+        locations: Sampling points (x, y), [0, 1] over the map, float32. (B, Q, heads, S, 2)
+        weights: Attention weights, float32. (B, Q, heads, S)
+        height: Rows H of the map.
+        width: Columns W of the map.
+
+    Returns:
+        Sums, float32. (B, Q, heads, C)
+    """
+    batch, queries, heads, _ = weights.shape
+    shape = (batch, queries, heads, value.shape[3])
+    out = torch.empty(shape, dtype=torch.float32, device=value.device)
     if out.numel():
-        tensors = value.contiguous(), locations.contiguous(), weights.contiguous(), out
-        sizes, grid = _layout(value, weights)
-        counts = weights.shape[:3].numel(), weights.shape[1], weights.shape[2]
+        rows, sizes, grid = _layout(value, weights)
         with torch.cuda.device_of(value):
-            forward_kernel[grid](*tensors, *counts, height, width, **sizes, **OPTIONS)
+            forward_kernel[grid](
+                value.contiguous(),
+                locations.contiguous(),
+                weights=weights.contiguous(),
+                out=out,
+                rows=rows,
+                queries=queries,
+                heads=heads,
+                height=height,
+                width=width,
+                **sizes,
+                **OPTIONS,
+            )
     return out
 
 
 def deformable_sample_backward(grads, value, locations, weights, height, width):
-    """Return the gradients in the map, the locations and the weights."""
-    value, locations, weights = value.contiguous(), locations.contiguous(), weights.contiguous()
-    in_value = torch.zeros(value.shape, dtype=torch.float32, device=value.device)
-    make = torch.empty_like if grads.numel() else torch.zeros_like
-    in_locations, in_weights = make(locations), make(weights)
-    if grads.numel():
-        tensors = grads.contiguous(), value, locations, weights, in_value, in_locations, in_weights
-        sizes, grid = _layout(value, weights)
-        counts = weights.shape[:3].numel(), weights.shape[1], weights.shape[2]
-        with torch.cuda.device_of(value):
-            backward_kernel[grid](*tensors, *counts, height, width, **sizes, **OPTIONS)
-    return in_value.to(value.dtype), in_locations, in_weights
+    """Compute the gradients of `deformable_sample`.
+
+    Args:
+        grads: Gradient of the sums, float32. (B, Q, heads, C)
+        value: Flattened maps, row-major. (B, H * W, heads, C)
+        locations: Sampling points (x, y), [0, 1] over the map, float32. (B, Q, heads, S, 2)
+        weights: Attention weights, float32. (B, Q, heads, S)
+        height: Rows H of the map.
+        width: Columns W of the map.
+
+    Returns:
+        Gradients of the maps, the locations and the weights.
+    """
+    locations = locations.contiguous()
+    weights = weights.contiguous()
+    grad_value = torch.zeros(value.shape, dtype=torch.float32, device=value.device)
+    if not grads.numel():
+        return grad_value.to(value.dtype), torch.zeros_like(locations), torch.zeros_like(weights)
+    grad_locations = torch.empty_like(locations)
+    grad_weights = torch.empty_like(weights)
+    rows, sizes, grid = _layout(value, weights)
+    with torch.cuda.device_of(value):
+        backward_kernel[grid](
+            grads.contiguous(),
+            value.contiguous(),
+            locations=locations,
+            weights=weights,
+            grad_value=grad_value,
+            grad_locations=grad_locations,
+            grad_weights=grad_weights,
+            rows=rows,
+            queries=weights.shape[1],
+            heads=weights.shape[2],
+            height=height,
+            width=width,
+            **sizes,
+            **OPTIONS,
+        )
+    return grad_value.to(value.dtype), grad_locations, grad_weights

@@ -15,55 +15,64 @@ _ARGUMENTS = "Tensor gaussians, float[] frame, int height, int width"
 
 
 def _masks_shape(gaussians: Tensor, frame: list[float], height: int, width: int) -> tuple[int, ...]:
-    """Return the shape of the masks of all Gaussians."""
+    """Shape of the masks of all instances, (N, H, W)."""
     return len(gaussians), height, width
 
 
-_render = fused_operator("gaussian_raster.render_gaussians", _ARGUMENTS, _masks_shape, 1)
+_render = fused_operator(
+    "gaussian_raster.render_gaussians", _ARGUMENTS, shape=_masks_shape, differentiable=1
+)
 _render_in_warps = fused_operator(
-    "gaussian_raster.render_gaussians_in_warps", _ARGUMENTS, _masks_shape, 1
+    "gaussian_raster.render_gaussians_in_warps", _ARGUMENTS, shape=_masks_shape, differentiable=1
 )
 
 
 def render_gaussians(
     means: Tensor, scales: Tensor, rotations: Tensor, grid: BEVGrid, backend: str = "auto"
 ) -> Tensor:
-    r"""Render each map element's 2D Gaussians to soft occupancy in [0, 1]. (..., H, W)
+    r"""Render the 2D Gaussians of each map element to a soft occupancy raster.
 
     A pixel :math:`p` takes :math:`1 - \prod_i (1 - G_i(p))` (GSMap Eq. 6), with :math:`G_i` from
-    Eq. 2, differentiable in the first three inputs. Inputs of several types are computed in the
-    widest, and at least in float32, also under autocast.
+    Eq. 2. Computation is in the widest type of the inputs, at least float32, also under autocast.
 
     Args:
         means: Centres (x, y) in metres, in the frame of ``grid``. (..., P, 2)
-        scales: Standard deviations along each Gaussian's own axes, in metres, > 0. (..., P, 2)
+        scales: Standard deviations along the axes of each Gaussian, in metres, > 0. (..., P, 2)
         rotations: Angle of the first axis from +x, in radians, anticlockwise. (..., P)
-        grid: The raster: its extent in metres and its size in pixels.
-        backend: As in `choose_backend`.
+        grid: Extent of the raster in metres and its size in pixels, H rows and W columns.
+        backend: Backend, see `choose_backend`.
+
+    Returns:
+        Occupancy in [0, 1], differentiable in the first three inputs. (..., H, W)
 
     Raises:
         TypeError: If an input is not floating point.
-        ValueError: If the shapes or devices disagree, or ``backend`` does not serve.
+        ValueError: If the shapes or devices disagree, or if ``backend`` is unknown or does not
+            support the inputs.
     """
-    _check(means, scales, rotations)
-    gaussians = torch.cat([means, scales, rotations[..., None]], -1)  # (..., P, 5), the widest type
+    _check(means, scales, rotations=rotations)
+    gaussians = torch.cat([means, scales, rotations[..., None]], dim=-1)  # (..., P, 5)
     gaussians = at_least_float32(gaussians)
     with torch.autocast(means.device.type, enabled=False):
         backend = choose_backend(backend, gaussians, kernel="render_gaussians")
         if backend == "reference":
             return render_gaussians_reference(
-                gaussians[..., :2], gaussians[..., 2:4], gaussians[..., 4], grid
+                means=gaussians[..., :2],
+                scales=gaussians[..., 2:4],
+                rotations=gaussians[..., 4],
+                grid=grid,
             )
-        flat = gaussians.reshape(math.prod(means.shape[:-2]), *gaussians.shape[-2:])
+        batch_shape = means.shape[:-2]
+        flat = gaussians.reshape(math.prod(batch_shape), means.shape[-2], 5)
         frame = [grid.x_range[0], grid.y_range[0], *grid.pixel_size_m]
         in_warps = backend == "triton" and "render_gaussians_in_warps" in backends.AUTO_KERNELS
         render = _render_in_warps if in_warps else _render
-        masks = render(flat, frame, grid.height, grid.width, backend)
-        return masks.reshape(*means.shape[:-2], grid.height, grid.width)
+        masks = render(flat, frame, height=grid.height, width=grid.width, backend=backend)
+        return masks.reshape((*batch_shape, grid.height, grid.width))
 
 
 def _check(means: Tensor, scales: Tensor, rotations: Tensor) -> None:
-    """Raise for inputs that do not belong together."""
+    """Raise if shapes or devices of Gaussians disagree, or if a type is not floating point."""
     if means.ndim < 2 or means.shape[-1] != 2:
         raise ValueError(f"means must have shape (..., P, 2), got {tuple(means.shape)}.")
     for name, tensor, shape in (

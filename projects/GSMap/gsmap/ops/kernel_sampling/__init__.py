@@ -11,16 +11,16 @@ _sample_kernels = fused_operator(
     "kernel_sampling.sample_kernels",
     "Tensor value, Tensor uv, Tensor weights, Tensor seen, Tensor offsets, int height, int width, "
     "bool bilinear",
-    lambda value, uv, weights, *_: (*weights.shape[:3], value.shape[4]),
+    lambda value, uv, weights, *_: (*weights.shape[:3], value.shape[4]),  # (B, Q, heads, C)
     differentiable=3,
     dtype=torch.float32,
 )
 
 
 def has_kernel(value: Tensor) -> bool:
-    """Return whether `sample_kernels` works on a map by one kernel, if it chooses itself."""
+    """Whether `sample_kernels` takes its Triton kernel for a map by default."""
     like = at_least_float32(value[:0])
-    return choose_backend("auto", like, ("triton",), "sample_kernels") == "triton"
+    return choose_backend("auto", like, fused=("triton",), kernel="sample_kernels") == "triton"
 
 
 def sample_kernels(
@@ -33,32 +33,46 @@ def sample_kernels(
     bilinear: bool = False,
     backend: str = "auto",
 ) -> Tensor:
-    """Sum weighted pixels around a cell's projections, over all cameras that see the cell.
+    """Sum weighted pixels around the projections of each BEV cell, over the cameras that see it.
 
-    Each output row is one bag of V * S pixels with weight 0 where no camera looks: no size depends
-    on values, so it can be captured in a CUDA graph. The sums are differentiable in ``value``,
-    ``weights`` and, if bilinear, ``uv``; they are in the wider type of value and weights, at least
-    float32. -> (B, Q, heads, C)
+    Each output row is one bag of V * S pixels, with weight zero for cameras that do not see the
+    cell. No size of a tensor depends on values, so the operation can be captured in a CUDA graph.
 
     Args:
-        value: Flattened feature maps, row-major, also in half precision. (B, V, h * w, heads, C)
+        value: Flattened feature maps, row-major, float32 or half precision.
+            (B, V, h * w, heads, C)
         shape: Rows h and columns w of a map.
-        uv: Projected points (x, y), [0, 1] over the map, one for each head; finite where seen.
-            (B, V, Q, heads, 2)
-        seen: Whether a camera sees a cell, bool. (B, V, Q)
+        uv: Projection (x, y) of each cell for each head, [0, 1] over the map; finite for visible
+            cells. (B, V, Q, heads, 2)
+        seen: Whether a cell is visible to a camera, bool. (B, V, Q)
         weights: Weights of the pixels. (B, Q, heads, S)
-        offsets: Offsets (dx, dy) of the pixels from the point. (S, 2)
-        bilinear: Sample between pixels, zero outside of the map, in place of rounding to the
-            nearest pixel of the map.
-        backend: ``"reference"``, ``"triton"`` (one kernel forward and one backward, which adds the
-            maps' gradient up in any order) or ``"auto"``.
+        offsets: Offsets (dx, dy) of the pixels from the projection, in pixels. (S, 2)
+        bilinear: Interpolate between pixels, which are zero outside of the map, instead of rounding
+            to the nearest pixel of the map.
+        backend: ``"reference"``, ``"triton"`` (one kernel for the forward pass, and one for the
+            backward pass, which adds the gradient of the maps in any order) or ``"auto"``.
+
+    Returns:
+        Sums, differentiable in ``value``, ``weights`` and, if bilinear, ``uv``. They have the wider
+        type of value and weights, at least float32. (B, Q, heads, C)
 
     Raises:
-        ValueError: If ``backend`` does not serve.
+        ValueError: If ``backend`` is unknown or does not support the inputs.
     """
-    dtype = torch.promote_types(torch.promote_types(value.dtype, weights.dtype), torch.float32)
-    uv, weights = uv.to(dtype), weights.to(dtype)
-    backend = choose_backend(backend, weights, ("triton",), "sample_kernels")
+    dtype = torch.promote_types(value.dtype, weights.dtype)
+    dtype = torch.promote_types(dtype, torch.float32)
+    uv = uv.to(dtype)
+    weights = weights.to(dtype)
+    backend = choose_backend(backend, weights, fused=("triton",), kernel="sample_kernels")
     if backend == "triton":
-        return _sample_kernels(value, uv, weights, seen, offsets, *shape, bilinear, backend)
-    return sample_kernels_reference(value.to(dtype), shape, uv, seen, weights, offsets, bilinear)
+        height, width = shape
+        return _sample_kernels(value, uv, weights, seen, offsets, height, width, bilinear, backend)
+    return sample_kernels_reference(
+        value.to(dtype),
+        shape,
+        uv=uv,
+        seen=seen,
+        weights=weights,
+        offsets=offsets,
+        bilinear=bilinear,
+    )

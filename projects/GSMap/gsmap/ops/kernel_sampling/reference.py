@@ -1,4 +1,4 @@
-"""Sampling by fixed kernels in plain torch: the definition of right."""
+"""Sampling of camera features by fixed kernels in plain torch."""
 
 import torch
 from torch import Tensor
@@ -8,40 +8,54 @@ from gsmap.structures.tensors import constant
 
 
 def kernel_cells(uv: Tensor, offsets: Tensor, shape: tuple[int, int]) -> Tensor:
-    """Return the feature pixels under a kernel centred at projected points, borders replicated.
+    """Find the pixels under a kernel that is centred at each projected point.
 
     Coordinates are rounded half to even after the offset is added, without a half-pixel shift, as
-    the original does. Points in [0, 1] (..., 2), offsets (dx, dy) in pixels (S, 2) -> (..., S)
+    in GKT's released code. Pixels outside of the map are moved to its border.
+
+    Args:
+        uv: Projected points (x, y), [0, 1] over the map. (..., 2)
+        offsets: Offsets (dx, dy) of the pixels from the point, in pixels. (S, 2)
+        shape: Rows and columns of the map.
+
+    Returns:
+        Row-major indices of the pixels. (..., S)
     """
     height, width = shape
     position = uv * constant(uv, [width, height])
-    return border_pixels(torch.round(position[..., None, :] + offsets.to(uv)), shape)
+    pixels = torch.round(position[..., None, :] + offsets.to(uv))
+    return border_pixels(pixels, shape)
 
 
 def border_pixels(position: Tensor, shape: tuple[int, int]) -> Tensor:
-    """Return row-major indices of pixels (x, y), moved onto the map. (..., 2) -> (...)"""
+    """Row-major indices of pixels (x, y), moved to the border of the map. (..., 2) -> (...)"""
     height, width = shape
-    cols, rows = position[..., 0].clamp(0, width - 1), position[..., 1].clamp(0, height - 1)
+    cols = position[..., 0].clamp(0, width - 1)
+    rows = position[..., 1].clamp(0, height - 1)
     return (rows * width + cols).long()
 
 
 def kernel_pixels(
     uv: Tensor, offsets: Tensor, weights: Tensor, shape: tuple[int, int], bilinear: bool
 ) -> tuple[Tensor, Tensor]:
-    """Return the pixels under a kernel, and their weights. 2 x (..., S or 4 S)
+    """Find the pixels under a kernel that is centred at each projected point, and their weights.
 
     Args:
-        uv: Projected points in [0, 1] over the map. (..., 2)
-        offsets: Offsets (dx, dy) in pixels. (S, 2)
-        weights: Weights of the kernel. (..., S)
+        uv: Projected points (x, y), [0, 1] over the map. (..., 2)
+        offsets: Offsets (dx, dy) of the kernel's S points from its centre, in pixels. (S, 2)
+        weights: Weights of the kernel's points. (..., S)
         shape: Rows and columns of the map.
-        bilinear: Sample between pixels, in place of rounding to one.
+        bilinear: Interpolate between pixels instead of rounding to one.
+
+    Returns:
+        Row-major indices of the pixels, and their weights, both (..., S), or (..., 4 S) if
+        bilinear.
     """
     if not bilinear:
-        return kernel_cells(uv, offsets, shape), weights
+        return kernel_cells(uv, offsets, shape=shape), weights
     height, width = shape
-    places = uv[..., None, :] + offsets / constant(uv, [width, height])
-    return bilinear_cells(places, weights, shape)
+    locations = uv[..., None, :] + offsets / constant(uv, [width, height])
+    return bilinear_cells(locations, weights, shape=shape)
 
 
 def sample_kernels_reference(
@@ -53,26 +67,31 @@ def sample_kernels_reference(
     offsets: Tensor,
     bilinear: bool,
 ) -> Tensor:
-    """Sum weighted pixels of all cameras. (B, Q, heads, C)
+    """Sum weighted pixels around the projections of each BEV cell, over the cameras that see it.
 
     Args:
-        value: Flattened feature maps. (B, V, h * w, heads, C)
+        value: Flattened feature maps, row-major. (B, V, h * w, heads, C)
         shape: Rows h and columns w of a map.
-        uv: Projected points in [0, 1] over the map. (B, V, Q, heads, 2)
-        seen: Whether a camera sees a cell. (B, V, Q)
+        uv: Projection (x, y) of each cell for each head, [0, 1] over the map; finite for visible
+            cells. (B, V, Q, heads, 2)
+        seen: Whether a cell is visible to a camera, bool. (B, V, Q)
         weights: Weights of the pixels. (B, Q, heads, S)
-        offsets: Offsets (dx, dy) of the pixels from the point. (S, 2)
-        bilinear: Sample between pixels, in place of rounding to one.
+        offsets: Offsets (dx, dy) of the pixels from the projection, in pixels. (S, 2)
+        bilinear: Interpolate between pixels instead of rounding to one.
+
+    Returns:
+        Sums. (B, Q, heads, C)
     """
-    batch, views, cells, heads, channels = value.shape
-    seen = seen.transpose(1, 2)[..., None, None]  # (B, Q, V, 1, 1)
-    uv = torch.where(seen, uv.transpose(1, 2), 0.0)  # (B, Q, V, heads, 2); unseen: may be anything
-    weights = weights[:, :, None] * seen  # (B, Q, V, heads, S)
-    pixels, weights = kernel_pixels(uv, offsets, weights, shape, bilinear)
+    batch, views, num_pixels, heads, channels = value.shape
+    visible = seen.transpose(1, 2)[..., None, None]  # (B, Q, V, 1, 1)
+    # Projections of invisible cells may have any value, also NaN.
+    uv = torch.where(visible, uv.transpose(1, 2), 0.0)  # (B, Q, V, heads, 2)
+    weights = weights[:, :, None] * visible  # (B, Q, V, heads, S)
+    pixels, weights = kernel_pixels(uv, offsets, weights=weights, shape=shape, bilinear=bilinear)
     sample = torch.arange(batch, device=value.device).view(-1, 1, 1, 1, 1)
     view = torch.arange(views, device=value.device).view(1, 1, -1, 1, 1)
     head = torch.arange(heads, device=value.device).view(1, 1, 1, -1, 1)
-    rows = ((sample * views + view) * cells + pixels) * heads + head
+    rows = ((sample * views + view) * num_pixels + pixels) * heads + head
     rows = rows.transpose(2, 3).flatten(3)  # (B, Q, heads, V * S)
     weights = weights.transpose(2, 3).flatten(3)
-    return sum_rows(value.reshape(-1, channels), rows, weights)
+    return sum_rows(value.reshape(-1, channels), rows, weights=weights)

@@ -1,4 +1,4 @@
-"""Rasters of polylines and polygons: MapVR's soft ones, and the masks of ground truth."""
+"""Rasters of polylines and polygons: MapVR's soft rasters, and masks of ground truth."""
 
 import torch
 from torch import Tensor
@@ -8,7 +8,7 @@ from gsmap.ops.polyline_raster.reference import draw_reference, soft_rasters_ref
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32
 
-LANE_GAP_PX = 0.01  # how far MapVR moves a line's way back: both form a polygon
+LANE_GAP_PX = 0.01  # shift of a line's way back in MapVR, which closes the line to a polygon
 DISTANCES = ("squared", "plain")
 _draw = fused_operator(
     "polyline_raster.draw_polylines",
@@ -31,21 +31,24 @@ def draw_polylines(
     filled: Tensor | None = None,
     backend: str = "auto",
 ) -> Tensor:
-    """Draw the masks of ground-truth polylines, in [0, 1], without gradient. (K, H, W)
+    """Draw masks of ground-truth polylines, without gradient.
 
-    A pixel takes the share that the shape covers of it, measured across the nearest edge. Masks
-    are on the polylines' device, at least float32.
+    A pixel takes the share of its area that the shape covers, measured across the nearest edge.
 
     Args:
         polylines: Vertices in metres, in the frame of ``grid``. (K, P, 2)
-        grid: The raster.
-        width_m: Width of a line in metres; AP_raster draws 5 pixels of 0.125 m.
-        filled: Which polylines are filled as polygons (to their vertices, without the line's
-            width), bool; all are drawn as lines without it. (K,)
-        backend: As in `choose_backend`.
+        grid: Extent of the raster in metres and its size in pixels, H rows and W columns.
+        width_m: Width of a line in metres, > 0; AP_raster draws 5 pixels of 0.125 m.
+        filled: Whether a polyline is filled as a polygon, up to its vertices and without the width
+            of a line, bool; None to draw all as lines. (K,)
+        backend: Backend, see `choose_backend`.
+
+    Returns:
+        Masks in [0, 1], at least float32, on the device of ``polylines``. (K, H, W)
 
     Raises:
-        ValueError: If a shape is wrong, ``width_m`` is not positive or ``backend`` does not serve.
+        ValueError: If a shape is wrong, ``width_m`` is not positive, or ``backend`` is unknown or
+            does not support the inputs.
     """
     if polylines.ndim != 3 or polylines.shape[-1] != 2 or polylines.shape[1] < 2:
         raise ValueError(
@@ -53,18 +56,28 @@ def draw_polylines(
         )
     if not width_m > 0:
         raise ValueError(f"width_m must be > 0, got {width_m}.")
-    flags = _flags(filled, "filled", polylines)
+    flags = _flags(filled, "filled", polylines=polylines)
     polylines = at_least_float32(polylines.detach())
     dx, dy = grid.pixel_size_m
-    half_width_m, pixel_m = width_m / 2, (dx * dy) ** 0.5
+    half_width_m = width_m / 2
+    pixel_m = (dx * dy) ** 0.5
     with torch.autocast(polylines.device.type, enabled=False):
         backend = choose_backend(backend, polylines, kernel="draw_polylines")
         if backend != "reference":
-            frame = [grid.x_range[0], grid.y_range[0], dx, dy]
-            height, width = grid.height, grid.width
-            return _draw(polylines, flags, height, width, frame, half_width_m, pixel_m, backend)
+            return _draw(
+                polylines,
+                flags,
+                height=grid.height,
+                width=grid.width,
+                frame=[grid.x_range[0], grid.y_range[0], dx, dy],
+                half_width=half_width_m,
+                pixel=pixel_m,
+                backend=backend,
+            )
         pixels = grid.pixel_centres(polylines.device, polylines.dtype)
-        return draw_reference(polylines, flags, pixels, half_width_m, pixel_m)
+        return draw_reference(
+            polylines, flags, pixels=pixels, half_width=half_width_m, pixel=pixel_m
+        )
 
 
 def soft_rasters(
@@ -79,25 +92,28 @@ def soft_rasters(
 ) -> Tensor:
     r"""Render lines as :math:`\exp(-D / \tau)`, polygons as :math:`\sigma(\pm D / \tau)`.
 
-    D is a pixel's distance to the nearest edge, or its square; the sign is + inside (MapVR
-    Eqs. 2-3). A line is rendered as the thin closed polygon of itself and its way back, a polygon
-    is closed implicitly. Masks are in [0, 1], differentiable in ``vertices``. -> (n, H, W)
+    D is the distance of a pixel to the nearest edge, or its square. The sign is + inside of a
+    polygon (MapVR Eqs. 2-3). A line is rendered as the thin closed polygon of the line and its way
+    back. The last vertex of a polygon is joined to the first one.
 
     Args:
-        vertices: In pixels (x = column, y = row); pixel (row, col) is sampled at (col, row).
-            (n, V, 2)
-        height: Rows H.
-        width: Columns W.
-        is_polygon: Which are filled polygons, bool; all are lines without it. (n,)
-        line_softness: :math:`\tau` of lines, in the unit of D.
-        polygon_softness: :math:`\tau` of polygons, in the unit of D.
-        distance: ``"squared"``: D in square pixels, as in MapVR's released rasterizer; ``"plain"``:
-            D in pixels, as in its equations.
-        backend: As in `choose_backend`.
+        vertices: Vertices in pixels (x = column, y = row); pixel (row, col) is sampled at
+            (col, row). (n, V, 2)
+        height: Rows H of the raster.
+        width: Columns W of the raster.
+        is_polygon: Whether an element is a filled polygon, bool; None for lines only. (n,)
+        line_softness: :math:`\tau` of lines, > 0, in the unit of D.
+        polygon_softness: :math:`\tau` of polygons, > 0, in the unit of D.
+        distance: ``"squared"`` for D in square pixels, as in MapVR's released rasterizer, or
+            ``"plain"`` for D in pixels, as in its equations.
+        backend: Backend, see `choose_backend`.
+
+    Returns:
+        Masks in [0, 1], differentiable in ``vertices``. (n, H, W)
 
     Raises:
-        ValueError: If a shape is wrong, a softness is not positive, ``distance`` is unknown or
-            ``backend`` does not serve.
+        ValueError: If a shape is wrong, a softness is not positive, ``distance`` is unknown, or
+            ``backend`` is unknown or does not support the inputs.
     """
     if vertices.ndim != 3 or vertices.shape[-1] != 2 or not vertices.shape[1]:
         raise ValueError(
@@ -107,22 +123,34 @@ def soft_rasters(
         raise ValueError(f"softness must be > 0, got {line_softness} and {polygon_softness}.")
     if distance not in DISTANCES:
         raise ValueError(f"distance must be one of {DISTANCES}, got {distance!r}.")
-    flags, plain = _flags(is_polygon, "is_polygon", vertices), distance == "plain"
+    flags = _flags(is_polygon, "is_polygon", polylines=vertices)
+    plain = distance == "plain"
     with torch.autocast(vertices.device.type, enabled=False):
         vertices = at_least_float32(vertices)
         # Differs from MapVR Eqs. (2-3) by default: D is squared, as in its released rasterizer.
         back = vertices.flip(1) + LANE_GAP_PX
-        stay = vertices[:, -1:].expand_as(vertices)  # a polygon's ring is padded by its last corner
-        rings = torch.cat([vertices, torch.where(flags[:, None, None], stay, back)], 1)
+        stay = vertices[:, -1:].expand_as(vertices)  # pads a polygon with its last vertex
+        second_half = torch.where(flags[:, None, None], stay, back)
+        rings = torch.cat([vertices, second_half], dim=1)  # (n, 2 V, 2)
         softness = [line_softness, polygon_softness]
         backend = choose_backend(backend, rings, kernel="soft_rasters")
         if backend != "reference":
-            return _soft_rasters(rings, flags, height, width, softness, plain, backend)
-        return soft_rasters_reference(rings, flags, height, width, softness, plain)
+            return _soft_rasters(
+                rings,
+                flags,
+                height=height,
+                width=width,
+                softness=softness,
+                plain=plain,
+                backend=backend,
+            )
+        return soft_rasters_reference(
+            rings, flags, height=height, width=width, softness=softness, plain=plain
+        )
 
 
 def _flags(flags: Tensor | None, name: str, polylines: Tensor) -> Tensor:
-    """Check a flag per polyline, or make them all false. (n,)"""
+    """Check the flags of the polylines, or create flags that are all false. (n,)"""
     if flags is None:
         return torch.zeros(len(polylines), dtype=torch.bool, device=polylines.device)
     if flags.shape != polylines.shape[:1] or flags.dtype != torch.bool:

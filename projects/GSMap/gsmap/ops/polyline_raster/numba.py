@@ -2,12 +2,12 @@
 # mypy: disable-error-code="no-untyped-def"
 """Fused CPU kernels (numba): soft rasters and ground-truth masks.
 
-One thread works on one element at a time. Edge by edge and row by row, only the pixels within a
-reach of the edge are visited: beyond it a soft raster differs from 0 or 1 by less than 1e-8, and a
-line's mask is empty. Two buffers of one mask per thread hold the smallest squared distance and the
-edge it belongs to; no tensor per edge exists. The backward pass rebuilds both and scatters each
-pixel's gradient to the two ends of its nearest edge, in float64 and in a fixed order, so two runs
-give the same bits.
+A thread computes one element at a time. For each edge and row, only the pixels within a reach of
+the edge are computed: beyond it a soft raster differs from 0 or 1 by less than 1e-8, and the mask
+of a line is empty. Two buffers per thread, of the size of a mask, store the smallest squared
+distance of each pixel and the index of its nearest edge. There is no tensor per edge. The backward
+pass computes both again and adds the gradient of each pixel to the two ends of its nearest edge, in
+float64 and in a fixed order, so repeated runs are equal to the bit.
 """
 
 import math
@@ -20,38 +20,50 @@ from gsmap.ops._numba import FASTMATH, pixel_range, run_in_threads
 from gsmap.ops.polyline_raster.reference import DISTANCE_EPS, LENGTH_EPS
 
 FAR = np.float32(np.inf)
-REACH = -math.log(1e-8)  # in units of softness: beyond it masks are 0 or 1
+REACH = -math.log(1e-8)  # in units of softness; farther pixels are 0 or 1
 INTEGER_FRAME = (-0.5, -0.5, 1.0, 1.0)  # MapVR samples pixel (row, col) at (col, row)
 
 
 @njit(nogil=True, cache=True, fastmath=FASTMATH, error_model="numpy")
 def _visit_edge(start, end, index, frame, reach, eps, steps, distances, owners):
-    """Lower the distances (H, W) by one edge's, and note whose they are."""
+    """Update the squared distances and nearest edges of pixels (H, W) by one edge."""
     x_min, y_min, step_x, step_y = frame
     height, width = distances.shape
-    x0, y0 = float(start[0]), float(start[1])
-    edge_x, edge_y = float(end[0]) - x0, float(end[1]) - y0
+    x0 = float(start[0])
+    y0 = float(start[1])
+    edge_x = float(end[0]) - x0
+    edge_y = float(end[1]) - y0
     length = math.sqrt(edge_x * edge_x + edge_y * edge_y)
     length2 = max(edge_x * edge_x + edge_y * edge_y + eps, 1e-38)
-    along_x, along_y = np.float32(edge_x / length2), np.float32(edge_y / length2)
-    ex, ey, step = np.float32(edge_x), np.float32(edge_y), np.float32(step_x)
-    low_y, high_y = min(y0, y0 + edge_y) - reach, max(y0, y0 + edge_y) + reach
-    low_x, high_x = min(x0, x0 + edge_x) - reach, max(x0, x0 + edge_x) + reach
-    top, bottom = pixel_range(low_y, high_y, y_min, step_y, height)
+    along_x = np.float32(edge_x / length2)
+    along_y = np.float32(edge_y / length2)
+    ex = np.float32(edge_x)
+    ey = np.float32(edge_y)
+    step = np.float32(step_x)
+    low_y = min(y0, y0 + edge_y) - reach
+    high_y = max(y0, y0 + edge_y) + reach
+    low_x = min(x0, x0 + edge_x) - reach
+    high_x = max(x0, x0 + edge_x) + reach
+    top, bottom = pixel_range(low_y, high_y, origin=y_min, step=step_y, size=height)
     for row in range(top, bottom):
         offset_y = y_min + (row + 0.5) * step_y - y0
-        left_x, right_x = low_x, high_x
-        if abs(edge_y) > 1e-6 * length:  # the strip along the edge, where it crosses this row
+        left_x = low_x
+        right_x = high_x
+        if abs(edge_y) > 1e-6 * length:  # part of the row in the strip along the edge
             crossing = x0 + offset_y * edge_x / edge_y
             half = reach * length / abs(edge_y)
-            left_x, right_x = max(left_x, crossing - half), min(right_x, crossing + half)
-        left, right = pixel_range(left_x, right_x, x_min, step_x, width)
-        nearest, owner = distances[row, left : max(left, right)], owners[row, left:right]
-        first, fy = np.float32(x_min + (left + 0.5) * step_x - x0), np.float32(offset_y)
+            left_x = max(left_x, crossing - half)
+            right_x = min(right_x, crossing + half)
+        left, right = pixel_range(left_x, right_x, origin=x_min, step=step_x, size=width)
+        nearest = distances[row, left : max(left, right)]
+        owner = owners[row, left:right]
+        first = np.float32(x_min + (left + 0.5) * step_x - x0)
+        fy = np.float32(offset_y)
         for k in range(len(nearest)):
             fx = first + steps[k] * step
             t = min(max(fx * along_x + fy * along_y, np.float32(0)), np.float32(1))
-            dx, dy = fx - t * ex, fy - t * ey
+            dx = fx - t * ex
+            dy = fy - t * ey
             squared = dx * dx + dy * dy
             closer = squared < nearest[k]
             nearest[k] = squared if closer else nearest[k]
@@ -65,10 +77,15 @@ def _fill_inside(ring, frame, inside):
     inside[:] = 0
     for i in range(len(ring)):
         j = i + 1 if i + 1 < len(ring) else 0
-        x0, y0, x1, y1 = float(ring[i, 0]), float(ring[i, 1]), float(ring[j, 0]), float(ring[j, 1])
+        x0 = float(ring[i, 0])
+        y0 = float(ring[i, 1])
+        x1 = float(ring[j, 0])
+        y1 = float(ring[j, 1])
         if y0 == y1:
             continue
-        top, bottom = pixel_range(min(y0, y1), max(y0, y1), y_min, step_y, len(inside))
+        top, bottom = pixel_range(
+            min(y0, y1), max(y0, y1), origin=y_min, step=step_y, size=len(inside)
+        )
         for row in range(top, bottom):
             y = y_min + (row + 0.5) * step_y
             if (y0 > y) == (y1 > y):
@@ -81,16 +98,19 @@ def _fill_inside(ring, frame, inside):
 
 @njit(nogil=True, cache=True)
 def _buffers(shape):
-    """Return a thread's scratch: column numbers, distances, owners, inside."""
+    """Buffers of a thread: column indices, squared distances, nearest edges, inside."""
     steps = np.arange(shape[1]).astype(np.float32)
-    return steps, np.empty(shape, np.float32), np.empty(shape, np.int32), np.empty(shape, np.uint8)
+    distances = np.empty(shape, np.float32)
+    owners = np.empty(shape, np.int32)
+    inside = np.empty(shape, np.uint8)
+    return steps, distances, owners, inside
 
 
 @njit(nogil=True, cache=True)
 def _survey(ring, closed, filled, frame, reach, eps, buffers):
-    """Fill squared distances, infinite beyond the reach, nearest edges and, if filled, the inside.
+    """Compute squared distances, infinite beyond the reach, nearest edges and the inside if filled.
 
-    False, and nothing is filled, if a vertex is not finite.
+    Returns False, and leaves the buffers as they are, if a vertex is not finite.
     """
     if not np.isfinite(ring).all():
         return False
@@ -99,32 +119,58 @@ def _survey(ring, closed, filled, frame, reach, eps, buffers):
     owners[:] = -1
     for i in range(len(ring) if closed else len(ring) - 1):
         j = i + 1 if i + 1 < len(ring) else 0
-        _visit_edge(ring[i], ring[j], np.int32(i), frame, reach, eps, steps, distances, owners)
+        _visit_edge(
+            ring[i],
+            ring[j],
+            index=np.int32(i),
+            frame=frame,
+            reach=reach,
+            eps=eps,
+            steps=steps,
+            distances=distances,
+            owners=owners,
+        )
     if filled:
-        _fill_inside(ring, frame, inside)
+        _fill_inside(ring, frame, inside=inside)
     return True
 
 
 @njit(inline="always")
 def _measure(squared, nearest):
-    """Return D: a squared distance as it is, or, if ``nearest`` > 0, the distance."""
+    """D: the squared distance, or, if ``nearest`` > 0, the distance but at least ``nearest``."""
     return max(math.sqrt(squared), nearest) if nearest > 0 else float(squared)
 
 
 @njit(nogil=True, cache=True)
 def soft_forward(rings, polygons, reach, softness, nearest, masks, first, last):
-    """Write exp(-D / s), or a sigmoid of +-D / s for polygons; NaN for a vertex not finite.
+    """Render the rings ``first`` to ``last - 1``: exp(-D / s), or sigmoid(+-D / s) for polygons.
 
-    Closed float32 rings (N, V, 2) are in pixels. ``reach``, beyond which a mask is 0 or 1, and
-    ``softness`` s are of lines and polygons. With ``nearest`` 0, D is the squared distance to the
-    nearest edge; else D is the distance, or ``nearest`` where it is smaller, and there it has no
-    gradient.
+    Args:
+        rings: Vertices of closed rings in pixels, float32. (N, V, 2)
+        polygons: Whether a ring is a polygon, bool. (N,)
+        reach: Distance in pixels beyond which a mask is 0 or 1, of lines and of polygons. (2,)
+        softness: Softness s of lines and of polygons, in the unit of D. (2,)
+        nearest: 0 if D is the squared distance to the nearest edge. Otherwise D is the distance,
+            and ``nearest`` its smallest value, at which it has no gradient.
+        masks: Output for the masks, float32; NaN for a ring with a vertex that is not finite.
+            (N, H, W)
+        first: First ring.
+        last: One past the last ring.
     """
     buffers = _buffers(masks.shape[1:])
     _, distances, owners, inside = buffers
     for n in range(first, last):
         kind = int(polygons[n])
-        if not _survey(rings[n], True, kind, INTEGER_FRAME, reach[kind], LENGTH_EPS, buffers):
+        is_finite = _survey(
+            rings[n],
+            closed=True,
+            filled=kind,
+            frame=INTEGER_FRAME,
+            reach=reach[kind],
+            eps=LENGTH_EPS,
+            buffers=buffers,
+        )
+        if not is_finite:
             masks[n] = np.nan
             continue
         for row in range(masks.shape[1]):
@@ -139,18 +185,23 @@ def soft_forward(rings, polygons, reach, softness, nearest, masks, first, last):
 
 @njit(nogil=True, cache=True)
 def _scatter(ring, owner, x, y, weight, out):
-    """Add weight * d(d^2) to the gradient of the two ends of a pixel's nearest edge."""
+    """Add ``weight`` times the gradient of the squared distance to both ends of an edge."""
     following = owner + 1 if owner + 1 < len(ring) else 0
-    x0, y0 = float(ring[owner, 0]), float(ring[owner, 1])
-    ex, ey = float(ring[following, 0]) - x0, float(ring[following, 1]) - y0
-    fx, fy = x - x0, y - y0
+    x0 = float(ring[owner, 0])
+    y0 = float(ring[owner, 1])
+    ex = float(ring[following, 0]) - x0
+    ey = float(ring[following, 1]) - y0
+    fx = x - x0
+    fy = y - y0
     length2 = ex * ex + ey * ey + LENGTH_EPS
     along = (fx * ex + fy * ey) / length2
     t = min(max(along, 0.0), 1.0)
-    dx, dy = fx - t * ex, fy - t * ey
-    # the eps moves t off the nearest point of an edge: between the ends t has a gradient of its own
+    dx = fx - t * ex
+    dy = fy - t * ey
+    # LENGTH_EPS moves t off the nearest point of an edge, so t has a gradient between the ends.
     slip = 2 * t * LENGTH_EPS / length2 if 0.0 <= along <= 1.0 else 0.0
-    end_x, end_y = -2 * t * dx - slip * (fx - 2 * t * ex), -2 * t * dy - slip * (fy - 2 * t * ey)
+    end_x = -2 * t * dx - slip * (fx - 2 * t * ex)
+    end_y = -2 * t * dy - slip * (fy - 2 * t * ey)
     out[following, 0] += weight * end_x
     out[following, 1] += weight * end_y
     out[owner, 0] += weight * (slip * ex - 2 * dx - end_x)
@@ -159,13 +210,36 @@ def _scatter(ring, owner, x, y, weight, out):
 
 @njit(nogil=True, cache=True)
 def soft_backward(rings, polygons, reach, softness, nearest, grads, out, first, last):
-    """Write to ``out`` (N, V, 2), float64, the gradient in the rings of ``grads`` (N, H, W)."""
+    """Compute the gradients of the rings ``first`` to ``last - 1``.
+
+    Args:
+        rings: Vertices of closed rings in pixels, float32. (N, V, 2)
+        polygons: Whether a ring is a polygon, bool. (N,)
+        reach: Distance in pixels beyond which a mask is 0 or 1, of lines and of polygons. (2,)
+        softness: Softness s of lines and of polygons, in the unit of D. (2,)
+        nearest: 0 for squared distances, otherwise the smallest distance, see `soft_forward`.
+        grads: Gradient of the masks, float32. (N, H, W)
+        out: Output for the gradient of the rings, float64; NaN for a ring with a vertex that is not
+            finite. (N, V, 2)
+        first: First ring.
+        last: One past the last ring.
+    """
     buffers = _buffers(grads.shape[1:])
     _, distances, owners, inside = buffers
     for n in range(first, last):
-        ring, kind = rings[n], int(polygons[n])
+        ring = rings[n]
+        kind = int(polygons[n])
         out[n] = 0
-        if not _survey(ring, True, kind, INTEGER_FRAME, reach[kind], LENGTH_EPS, buffers):
+        is_finite = _survey(
+            ring,
+            closed=True,
+            filled=kind,
+            frame=INTEGER_FRAME,
+            reach=reach[kind],
+            eps=LENGTH_EPS,
+            buffers=buffers,
+        )
+        if not is_finite:
             out[n] = np.nan
             continue
         for row in range(grads.shape[1]):
@@ -180,18 +254,39 @@ def soft_backward(rings, polygons, reach, softness, nearest, grads, out, first, 
                 weight = grads[n, row, col] * slope / softness[kind]
                 if nearest > 0:
                     weight *= 0.5 / distance if distance > nearest else 0.0
-                _scatter(ring, owners[row, col], col, row, weight, out[n])
+                _scatter(ring, owners[row, col], x=col, y=row, weight=weight, out=out[n])
 
 
 @njit(nogil=True, cache=True)
 def draw(polylines, filled, frame, half_width, pixel, masks, first, last):
-    """Write masks of lines of a width, or of filled polygons; arguments as of `draw_reference`."""
+    """Draw the polylines ``first`` to ``last - 1`` as lines or filled polygons.
+
+    Args:
+        polylines: Vertices in metres, float32. (K, P, 2)
+        filled: Whether a polyline is filled as a polygon, bool. (K,)
+        frame: Smallest x and y of the raster, and the size of a pixel along x and y, in metres.
+        half_width: Half the width of a line in metres.
+        pixel: Side in metres of a square with the area of a pixel.
+        masks: Output for the masks, float32; NaN for a polyline with a vertex that is not finite.
+            (K, H, W)
+        first: First polyline.
+        last: One past the last polyline.
+    """
     buffers = _buffers(masks.shape[1:])
     _, distances, _, inside = buffers
     for n in range(first, last):
         kind = filled[n]
         reach = pixel if kind else half_width + pixel
-        if not _survey(polylines[n], kind, kind, frame, reach, 0.0, buffers):
+        is_finite = _survey(
+            polylines[n],
+            closed=kind,
+            filled=kind,
+            frame=frame,
+            reach=reach,
+            eps=0.0,
+            buffers=buffers,
+        )
+        if not is_finite:
             masks[n] = np.nan
             continue
         for row in range(masks.shape[1]):
@@ -206,31 +301,77 @@ def draw(polylines, filled, frame, half_width, pixel, masks, first, last):
                 masks[n, row, col] = max(share, 0.0)
 
 
-def _settings(softness, plain):
-    """Return the kernels' reach, softness and smallest distance."""
-    reach = tuple(REACH * tau if plain else math.sqrt(REACH * tau) for tau in softness)
-    return reach, tuple(softness), DISTANCE_EPS if plain else 0.0
+def _reach(softness, plain):
+    """Distance in pixels beyond which masks are 0 or 1, of lines and of polygons."""
+    line, polygon = softness
+    if plain:
+        return REACH * line, REACH * polygon
+    return math.sqrt(REACH * line), math.sqrt(REACH * polygon)
 
 
 def soft_rasters(rings, is_polygon, height, width, softness, plain):
-    """Render closed float32 rings softly; see ``soft_rasters_reference``. (n, H, W)"""
+    """Render closed rings softly, see `soft_rasters_reference`.
+
+    Args:
+        rings: Vertices of closed rings in pixels, float32. (n, V, 2)
+        is_polygon: Whether a ring is a polygon, bool. (n,)
+        height: Rows H of the raster.
+        width: Columns W of the raster.
+        softness: Softness s of lines and of polygons, in the unit of D. (2,)
+        plain: Whether D is the distance to the nearest edge instead of its square.
+
+    Returns:
+        Masks in [0, 1], float32. (n, H, W)
+    """
     masks = torch.empty(len(rings), height, width, dtype=torch.float32)
-    rules = _settings(softness, plain)
-    run_in_threads(soft_forward, height * width, rings, is_polygon, *rules, masks)
+    reach = _reach(softness, plain)
+    nearest = DISTANCE_EPS if plain else 0.0
+    pixels = height * width
+    run_in_threads(soft_forward, pixels, rings, is_polygon, reach, tuple(softness), nearest, masks)
     return masks
 
 
 def soft_rasters_backward(grads, rings, is_polygon, height, width, softness, plain):
-    """Return the gradient in the rings. (n, V, 2)"""
-    gradients = torch.empty(rings.shape, dtype=torch.float64)
-    rules = _settings(softness, plain)
-    run_in_threads(soft_backward, height * width, rings, is_polygon, *rules, grads, gradients)
-    return (gradients.float(),)
+    """Compute the gradient of `soft_rasters`.
+
+    Args:
+        grads: Gradient of the masks, float32. (n, H, W)
+        rings: Vertices of closed rings in pixels, float32. (n, V, 2)
+        is_polygon: Whether a ring is a polygon, bool. (n,)
+        height: Rows H of the raster.
+        width: Columns W of the raster.
+        softness: Softness s of lines and of polygons, in the unit of D. (2,)
+        plain: Whether D is the distance to the nearest edge instead of its square.
+
+    Returns:
+        Gradient of the rings, float32. (n, V, 2)
+    """
+    out = torch.empty(rings.shape, dtype=torch.float64)
+    reach = _reach(softness, plain)
+    nearest = DISTANCE_EPS if plain else 0.0
+    pixels = height * width
+    run_in_threads(
+        soft_backward, pixels, rings, is_polygon, reach, tuple(softness), nearest, grads, out
+    )
+    return (out.float(),)
 
 
 def draw_polylines(polylines, filled, height, width, frame, half_width, pixel):
-    """Draw float32 polylines; see ``draw_reference``. (K, H, W)"""
+    """Draw polylines and filled polygons, see `draw_reference`.
+
+    Args:
+        polylines: Vertices in metres, float32. (K, P, 2)
+        filled: Whether a polyline is filled as a polygon, bool. (K,)
+        height: Rows H of the raster.
+        width: Columns W of the raster.
+        frame: Smallest x and y of the raster, and the size of a pixel along x and y, in metres.
+        half_width: Half the width of a line in metres.
+        pixel: Side in metres of a square with the area of a pixel.
+
+    Returns:
+        Masks in [0, 1], float32. (K, H, W)
+    """
     masks = torch.empty(len(polylines), height, width, dtype=torch.float32)
-    pixels, frame = height * width, tuple(frame)
-    run_in_threads(draw, pixels, polylines, filled, frame, half_width, pixel, masks)
+    pixels = height * width
+    run_in_threads(draw, pixels, polylines, filled, tuple(frame), half_width, pixel, masks)
     return masks

@@ -1,15 +1,15 @@
 # Triton infers the types of its kernels:
 # mypy: disable-error-code="no-untyped-def"
-"""Triton kernels: soft rasters and ground-truth masks, a tile of an element per program.
+"""Triton kernels: soft rasters and ground-truth masks, one program per tile of an element.
 
-One warp keeps a tile of TILE x TILE pixels in registers and walks over the element's edges: the
-smallest squared distance, the edge it belongs to, and how many edges lie to the right of a pixel.
-No tensor per edge exists.
+A warp keeps a tile of TILE x TILE pixels in registers and loops over the edges of the element. For
+each pixel it computes the smallest squared distance, the index of the nearest edge, and whether the
+number of edges to the right is odd. There is no tensor per edge.
 
-The backward pass finds the nearest edges again. Those that own a pixel of the tile are the set bits
-of a number, 32 edges at a time; for each the warp adds up the gradient in its two ends, and writes
-it to a buffer (n, tiles, V, 4) that no other program writes: no atomics, so two runs give the same
-bits. torch adds up the tiles.
+The backward pass searches the nearest edges again. The set of edges that are nearest to a pixel of
+the tile is an integer with one bit per edge, for 32 edges at a time. For each of these edges the
+warp sums the gradient of both ends and writes it to its entries of a buffer (n, tiles, V, 4). There
+are no atomics, so repeated runs are equal to the bit. Torch adds the sums of all tiles.
 """
 
 import math
@@ -22,44 +22,53 @@ from gsmap.ops.polyline_raster.reference import DISTANCE_EPS, LENGTH_EPS
 
 TILE = 16
 OPTIONS = {"num_warps": 1, "enable_fp_fusion": True}
-CHUNK = tl.constexpr(32)  # edges at a time: the bits of a number
+CHUNK = tl.constexpr(32)  # number of edges at a time: the bits of an integer
 EPS = tl.constexpr(LENGTH_EPS)
-SHORTEST = tl.constexpr(1e-30)  # squared length of an edge, which may be a single point
+SHORTEST = tl.constexpr(1e-30)  # smallest squared length of an edge, which may be a point
 
 
 @triton.jit
 def _tile_pixels(height, width, TILE: tl.constexpr):
-    """Return a tile's columns (1, TILE) and rows (TILE, 1), flat indices and validity."""
+    """Columns (1, TILE) and rows (TILE, 1) of a tile, flat indices of its pixels, validity."""
     tiles_x = tl.cdiv(width, TILE)
     rows = (tl.program_id(0) // tiles_x) * TILE + tl.arange(0, TILE)[:, None]
     cols = (tl.program_id(0) % tiles_x) * TILE + tl.arange(0, TILE)[None, :]
+    index = rows * width + cols
     valid = (rows < height) & (cols < width)
-    return cols.to(tl.float32), rows.to(tl.float32), rows * width + cols, valid
+    return cols.to(tl.float32), rows.to(tl.float32), index, valid
 
 
 @triton.jit
 def _ends(ring, edge, count):
-    """Return the first end of an edge of a closed ring, and the way to the second."""
+    """Start (x, y) of an edge of a closed ring, and the vector to its end."""
     following = tl.where(edge + 1 < count, edge + 1, 0)
-    x, y = tl.load(ring + 2 * edge), tl.load(ring + 2 * edge + 1)
-    return x, y, tl.load(ring + 2 * following) - x, tl.load(ring + 2 * following + 1) - y
+    x = tl.load(ring + 2 * edge)
+    y = tl.load(ring + 2 * edge + 1)
+    edge_x = tl.load(ring + 2 * following) - x
+    edge_y = tl.load(ring + 2 * following + 1) - y
+    return x, y, edge_x, edge_y
 
 
 @triton.jit
 def _survey(ring, edges, count, x, y, eps, TILE: tl.constexpr):
-    """Return squared distances to the nearest edges, these, the inside, and 0, or NaN if one is."""
-    nearest = tl.full((TILE, TILE), float("inf"), tl.float32)
-    owner = tl.full((TILE, TILE), 0, tl.int32)
-    inside = tl.full((TILE, TILE), 0, tl.int32)
+    """Squared distances to the nearest edges, their indices, the inside, and a term for NaN.
+
+    The term is added to the mask: it is NaN if a vertex is not finite, otherwise zero.
+    """
+    nearest = tl.full((TILE, TILE), float("inf"), dtype=tl.float32)
+    owner = tl.full((TILE, TILE), 0, dtype=tl.int32)
+    inside = tl.full((TILE, TILE), 0, dtype=tl.int32)
     poison = 0.0
     for edge in range(edges):
-        x0, y0, edge_x, edge_y = _ends(ring, edge, count)
+        x0, y0, edge_x, edge_y = _ends(ring, edge, count=count)
         poison += (edge_x - edge_x) + (edge_y - edge_y)
         length2 = tl.maximum(edge_x * edge_x + edge_y * edge_y + eps, SHORTEST)
-        offset_x, offset_y = x - x0, y - y0
+        offset_x = x - x0
+        offset_y = y - y0
         along = offset_x * (edge_x / length2) + offset_y * (edge_y / length2)
         along = tl.minimum(tl.maximum(along, 0.0), 1.0)
-        dx, dy = offset_x - along * edge_x, offset_y - along * edge_y
+        dx = offset_x - along * edge_x
+        dy = offset_y - along * edge_y
         squared = dx * dx + dy * dy
         closer = squared < nearest
         nearest = tl.where(closer, squared, nearest)
@@ -72,7 +81,7 @@ def _survey(ring, edges, count, x, y, eps, TILE: tl.constexpr):
 
 @triton.jit
 def _distance(squared, nearest, PLAIN: tl.constexpr):
-    """Return D: a squared distance as it is, or the distance, which is at least ``nearest``."""
+    """D: the squared distance or, if ``PLAIN``, the distance but at least ``nearest``."""
     if PLAIN:
         squared = tl.maximum(tl.sqrt(squared), nearest)
     return squared
@@ -92,19 +101,37 @@ def soft_forward_kernel(
     PLAIN: tl.constexpr,
     TILE: tl.constexpr,
 ):
-    """Render one tile of one closed ring: rings (n, V, 2) to masks (n, H, W)."""
+    """Render one tile of one closed ring: exp(-D / s), or sigmoid(+-D / s) for a polygon.
+
+    Args:
+        rings: Vertices of closed rings in pixels, float32. (n, V, 2)
+        polygons: Whether a ring is a polygon, uint8. (n,)
+        masks: Output for the masks, float32. (n, H, W)
+        count: Number V of vertices of a ring.
+        height: Rows H of the raster.
+        width: Columns W of the raster.
+        line_softness: Softness s of lines, in the unit of D.
+        polygon_softness: Softness s of polygons, in the unit of D.
+        nearest: Smallest distance of a pixel from an edge, in pixels.
+        PLAIN: Whether D is the distance to the nearest edge instead of its square.
+        TILE: Side of a tile in pixels.
+    """
     n = tl.program_id(1).to(tl.int64)
-    x, y, index, valid = _tile_pixels(height, width, TILE)
-    squared, _, inside, poison = _survey(rings + n * count * 2, count, count, x, y, EPS, TILE)
+    x, y, index, valid = _tile_pixels(height, width, TILE=TILE)
+    squared, _, inside, poison = _survey(
+        rings + n * count * 2, count, count=count, x=x, y=y, eps=EPS, TILE=TILE
+    )
     filled = tl.load(polygons + n) != 0
     softness = tl.where(filled, polygon_softness, line_softness)
-    fade = tl.exp(-_distance(squared, nearest, PLAIN) / softness)
+    fade = tl.exp(-_distance(squared, nearest, PLAIN=PLAIN) / softness)
     area = tl.where(inside, 1.0, fade) / (1 + fade)
-    tl.store(masks + n * height * width + index, tl.where(filled, area, fade) + poison, valid)
+    mask = tl.where(filled, area, fade) + poison
+    tl.store(masks + n * height * width + index, mask, mask=valid)
 
 
 @triton.jit
 def _or(a, b):
+    """Bitwise or, for a reduction."""
     return a | b
 
 
@@ -123,47 +150,66 @@ def soft_backward_kernel(
     PLAIN: tl.constexpr,
     TILE: tl.constexpr,
 ):
-    """Sum one tile's gradient in the ends of the edges it owns: to sums (n, tiles, V, 4), zeros."""
+    """Sum the gradients of the ends of edges over the pixels of one tile.
+
+    Args:
+        rings: Vertices of closed rings in pixels, float32. (n, V, 2)
+        polygons: Whether a ring is a polygon, uint8. (n,)
+        grads: Gradient of the masks, float32. (n, H, W)
+        sums: Output, filled with zeros, for the gradient of the start (2) and the end (2) of each
+            edge, float32. (n, tiles, V, 4)
+        count: Number V of vertices of a ring.
+        height: Rows H of the raster.
+        width: Columns W of the raster.
+        line_softness: Softness s of lines, in the unit of D.
+        polygon_softness: Softness s of polygons, in the unit of D.
+        nearest: Smallest distance of a pixel from an edge, in pixels.
+        PLAIN: Whether D is the distance to the nearest edge instead of its square.
+        TILE: Side of a tile in pixels.
+    """
     n = tl.program_id(1).to(tl.int64)
-    x, y, index, valid = _tile_pixels(height, width, TILE)
+    x, y, index, valid = _tile_pixels(height, width, TILE=TILE)
     ring = rings + n * count * 2
-    squared, owner, inside, _ = _survey(ring, count, count, x, y, EPS, TILE)
+    squared, owner, inside, _ = _survey(ring, count, count=count, x=x, y=y, eps=EPS, TILE=TILE)
     filled = tl.load(polygons + n) != 0
     softness = tl.where(filled, polygon_softness, line_softness)
-    distance = _distance(squared, nearest, PLAIN)
+    distance = _distance(squared, nearest, PLAIN=PLAIN)
     fade = tl.exp(-distance / softness)
     area = tl.where(inside, fade, -fade) / ((1 + fade) * (1 + fade))
-    grad = tl.load(grads + n * height * width + index, valid, 0.0)
-    weight = grad * tl.where(filled, area, -fade) / softness  # gradient in D
+    grad = tl.load(grads + n * height * width + index, mask=valid, other=0.0)
+    weight = grad * tl.where(filled, area, -fade) / softness  # gradient of D
     if PLAIN:
-        weight *= tl.where(distance > nearest, 0.5 / distance, 0.0)  # in the squared distance
+        weight *= tl.where(distance > nearest, 0.5 / distance, 0.0)  # of D squared
     out = sums + (n * tl.num_programs(0) + tl.program_id(0)) * count * 4
     for first in range(0, count, CHUNK):
         bit = owner - first
-        owned = (weight != 0) & (bit >= 0) & (bit < CHUNK)
-        bits = tl.where(owned, 1 << tl.where(owned, bit, 0), 0)
-        left = tl.reduce(tl.reduce(bits, 1, _or), 0, _or)
-        while left != 0:
-            lowest = (left & -left).to(tl.uint32).to(tl.float32)  # a power of two
+        in_chunk = (weight != 0) & (bit >= 0) & (bit < CHUNK)
+        pixel_bits = tl.where(in_chunk, 1 << tl.where(in_chunk, bit, 0), 0)
+        row_bits = tl.reduce(pixel_bits, 1, combine_fn=_or)
+        bits = tl.reduce(row_bits, 0, combine_fn=_or)
+        while bits != 0:
+            lowest = (bits & -bits).to(tl.uint32).to(tl.float32)  # a power of two
             edge = first + (lowest.to(tl.int32, bitcast=True) >> 23) - 127
-            x0, y0, edge_x, edge_y = _ends(ring, edge, count)
+            x0, y0, edge_x, edge_y = _ends(ring, edge, count=count)
             length2 = edge_x * edge_x + edge_y * edge_y + EPS
-            offset_x, offset_y = x - x0, y - y0
+            offset_x = x - x0
+            offset_y = y - y0
             along = offset_x * (edge_x / length2) + offset_y * (edge_y / length2)
             t = tl.minimum(tl.maximum(along, 0.0), 1.0)
-            dx, dy = offset_x - t * edge_x, offset_y - t * edge_y
-            # Between the ends t has a gradient of its own: EPS, and rounding, move it off the
-            # nearest point. As computed, and not by EPS alone, it undoes what rounding does.
+            dx = offset_x - t * edge_x
+            dy = offset_y - t * edge_y
+            # EPS and rounding move t off the nearest point of the edge, so t has a gradient between
+            # the ends. Computed from (dx, dy) instead of EPS, the slip also covers rounding.
             between = (along >= 0) & (along <= 1)
             slip = tl.where(between, 2 * (dx * edge_x + dy * edge_y) / length2, 0.0)
-            own = tl.where(owner == edge, weight, 0.0)
+            share = tl.where(owner == edge, weight, 0.0)
             end_x = -2 * t * dx - slip * (offset_x - 2 * t * edge_x)
             end_y = -2 * t * dy - slip * (offset_y - 2 * t * edge_y)
-            tl.store(out + edge * 4, tl.sum(own * (slip * edge_x - 2 * dx - end_x)))
-            tl.store(out + edge * 4 + 1, tl.sum(own * (slip * edge_y - 2 * dy - end_y)))
-            tl.store(out + edge * 4 + 2, tl.sum(own * end_x))
-            tl.store(out + edge * 4 + 3, tl.sum(own * end_y))
-            left = left & (left - 1)
+            tl.store(out + edge * 4, tl.sum(share * (slip * edge_x - 2 * dx - end_x)))
+            tl.store(out + edge * 4 + 1, tl.sum(share * (slip * edge_y - 2 * dy - end_y)))
+            tl.store(out + edge * 4 + 2, tl.sum(share * end_x))
+            tl.store(out + edge * 4 + 3, tl.sum(share * end_y))
+            bits = bits & (bits - 1)
 
 
 @triton.jit
@@ -182,68 +228,157 @@ def draw_kernel(
     pixel,
     TILE: tl.constexpr,
 ):
-    """Draw one tile of one polyline or filled polygon: (K, P, 2) to masks (K, H, W)."""
+    """Draw one tile of one polyline or filled polygon.
+
+    Args:
+        polylines: Vertices in metres, float32. (K, P, 2)
+        filled: Whether a polyline is filled as a polygon, uint8. (K,)
+        masks: Output for the masks, float32. (K, H, W)
+        count: Number P of vertices of a polyline.
+        height: Rows H of the raster.
+        width: Columns W of the raster.
+        x_min: Smallest x of the raster in metres.
+        y_min: Smallest y of the raster in metres.
+        step_x: Size of a pixel along x in metres.
+        step_y: Size of a pixel along y in metres.
+        half_width: Half the width of a line in metres.
+        pixel: Side in metres of a square with the area of a pixel.
+        TILE: Side of a tile in pixels.
+    """
     n = tl.program_id(1).to(tl.int64)
-    cols, rows, index, valid = _tile_pixels(height, width, TILE)
-    x, y = x_min + (cols + 0.5) * step_x, y_min + (rows + 0.5) * step_y
+    cols, rows, index, valid = _tile_pixels(height, width, TILE=TILE)
+    x = x_min + (cols + 0.5) * step_x
+    y = y_min + (rows + 0.5) * step_y
     closed = (tl.load(filled + n) != 0).to(tl.int32)
     squared, _, inside, poison = _survey(
-        polylines + n * count * 2, count - 1 + closed, count, x, y, 0.0, TILE
+        polylines + n * count * 2, count - 1 + closed, count=count, x=x, y=y, eps=0.0, TILE=TILE
     )
     distance = tl.sqrt(squared)
     area = tl.minimum(0.5 + tl.where(inside, distance, -distance) / pixel, 1.0)
     near = tl.minimum((distance + half_width) / pixel, 0.5)
     line = near - tl.maximum((distance - half_width) / pixel, -0.5)
     share = tl.maximum(tl.where(closed != 0, area, line), 0.0)
-    tl.store(masks + n * height * width + index, share + poison, valid)
+    tl.store(masks + n * height * width + index, share + poison, mask=valid)
 
 
-def _tiles(height, width):
-    """Return the number of tiles of a raster."""
+def _num_tiles(height, width):
+    """Number of tiles of a raster."""
     return math.ceil(height / TILE) * math.ceil(width / TILE)
 
 
-def _flags(flags):
-    """Return bools as the kernels read them."""
-    return flags.contiguous().view(torch.uint8)
-
-
 def soft_rasters(rings, is_polygon, height, width, softness, plain):
-    """Render closed float32 rings softly; see ``soft_rasters_reference``. (n, H, W)"""
+    """Render closed rings softly, see `soft_rasters_reference`.
+
+    Args:
+        rings: Vertices of closed rings in pixels, float32. (n, V, 2)
+        is_polygon: Whether a ring is a polygon, bool. (n,)
+        height: Rows H of the raster.
+        width: Columns W of the raster.
+        softness: Softness s of lines and of polygons, in the unit of D. (2,)
+        plain: Whether D is the distance to the nearest edge instead of its square.
+
+    Returns:
+        Masks in [0, 1], float32. (n, H, W)
+    """
     masks = torch.empty(len(rings), height, width, dtype=torch.float32, device=rings.device)
-    if masks.numel():
-        tensors = rings.contiguous(), _flags(is_polygon), masks
-        numbers = rings.shape[1], height, width, *softness, DISTANCE_EPS
-        with torch.cuda.device_of(rings):
-            launch = soft_forward_kernel[_tiles(height, width), len(rings)]
-            launch(*tensors, *numbers, PLAIN=plain, TILE=TILE, **OPTIONS)
+    if not masks.numel():
+        return masks
+    line_softness, polygon_softness = softness
+    with torch.cuda.device_of(rings):
+        soft_forward_kernel[_num_tiles(height, width), len(rings)](
+            rings.contiguous(),
+            is_polygon.contiguous().view(torch.uint8),
+            masks=masks,
+            count=rings.shape[1],
+            height=height,
+            width=width,
+            line_softness=line_softness,
+            polygon_softness=polygon_softness,
+            nearest=DISTANCE_EPS,
+            PLAIN=plain,
+            TILE=TILE,
+            **OPTIONS,
+        )
     return masks
 
 
 def soft_rasters_backward(grads, rings, is_polygon, height, width, softness, plain):
-    """Return the gradient in the rings; not a number for a ring with such a vertex. (n, V, 2)"""
+    """Compute the gradient of `soft_rasters`.
+
+    Args:
+        grads: Gradient of the masks, float32. (n, H, W)
+        rings: Vertices of closed rings in pixels, float32. (n, V, 2)
+        is_polygon: Whether a ring is a polygon, bool. (n,)
+        height: Rows H of the raster.
+        width: Columns W of the raster.
+        softness: Softness s of lines and of polygons, in the unit of D. (2,)
+        plain: Whether D is the distance to the nearest edge instead of its square.
+
+    Returns:
+        Gradient of the rings, float32; NaN for a ring with a vertex that is not finite. (n, V, 2)
+    """
     if not grads.numel():
         return (torch.zeros_like(rings, memory_format=torch.contiguous_format),)
-    tiles, rings = _tiles(height, width), rings.contiguous()
-    shape = len(rings), tiles, rings.shape[1], 4
-    sums = torch.zeros(shape, dtype=torch.float32, device=rings.device)
-    tensors = rings, _flags(is_polygon), grads.contiguous(), sums
-    numbers = rings.shape[1], height, width, *softness, DISTANCE_EPS
+    num_tiles = _num_tiles(height, width)
+    rings = rings.contiguous()
+    instances, count, _ = rings.shape
+    sums = torch.zeros(instances, num_tiles, count, 4, dtype=torch.float32, device=rings.device)
+    line_softness, polygon_softness = softness
     with torch.cuda.device_of(rings):
-        launch = soft_backward_kernel[tiles, len(rings)]
-        launch(*tensors, *numbers, PLAIN=plain, TILE=TILE, **OPTIONS)
+        soft_backward_kernel[num_tiles, instances](
+            rings,
+            is_polygon.contiguous().view(torch.uint8),
+            grads=grads.contiguous(),
+            sums=sums,
+            count=count,
+            height=height,
+            width=width,
+            line_softness=line_softness,
+            polygon_softness=polygon_softness,
+            nearest=DISTANCE_EPS,
+            PLAIN=plain,
+            TILE=TILE,
+            **OPTIONS,
+        )
     starts, ends = sums.sum(1).split(2, -1)
-    poison = (rings - rings).sum((1, 2), keepdim=True)
+    poison = (rings - rings).sum((1, 2), keepdim=True)  # NaN if a vertex is not finite
     return (starts + ends.roll(1, 1) + poison,)
 
 
 def draw_polylines(polylines, filled, height, width, frame, half_width, pixel):
-    """Draw float32 polylines; see ``draw_reference``. (K, H, W)"""
+    """Draw polylines and filled polygons, see `draw_reference`.
+
+    Args:
+        polylines: Vertices in metres, float32. (K, P, 2)
+        filled: Whether a polyline is filled as a polygon, bool. (K,)
+        height: Rows H of the raster.
+        width: Columns W of the raster.
+        frame: Smallest x and y of the raster, and the size of a pixel along x and y, in metres.
+        half_width: Half the width of a line in metres.
+        pixel: Side in metres of a square with the area of a pixel.
+
+    Returns:
+        Masks in [0, 1], float32. (K, H, W)
+    """
     masks = torch.empty(len(polylines), height, width, dtype=torch.float32, device=polylines.device)
-    if masks.numel():
-        tensors = polylines.contiguous(), _flags(filled), masks
-        numbers = polylines.shape[1], height, width, *frame, half_width, pixel
-        with torch.cuda.device_of(polylines):
-            launch = draw_kernel[_tiles(height, width), len(polylines)]
-            launch(*tensors, *numbers, TILE=TILE, **OPTIONS)
+    if not masks.numel():
+        return masks
+    x_min, y_min, step_x, step_y = frame
+    with torch.cuda.device_of(polylines):
+        draw_kernel[_num_tiles(height, width), len(polylines)](
+            polylines.contiguous(),
+            filled.contiguous().view(torch.uint8),
+            masks=masks,
+            count=polylines.shape[1],
+            height=height,
+            width=width,
+            x_min=x_min,
+            y_min=y_min,
+            step_x=step_x,
+            step_y=step_y,
+            half_width=half_width,
+            pixel=pixel,
+            TILE=TILE,
+            **OPTIONS,
+        )
     return masks

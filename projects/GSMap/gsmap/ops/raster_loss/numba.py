@@ -1,16 +1,17 @@
 # numba infers the types of its kernels:
 # mypy: disable-error-code="no-untyped-def"
-"""Fused CPU kernels (numba): the raster loss on the pixels that matter.
+"""Fused CPU kernels (numba): the raster loss on the pixels that contribute to it.
 
-One thread works on one instance at a time. Where neither mask has anything within SSIM's window,
-SSIM is exactly 1 and the L1 term exactly 0, so every step runs, row by row, from the first to the
-last column that can differ: from the masks' own columns, grown by the window's radius for each
-blur. The window is separable and a row is blurred when it is needed, so no blurred map is kept.
+A thread computes one instance at a time. Where both masks are zero within SSIM's window, SSIM is
+exactly 1 and the L1 term exactly 0. In each row, every step therefore runs only from the first to
+the last column that can contribute: the columns where a mask is not zero, extended by the radius of
+the window for each blur. The window is separable and a row is blurred when it is needed, so no
+blurred map is stored.
 
-Nothing is kept for the backward pass but the two masks: the four blurred maps (p, t, p^2 + t^2,
-p t) are built again, turned into the derivatives of SSIM by the blurred p, p^2 and p t, and blurred
-once more (the window is symmetric, so the blur is its own transpose). Sums run in a fixed order in
-one thread, so two runs give the same bits.
+Only the two masks are saved for the backward pass. It computes the four blurred maps (p, t,
+p^2 + t^2, p t) again and, from them, the derivatives of SSIM with respect to the blurred p, p^2 and
+p t. These are blurred once more, since the blur with a symmetric window equals its transpose. Sums
+run in a fixed order in one thread, so repeated runs are equal to the bit.
 """
 
 import numpy as np
@@ -20,46 +21,67 @@ from numba import njit
 from gsmap.ops._numba import FASTMATH, run_in_threads
 from gsmap.ops.raster_loss.reference import SEEN, SSIM_C1, SSIM_C2
 
-ONE, TWO = np.float32(1), np.float32(2)
-C1, C2 = np.float32(SSIM_C1), np.float32(SSIM_C2)
+ONE = np.float32(1)
+TWO = np.float32(2)
+C1 = np.float32(SSIM_C1)
+C2 = np.float32(SSIM_C2)
 SEEN_FLOAT32 = np.float32(SEEN)
-TAPS = 6  # that are added at a time, without going back to memory
+TAPS = 6  # taps of the window that are added at a time, without a detour through memory
 
 
 @njit(nogil=True, cache=True, fastmath=FASTMATH)
 def _find_spans(preds, targets, radius, spans):
-    """Write each row's first and one past the last column where a mask is not 0, (3, H, 2).
+    """Find the columns of each row that contribute to the loss.
 
-    The second and third spans are those that a window carries the ones before to.
+    Args:
+        preds: Predicted mask. (H, W)
+        targets: Ground-truth mask. (H, W)
+        radius: Radius of the window in pixels.
+        spans: Output for the first column and one past the last column of each row: where a mask is
+            not zero, where its blur is not zero, and where the blur of the blur is not zero.
+            (3, H, 2)
     """
     height, width = preds.shape
     for row in range(height):
-        left, right = np.int32(width), np.int32(0)
+        left = np.int32(width)
+        right = np.int32(0)
         for col in range(width):
-            seen = (preds[row, col] != 0) | (targets[row, col] != 0)
-            left = min(left, np.int32(col) if seen else np.int32(width))
-            right = max(right, np.int32(col + 1) if seen else np.int32(0))
-        spans[0, row, 0], spans[0, row, 1] = left, max(left, right)
+            nonzero = (preds[row, col] != 0) | (targets[row, col] != 0)
+            left = min(left, np.int32(col) if nonzero else np.int32(width))
+            right = max(right, np.int32(col + 1) if nonzero else np.int32(0))
+        spans[0, row, 0] = left
+        spans[0, row, 1] = max(left, right)
     for step in range(2):
         for row in range(height):
-            left, right = np.int32(width), np.int32(0)
+            left = np.int32(width)
+            right = np.int32(0)
             for other in range(max(row - radius, 0), min(row + radius + 1, height)):
                 if spans[step, other, 0] < spans[step, other, 1]:
                     left = min(left, spans[step, other, 0])
                     right = max(right, spans[step, other, 1])
             left = max(left - radius, np.int32(0))
-            spans[step + 1, row] = left, max(min(right + radius, np.int32(width)), left)
+            right = min(right + radius, np.int32(width))
+            spans[step + 1, row, 0] = left
+            spans[step + 1, row, 1] = max(right, left)
 
 
 @njit(nogil=True, cache=True, fastmath=FASTMATH)
 def _convolve(source, first, stride, window, out, size):
-    """Write sum_j window[j] source[first + k + j stride] to ``out[k]`` for k < size."""
-    s_1, s_2, s_3 = np.uint64(stride), np.uint64(2 * stride), np.uint64(3 * stride)
-    s_4, s_5 = np.uint64(4 * stride), np.uint64(5 * stride)  # unsigned: an index is not wrapped
+    """Compute out[k] = sum_j window[j] source[first + k + j stride] for k < size."""
+    # Unsigned indices need no test for a negative one, which counts from the end.
+    s_1 = np.uint64(stride)
+    s_2 = np.uint64(2 * stride)
+    s_3 = np.uint64(3 * stride)
+    s_4 = np.uint64(4 * stride)
+    s_5 = np.uint64(5 * stride)
     out[:size] = 0
     for j in range(0, len(window), TAPS):
-        w_0, w_1, w_2 = window[j], window[j + 1], window[j + 2]
-        w_3, w_4, w_5 = window[j + 3], window[j + 4], window[j + 5]
+        w_0 = window[j]
+        w_1 = window[j + 1]
+        w_2 = window[j + 2]
+        w_3 = window[j + 3]
+        w_4 = window[j + 4]
+        w_5 = window[j + 5]
         start = np.uint64(first + j * stride)
         for k in range(np.uint64(size)):
             i = start + k
@@ -70,75 +92,108 @@ def _convolve(source, first, stride, window, out, size):
 
 @njit(nogil=True, cache=True)
 def _blur_row(images, channels, row, span, window, line, out):
-    """Filter a row's span of padded images (H + taps, (W + taps) channels); return its pixels."""
-    pitch, pixels = images.shape[1], span[1] - span[0]
-    first = row * pitch + span[0] * channels  # images start a radius early
+    """Blur a span of one row of padded images (H + taps, (W + taps) channels).
+
+    Args:
+        images: Images with interleaved channels and a margin of the window's radius.
+        channels: Number of channels.
+        row: Row of the images without margin.
+        span: First column and one past the last column. (2,)
+        window: Weights of the window. (taps,)
+        line: Buffer for a blurred row. (4 (W + taps),)
+        out: Output for the blurred span. (4 (W + taps),)
+
+    Returns:
+        Number of pixels of the span.
+    """
+    pitch = images.shape[1]
+    pixels = span[1] - span[0]
+    first = row * pitch + span[0] * channels  # top left of the window, because of the margin
     size = (pixels + len(window)) * channels
-    _convolve(images.reshape(images.size), first, pitch, window, line, size)
-    _convolve(line, 0, channels, window, out, pixels * channels)
+    _convolve(images.reshape(images.size), first, stride=pitch, window=window, out=line, size=size)
+    _convolve(line, 0, stride=channels, window=window, out=out, size=pixels * channels)
     return pixels
 
 
 @njit(inline="always")
 def _ssim_terms(p, t, squares, product):
-    """Return SSIM's numerators and denominators of the blurred p, t, p^2 + t^2 and p t."""
+    """Numerators and denominators of SSIM from the blurred p, t, p^2 + t^2 and p t."""
     means = p * p + t * t
-    return TWO * p * t + C1, TWO * (product - p * t) + C2, means + C1, squares - means + C2
+    top_mean = TWO * p * t + C1
+    top_cov = TWO * (product - p * t) + C2
+    return top_mean, top_cov, means + C1, squares - means + C2
 
 
 @njit(nogil=True, cache=True)
 def _dissimilarity(maps, pixels):
-    """Sum a row's 1 - SSIM, and count the pixels whose window sees the target, and either."""
-    total, target, either = 0.0, 0.0, 0.0
+    """Sum 1 - SSIM over a row, and count the pixels near the target and near either mask."""
+    total = 0.0
+    near_target = 0.0
+    near_either = 0.0
     for k in range(pixels):
-        p, t = maps[4 * k], maps[4 * k + 1]
-        top_mean, top_cov, low_mean, low_var = _ssim_terms(p, t, maps[4 * k + 2], maps[4 * k + 3])
+        p = maps[4 * k]
+        t = maps[4 * k + 1]
+        top_mean, top_cov, low_mean, low_var = _ssim_terms(
+            p, t, squares=maps[4 * k + 2], product=maps[4 * k + 3]
+        )
         total += ONE - (top_mean * top_cov) / (low_mean * low_var)
-        target += 1.0 if t > 0 else 0.0
-        either += 1.0 if max(p, t) > SEEN_FLOAT32 else 0.0
-    return total, target, either
+        near_target += 1.0 if t > 0 else 0.0
+        near_either += 1.0 if max(p, t) > SEEN_FLOAT32 else 0.0
+    return total, near_target, near_either
 
 
 @njit(nogil=True, cache=True)
 def _derivatives(maps, pixels, out):
-    """Fill a row's derivatives of SSIM by the blurred p, p^2 and p t."""
+    """Compute the derivatives of SSIM with respect to the blurred p, p^2 and p t of a row."""
     for k in range(pixels):
-        p, t = maps[4 * k], maps[4 * k + 1]
-        top_mean, top_cov, low_mean, low_var = _ssim_terms(p, t, maps[4 * k + 2], maps[4 * k + 3])
+        p = maps[4 * k]
+        t = maps[4 * k + 1]
+        top_mean, top_cov, low_mean, low_var = _ssim_terms(
+            p, t, squares=maps[4 * k + 2], product=maps[4 * k + 3]
+        )
         scale = ONE / (low_mean * low_var)
         ssim = top_mean * top_cov * scale
         change = t * (top_cov - top_mean) + p * ssim * (low_mean - low_var)
-        out[3 * k], out[3 * k + 1] = TWO * change * scale, -ssim * scale * low_mean
+        out[3 * k] = TWO * change * scale
+        out[3 * k + 1] = -ssim * scale * low_mean
         out[3 * k + 2] = TWO * top_mean * scale
 
 
 @njit(nogil=True, cache=True)
 def _fill_products(pred, target, weight, out):
-    """Fill a row's p, t, p^2 + t^2 and p t; return sum w |p - t|, w p, w t and w - 1."""
-    l1, predicted, foreground, excess = 0.0, 0.0, 0.0, 0.0
+    """Compute p, t, p^2 + t^2 and p t of a row, and sum w |p - t|, w p, w t and w - 1."""
+    l1 = 0.0
+    predicted = 0.0
+    foreground = 0.0
+    excess = 0.0
     for k in range(len(pred)):
-        p, t = pred[k], target[k]
+        p = pred[k]
+        t = target[k]
         extra = (weight - ONE) * t
         l1 += (ONE + extra) * abs(p - t)
         predicted += (ONE + extra) * p
         foreground += (ONE + extra) * t
         excess += extra
-        out[4 * k], out[4 * k + 1], out[4 * k + 2] = p, t, p * p + t * t
+        out[4 * k] = p
+        out[4 * k + 1] = t
+        out[4 * k + 2] = p * p + t * t
         out[4 * k + 3] = p * t
     return l1, predicted, foreground, excess
 
 
 @njit(nogil=True, cache=True)
 def _survey(preds, targets, weight, radius, products, spans, sums):
-    """Fill an instance's spans and products, and add up what needs no window."""
-    _find_spans(preds, targets, radius, spans)
+    """Compute the spans and products of an instance, and the sums that need no window."""
+    _find_spans(preds, targets, radius=radius, spans=spans)
     products[:] = 0
     sums[:] = 0
     for row in range(len(preds)):
-        left, right = spans[0, row, 0], spans[0, row, 1]
-        pred, target = preds[row, left:right], targets[row, left:right]
+        left = spans[0, row, 0]
+        right = spans[0, row, 1]
+        pred = preds[row, left:right]
+        target = targets[row, left:right]
         out = products[row + radius, 4 * (left + radius) :]
-        l1, predicted, foreground, excess = _fill_products(pred, target, weight, out)
+        l1, predicted, foreground, excess = _fill_products(pred, target, weight=weight, out=out)
         sums[0] += l1
         sums[1] += predicted
         sums[3] += foreground
@@ -147,37 +202,59 @@ def _survey(preds, targets, weight, radius, products, spans, sums):
 
 @njit(nogil=True, cache=True)
 def _buffers(shape, taps):
-    """Return a thread's scratch: products, their derivatives, rows of both, three spans."""
-    height, width = shape[0] + taps, shape[1] + taps
+    """Buffers of a thread: products, derivatives, a row blurred once and twice, spans."""
+    height = shape[0] + taps
+    width = shape[1] + taps
     products = np.empty((height, 4 * width), np.float32)
     slopes = np.empty((height, 3 * width), np.float32)
-    line, maps = np.empty(4 * width, np.float32), np.empty(4 * width, np.float32)
-    return products, slopes, line, maps, np.empty((3, shape[0], 2), np.int64)
+    line = np.empty(4 * width, np.float32)
+    maps = np.empty(4 * width, np.float32)
+    spans = np.empty((3, shape[0], 2), np.int64)
+    return products, slopes, line, maps, spans
 
 
 @njit(nogil=True, cache=True)
 def loss_forward(preds, targets, window, radius, weight, results, first, last):
-    """Write some instances' sums, those of `raster_loss_sums_reference`, float64 (n, 7).
+    """Compute the sums of `raster_loss_sums_reference` of the masks ``first`` to ``last - 1``.
 
-    Masks (n, H, W), the window (size,) and the weight are float32; zeros at the window's end make
-    its size a multiple of ``TAPS``.
+    Args:
+        preds: Predicted masks in [0, 1], float32. (n, H, W)
+        targets: Ground-truth masks in [0, 1], float32. (n, H, W)
+        window: Weights of SSIM's window, float32, with zeros at the end that make their number a
+            multiple of ``TAPS``. (taps,)
+        radius: Radius of the window in pixels.
+        weight: Weight of a foreground pixel, relative to a background pixel, float32.
+        results: Output for the sums, float64. (n, 7)
+        first: First mask.
+        last: One past the last mask.
     """
     products, _, line, maps, spans = _buffers(preds.shape[1:], len(window))
     for n in range(first, last):
-        _survey(preds[n], targets[n], weight, radius, products, spans, results[n])
+        _survey(
+            preds[n],
+            targets[n],
+            weight=weight,
+            radius=radius,
+            products=products,
+            spans=spans,
+            sums=results[n],
+        )
         for row in range(preds.shape[1]):
-            pixels = _blur_row(products, 4, row, spans[1, row], window, line, maps)
-            dissimilarity, target, either = _dissimilarity(maps, pixels)
+            pixels = _blur_row(
+                products, 4, row=row, span=spans[1, row], window=window, line=line, out=maps
+            )
+            dissimilarity, near_target, near_either = _dissimilarity(maps, pixels)
             results[n, 2] += dissimilarity
-            results[n, 5] += target
-            results[n, 6] += either
+            results[n, 5] += near_target
+            results[n, 6] += near_either
 
 
 @njit(nogil=True, cache=True, fastmath=FASTMATH)
 def _row_gradient(pred, target, maps, weight, factors, grad):
-    """Write a row's gradient of the first three sums, each times its factor."""
+    """Compute the gradient of the first three sums of a row, each times its factor."""
     for k in range(len(grad)):
-        p, t = pred[k], target[k]
+        p = pred[k]
+        t = target[k]
         slope = factors[0] * np.sign(p - t) + factors[1]
         ssim = maps[3 * k] + TWO * p * maps[3 * k + 1] + t * maps[3 * k + 2]
         grad[k] = (ONE + (weight - ONE) * t) * slope - factors[2] * ssim
@@ -185,41 +262,99 @@ def _row_gradient(pred, target, maps, weight, factors, grad):
 
 @njit(nogil=True, cache=True)
 def loss_backward(preds, targets, window, radius, weight, factors, grads, first, last):
-    """Write the gradient (n, H, W) of the first three sums, each times its factor (n, 3)."""
+    """Compute the gradient of the masks ``first`` to ``last - 1``.
+
+    Args:
+        preds: Predicted masks in [0, 1], float32. (n, H, W)
+        targets: Ground-truth masks in [0, 1], float32. (n, H, W)
+        window: Weights of SSIM's window, see `loss_forward`. (taps,)
+        radius: Radius of the window in pixels.
+        weight: Weight of a foreground pixel, relative to a background pixel, float32.
+        factors: Gradient of the first three sums, float32. (n, 3)
+        grads: Output for the gradient of the predicted masks, float32. (n, H, W)
+        first: First mask.
+        last: One past the last mask.
+    """
     products, slopes, line, maps, spans = _buffers(preds.shape[1:], len(window))
     unused = np.zeros(7)
     for n in range(first, last):
-        grads[n] = factors[n, 1]  # outside the spans w is 1, and nothing else depends on p
-        _survey(preds[n], targets[n], weight, radius, products, spans, unused)
+        grads[n] = factors[n, 1]  # outside the spans w is 1 and only the sum of w p depends on p
+        _survey(
+            preds[n],
+            targets[n],
+            weight=weight,
+            radius=radius,
+            products=products,
+            spans=spans,
+            sums=unused,
+        )
         slopes[:] = 0
         for row in range(preds.shape[1]):
-            pixels = _blur_row(products, 4, row, spans[1, row], window, line, maps)
+            pixels = _blur_row(
+                products, 4, row=row, span=spans[1, row], window=window, line=line, out=maps
+            )
             out = slopes[row + radius, 3 * (spans[1, row, 0] + radius) :]
-            _derivatives(maps, pixels, out)
+            _derivatives(maps, pixels, out=out)
         for row in range(preds.shape[1]):
-            _blur_row(slopes, 3, row, spans[2, row], window, line, maps)
-            left, right = spans[2, row, 0], spans[2, row, 1]
-            pred, target = preds[n, row, left:right], targets[n, row, left:right]
-            _row_gradient(pred, target, maps, weight, factors[n], grads[n, row, left:right])
+            _blur_row(slopes, 3, row=row, span=spans[2, row], window=window, line=line, out=maps)
+            left = spans[2, row, 0]
+            right = spans[2, row, 1]
+            pred = preds[n, row, left:right]
+            target = targets[n, row, left:right]
+            _row_gradient(
+                pred,
+                target,
+                maps=maps,
+                weight=weight,
+                factors=factors[n],
+                grad=grads[n, row, left:right],
+            )
 
 
-def _settings(window, weight):
-    """Return the kernels' window, radius and weight."""
-    padded = torch.nn.functional.pad(window, (0, -len(window) % TAPS))
-    return padded, len(window) // 2, np.float32(weight)
+def _pad_window(window):
+    """Append zeros to a window (size,) up to a multiple of ``TAPS``."""
+    return torch.nn.functional.pad(window, (0, -len(window) % TAPS))
 
 
 def raster_loss_sums(preds, targets, window, weight):
-    """Return the sums of `raster_loss_sums_reference`; the first three are differentiable."""
+    """Compute the sums of `raster_loss_sums_reference`.
+
+    Args:
+        preds: Predicted masks in [0, 1], float32. (n, H, W)
+        targets: Ground-truth masks in [0, 1], float32. (n, H, W)
+        window: Weights of SSIM's window, float32. (size,)
+        weight: Weight of a foreground pixel, relative to a background pixel.
+
+    Returns:
+        Sums, float32. The first three are differentiable in ``preds``. (n, 7)
+    """
     sums = torch.empty(len(preds), 7, dtype=torch.float64)
-    arguments = preds, targets, *_settings(window, weight), sums
-    run_in_threads(loss_forward, preds.shape[1:].numel(), *arguments)
+    pixels = preds.shape[1:].numel()
+    padded = _pad_window(window)
+    radius = len(window) // 2
+    weight = np.float32(weight)
+    run_in_threads(loss_forward, pixels, preds, targets, padded, radius, weight, sums)
     return sums.float()
 
 
 def raster_loss_sums_backward(grads, preds, targets, window, weight):
-    """Return the gradient in the predictions. (n, H, W)"""
+    """Compute the gradient of `raster_loss_sums`.
+
+    Args:
+        grads: Gradient of the sums, float32. (n, 7)
+        preds: Predicted masks in [0, 1], float32. (n, H, W)
+        targets: Ground-truth masks in [0, 1], float32. (n, H, W)
+        window: Weights of SSIM's window, float32. (size,)
+        weight: Weight of a foreground pixel, relative to a background pixel.
+
+    Returns:
+        Gradient of the predicted masks, float32. (n, H, W)
+    """
     gradient = torch.empty(preds.shape, dtype=torch.float32)
-    arguments = preds, targets, *_settings(window, weight), grads[:, :3], gradient
-    run_in_threads(loss_backward, preds.shape[1:].numel(), *arguments)
+    pixels = preds.shape[1:].numel()
+    padded = _pad_window(window)
+    radius = len(window) // 2
+    weight = np.float32(weight)
+    factors = grads[:, :3]
+    run_in_threads(loss_backward, pixels, preds, targets, padded, radius, weight, factors, gradient)
     return (gradient,)

@@ -1,23 +1,28 @@
-"""The sums behind the raster loss in plain torch: the definition of right."""
+"""Sums of the raster loss in plain torch."""
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2  # the usual constants for values in [0, 1]
-# A window whose weighted mean is below sees a mask as empty. So D-SSIM of a miss is 0.94 to 1.03
-# for elements of 4 to 60 m and rasters of 128 x 64 to 256 x 128. At 0 it is 0.59 to 0.93, as
-# windows that see next to nothing of the mask count, too; at 1e-2 it is 1.09 to 1.38.
+SSIM_C1 = 0.01**2
+SSIM_C2 = 0.03**2  # the usual constants for values in [0, 1]
+# Weighted mean of a mask in a window above which the window counts as covering part of it. D-SSIM
+# of a miss is then 0.94 to 1.03 for elements of 4 to 60 m and rasters of 128 x 64 to 256 x 128. At
+# 0 it is 0.59 to 0.93, as windows count that cover almost nothing of the mask, and at 1e-2 it is
+# 1.09 to 1.38.
 SEEN = 1e-3
 
 
 def gaussian_window(size: int, sigma: float, like: Tensor) -> Tensor:
-    """Return a 1D Gaussian window that sums to one. (size,)
+    """Create a 1D Gaussian window that sums to one.
 
     Args:
         size: Number of values.
-        sigma: Standard deviation in values.
-        like: Its type and device are those of the window.
+        sigma: Standard deviation, in units of the distance between two values.
+        like: Tensor with the type and device of the window.
+
+    Returns:
+        Window. (size,)
     """
     offsets = torch.arange(size, device=like.device, dtype=like.dtype) - (size - 1) / 2
     window = torch.exp(-0.5 * (offsets / sigma).square())
@@ -25,17 +30,27 @@ def gaussian_window(size: int, sigma: float, like: Tensor) -> Tensor:
 
 
 def _blur(images: Tensor, window: Tensor) -> Tensor:
-    """Filter with a separable window, zeros outside the image. (n, H, W)"""
+    """Filter images with a separable window, zeros outside. (n, H, W), (size,) -> (n, H, W)"""
     pad = len(window) // 2
     columns = F.conv2d(images[:, None], window.view(1, 1, 1, -1), padding=(0, pad))
     return F.conv2d(columns, window.view(1, 1, -1, 1), padding=(pad, 0))[:, 0]
 
 
 def dssim_map(preds: Tensor, targets: Tensor, window: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return 1 - SSIM in [0, 2], and the means of both masks in the window. 3 x (n, H, W)"""
+    """Compute the structural dissimilarity of masks in a window around each pixel.
+
+    Args:
+        preds: Predicted masks in [0, 1]. (n, H, W)
+        targets: Ground-truth masks in [0, 1]. (n, H, W)
+        window: Weights of the window along one axis, which sum to one. (size,)
+
+    Returns:
+        1 - SSIM in [0, 2], and the weighted means of predictions and of targets, all (n, H, W).
+    """
     images = torch.cat([preds, targets, preds.square(), targets.square(), preds * targets])
     mean_p, mean_t, square_p, square_t, product = _blur(images, window).chunk(5)
-    var_p, var_t = square_p - mean_p.square(), square_t - mean_t.square()
+    var_p = square_p - mean_p.square()
+    var_t = square_t - mean_t.square()
     covariance = product - mean_p * mean_t
     numerator = (2 * mean_p * mean_t + SSIM_C1) * (2 * covariance + SSIM_C2)
     denominator = (mean_p.square() + mean_t.square() + SSIM_C1) * (var_p + var_t + SSIM_C2)
@@ -45,24 +60,25 @@ def dssim_map(preds: Tensor, targets: Tensor, window: Tensor) -> tuple[Tensor, T
 def raster_loss_sums_reference(
     preds: Tensor, targets: Tensor, window_size: int, window_sigma: float, weight: float
 ) -> Tensor:
-    """Sum what Eq. 12 is made of over each instance's pixels. (n, 7)
-
-    With w = 1 + (weight - 1) t: sum w |p - t|, sum w p, sum (1 - SSIM), sum w t, sum (w - 1), and
-    the number of pixels whose window sees the target, and either mask.
+    """Sum the terms of GSMap Eq. 12 over the pixels of each mask.
 
     Args:
         preds: Predicted masks p in [0, 1]. (n, H, W)
-        targets: True masks t in [0, 1]. (n, H, W)
+        targets: Ground-truth masks t in [0, 1]. (n, H, W)
         window_size: Side of SSIM's window in pixels.
         window_sigma: Standard deviation of SSIM's window in pixels.
-        weight: Weight of a foreground pixel, where the background has 1.
+        weight: Weight of a foreground pixel, relative to a background pixel.
+
+    Returns:
+        With w = 1 + (weight - 1) t: sum w |p - t|, sum w p, sum (1 - SSIM), sum w t, sum (w - 1),
+        the number of pixels whose window covers part of the target, and of either mask. (n, 7)
     """
     excess = (weight - 1) * targets
     weights = 1 + excess
-    window = gaussian_window(window_size, window_sigma, preds)
-    dissimilarity, mean_p, mean_t = dssim_map(preds, targets, window)
+    window = gaussian_window(window_size, window_sigma, like=preds)
+    dissimilarity, mean_p, mean_t = dssim_map(preds, targets, window=window)
     reach = F.max_pool2d(targets[:, None], window_size, 1, window_size // 2)[:, 0]
-    sums = (
+    terms = (
         weights * (preds - targets).abs(),
         weights * preds,
         dissimilarity,
@@ -71,4 +87,4 @@ def raster_loss_sums_reference(
         (reach > 0).to(preds.dtype),
         (torch.maximum(mean_p, mean_t) > SEEN).to(preds.dtype),
     )
-    return torch.stack([values.sum((1, 2)) for values in sums], -1)
+    return torch.stack([term.sum((1, 2)) for term in terms], dim=-1)

@@ -2,12 +2,13 @@
 # mypy: disable-error-code="no-untyped-def"
 """Triton kernels: the raster loss by separable blurs, in float32.
 
-A program has ``BLOCK`` pixels of one instance, row after row. Forward, one kernel blurs p, t,
-p^2 + t^2 and p t along rows; the next one blurs these along columns, takes SSIM, and writes its
-block's sums to a buffer (n, blocks, 7) that no other program writes: no atomics, so two runs give
-the same bits. Backward, the blurs are computed again and become the derivatives of SSIM by the
-blurred p, p^2 and p t, which are blurred once more (the window is symmetric, so the blur is its own
-transpose). Neighbours are read from the cache, once for each of the window's taps.
+A program computes ``BLOCK`` consecutive pixels of one instance. In the forward pass, one kernel
+blurs p, t, p^2 + t^2 and p t along rows. The next one blurs them along columns, computes SSIM, and
+writes the sums of its block to separate entries of a buffer (n, blocks, 7). There are no atomics,
+so repeated runs are equal to the bit. The backward pass computes the blurs again and, from them,
+the derivatives of SSIM with respect to the blurred p, p^2 and p t. These are blurred once more,
+since the blur with a symmetric window equals its transpose. Neighbours are read from the cache,
+once for each tap of the window.
 """
 
 import torch
@@ -18,69 +19,95 @@ from gsmap.ops.raster_loss.reference import SEEN, SSIM_C1, SSIM_C2
 
 BLOCK = 256
 OPTIONS = {"num_warps": 4, "enable_fp_fusion": True}
-# A fused a - b * c is the rounding of b * c where it should be 0, as with empty masks.
+# With fusion, a - b * c is the rounding error of b * c where it must be 0, as for empty masks.
 EXACT_OPTIONS = {**OPTIONS, "enable_fp_fusion": False}
-C1, C2 = tl.constexpr(SSIM_C1), tl.constexpr(SSIM_C2)
+C1 = tl.constexpr(SSIM_C1)
+C2 = tl.constexpr(SSIM_C2)
 SEEN_MEAN = tl.constexpr(SEEN)
 
 
 @triton.jit
 def _block(height, width, BLOCK: tl.constexpr):
-    """Return a program's instance, the instance's number of pixels, and the block's pixels."""
+    """Instance of a program, number of pixels of an instance, and pixels of the block."""
+    n = tl.program_id(1).to(tl.int64)
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    return tl.program_id(1).to(tl.int64), height * width, index
+    return n, height * width, index
 
 
 @triton.jit
 def rows_kernel(
     preds, targets, window, maps, height, width, TAPS: tl.constexpr, BLOCK: tl.constexpr
 ):
-    """Blur p, t, p^2 + t^2 and p t (n, H, W) along rows: to maps (n, 4, H, W)."""
-    n, pixels, index = _block(height, width, BLOCK)
+    """Blur p, t, p^2 + t^2 and p t along rows.
+
+    Args:
+        preds: Predicted masks p in [0, 1], float32. (n, H, W)
+        targets: Ground-truth masks t in [0, 1], float32. (n, H, W)
+        window: Weights of SSIM's window, float32. (TAPS,)
+        maps: Output for the blurred p, t, p^2 + t^2 and p t, float32. (n, 4, H, W)
+        height: Rows H of the masks.
+        width: Columns W of the masks.
+        TAPS: Size of the window.
+        BLOCK: Number of pixels of a program.
+    """
+    n, pixels, index = _block(height, width, BLOCK=BLOCK)
     col = index % width
-    mean_p = tl.zeros((BLOCK,), tl.float32)
-    mean_t = tl.zeros((BLOCK,), tl.float32)
-    squares = tl.zeros((BLOCK,), tl.float32)
-    product = tl.zeros((BLOCK,), tl.float32)
+    mean_p = tl.zeros((BLOCK,), dtype=tl.float32)
+    mean_t = tl.zeros((BLOCK,), dtype=tl.float32)
+    squares = tl.zeros((BLOCK,), dtype=tl.float32)
+    product = tl.zeros((BLOCK,), dtype=tl.float32)
     for tap in tl.static_range(TAPS):
         shift = tap - TAPS // 2
         inside = (index < pixels) & (col + shift >= 0) & (col + shift < width)
-        p = tl.load(preds + n * pixels + index + shift, inside, 0.0)
-        t = tl.load(targets + n * pixels + index + shift, inside, 0.0)
+        p = tl.load(preds + n * pixels + index + shift, mask=inside, other=0.0)
+        t = tl.load(targets + n * pixels + index + shift, mask=inside, other=0.0)
         weight = tl.load(window + tap)
         mean_p += weight * p
         mean_t += weight * t
         squares += weight * (p * p + t * t)
         product += weight * (p * t)
     out = maps + n * 4 * pixels + index
-    tl.store(out, mean_p, index < pixels)
-    tl.store(out + pixels, mean_t, index < pixels)
-    tl.store(out + 2 * pixels, squares, index < pixels)
-    tl.store(out + 3 * pixels, product, index < pixels)
+    tl.store(out, mean_p, mask=index < pixels)
+    tl.store(out + pixels, mean_t, mask=index < pixels)
+    tl.store(out + 2 * pixels, squares, mask=index < pixels)
+    tl.store(out + 3 * pixels, product, mask=index < pixels)
 
 
 @triton.jit
 def _blur_columns(maps, window, index, pixels, width, TAPS: tl.constexpr, BLOCK: tl.constexpr):
     """Blur one map of an instance along columns. (BLOCK,)"""
-    total = tl.zeros((BLOCK,), tl.float32)
+    total = tl.zeros((BLOCK,), dtype=tl.float32)
     for tap in tl.static_range(TAPS):
-        place = index + (tap - TAPS // 2) * width
-        inside = (index < pixels) & (place >= 0) & (place < pixels)
-        total += tl.load(window + tap) * tl.load(maps + place, inside, 0.0)
+        source = index + (tap - TAPS // 2) * width
+        inside = (index < pixels) & (source >= 0) & (source < pixels)
+        total += tl.load(window + tap) * tl.load(maps + source, mask=inside, other=0.0)
     return total
 
 
 @triton.jit
 def _ssim_terms(maps, window, n, index, pixels, width, TAPS: tl.constexpr, BLOCK: tl.constexpr):
-    """Return the blurred p and t, and SSIM's two numerators and two denominators. (BLOCK,)"""
-    own = maps + n * 4 * pixels
-    p = _blur_columns(own, window, index, pixels, width, TAPS, BLOCK)
-    t = _blur_columns(own + pixels, window, index, pixels, width, TAPS, BLOCK)
-    squares = _blur_columns(own + 2 * pixels, window, index, pixels, width, TAPS, BLOCK)
-    product = _blur_columns(own + 3 * pixels, window, index, pixels, width, TAPS, BLOCK)
+    """Blurred p and t, both numerators and both denominators of SSIM. (BLOCK,) each"""
+    map_p = maps + n * 4 * pixels
+    map_t = map_p + pixels
+    map_squares = map_p + 2 * pixels
+    map_product = map_p + 3 * pixels
+    p = _blur_columns(
+        map_p, window, index=index, pixels=pixels, width=width, TAPS=TAPS, BLOCK=BLOCK
+    )
+    t = _blur_columns(
+        map_t, window, index=index, pixels=pixels, width=width, TAPS=TAPS, BLOCK=BLOCK
+    )
+    squares = _blur_columns(
+        map_squares, window, index=index, pixels=pixels, width=width, TAPS=TAPS, BLOCK=BLOCK
+    )
+    product = _blur_columns(
+        map_product, window, index=index, pixels=pixels, width=width, TAPS=TAPS, BLOCK=BLOCK
+    )
     means = p * p + t * t
-    top_cov, low_var = 2 * (product - p * t) + C2, squares - means + C2
-    return p, t, 2 * p * t + C1, top_cov, means + C1, low_var
+    top_mean = 2 * p * t + C1
+    top_cov = 2 * (product - p * t) + C2
+    low_var = squares - means + C2
+    return p, t, top_mean, top_cov, means + C1, low_var
 
 
 @triton.jit
@@ -96,16 +123,29 @@ def sums_kernel(
     TAPS: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Sum a block's share of what `raster_loss_sums_reference` sums: to sums (n, blocks, 7)."""
-    n, pixels, index = _block(height, width, BLOCK)
+    """Compute the sums of `raster_loss_sums_reference` over one block of pixels.
+
+    Args:
+        preds: Predicted masks p in [0, 1], float32. (n, H, W)
+        targets: Ground-truth masks t in [0, 1], float32. (n, H, W)
+        window: Weights of SSIM's window, float32. (TAPS,)
+        maps: Products that `rows_kernel` blurred along rows, float32. (n, 4, H, W)
+        sums: Output for the sums, float32. (n, blocks, 7)
+        weight: Weight of a foreground pixel, relative to a background pixel.
+        height: Rows H of the masks.
+        width: Columns W of the masks.
+        TAPS: Size of the window.
+        BLOCK: Number of pixels of a program.
+    """
+    n, pixels, index = _block(height, width, BLOCK=BLOCK)
     ok = index < pixels
     mean_p, mean_t, top_mean, top_cov, low_mean, low_var = _ssim_terms(
-        maps, window, n, index, pixels, width, TAPS, BLOCK
+        maps, window, n=n, index=index, pixels=pixels, width=width, TAPS=TAPS, BLOCK=BLOCK
     )
     low = low_mean * low_var
     dissimilarity = (low - top_mean * top_cov) / low  # exactly 0 where both masks are empty
-    p = tl.load(preds + n * pixels + index, ok, 0.0)
-    t = tl.load(targets + n * pixels + index, ok, 0.0)
+    p = tl.load(preds + n * pixels + index, mask=ok, other=0.0)
+    t = tl.load(targets + n * pixels + index, mask=ok, other=0.0)
     excess = (weight - 1) * t
     out = sums + (n * tl.num_programs(0) + tl.program_id(0)) * 7
     tl.store(out, tl.sum((1 + excess) * tl.abs(p - t)))
@@ -120,34 +160,54 @@ def sums_kernel(
 
 @triton.jit
 def slopes_kernel(window, maps, slopes, height, width, TAPS: tl.constexpr, BLOCK: tl.constexpr):
-    """Take SSIM's derivatives by the blurred p, p^2 and p t: to slopes (n, 3, H, W)."""
-    n, pixels, index = _block(height, width, BLOCK)
+    """Compute the derivatives of SSIM with respect to the blurred p, p^2 and p t.
+
+    Args:
+        window: Weights of SSIM's window, float32. (TAPS,)
+        maps: Products that `rows_kernel` blurred along rows, float32. (n, 4, H, W)
+        slopes: Output for the derivatives, float32. (n, 3, H, W)
+        height: Rows H of the masks.
+        width: Columns W of the masks.
+        TAPS: Size of the window.
+        BLOCK: Number of pixels of a program.
+    """
+    n, pixels, index = _block(height, width, BLOCK=BLOCK)
     p, t, top_mean, top_cov, low_mean, low_var = _ssim_terms(
-        maps, window, n, index, pixels, width, TAPS, BLOCK
+        maps, window, n=n, index=index, pixels=pixels, width=width, TAPS=TAPS, BLOCK=BLOCK
     )
     scale = 1 / (low_mean * low_var)
     ssim = top_mean * top_cov * scale
     change = t * (top_cov - top_mean) + p * ssim * (low_mean - low_var)
     out = slopes + n * 3 * pixels + index
-    tl.store(out, 2 * change * scale, index < pixels)
-    tl.store(out + pixels, -ssim * scale * low_mean, index < pixels)
-    tl.store(out + 2 * pixels, 2 * top_mean * scale, index < pixels)
+    tl.store(out, 2 * change * scale, mask=index < pixels)
+    tl.store(out + pixels, -ssim * scale * low_mean, mask=index < pixels)
+    tl.store(out + 2 * pixels, 2 * top_mean * scale, mask=index < pixels)
 
 
 @triton.jit
 def slope_rows_kernel(
     window, slopes, blurred, height, width, TAPS: tl.constexpr, BLOCK: tl.constexpr
 ):
-    """Blur maps (n * 3, H, W) along rows; the grid's second axis is that of the maps."""
-    n, pixels, index = _block(height, width, BLOCK)
+    """Blur derivatives along rows; the second axis of the grid counts maps.
+
+    Args:
+        window: Weights of SSIM's window, float32. (TAPS,)
+        slopes: Derivatives, float32. (n * 3, H, W)
+        blurred: Output for the blurred derivatives, float32. (n * 3, H, W)
+        height: Rows H of the masks.
+        width: Columns W of the masks.
+        TAPS: Size of the window.
+        BLOCK: Number of pixels of a program.
+    """
+    n, pixels, index = _block(height, width, BLOCK=BLOCK)
     col = index % width
-    total = tl.zeros((BLOCK,), tl.float32)
+    total = tl.zeros((BLOCK,), dtype=tl.float32)
     for tap in tl.static_range(TAPS):
         shift = tap - TAPS // 2
         inside = (index < pixels) & (col + shift >= 0) & (col + shift < width)
-        slope = tl.load(slopes + n * pixels + index + shift, inside, 0.0)
+        slope = tl.load(slopes + n * pixels + index + shift, mask=inside, other=0.0)
         total += tl.load(window + tap) * slope
-    tl.store(blurred + n * pixels + index, total, index < pixels)
+    tl.store(blurred + n * pixels + index, total, mask=index < pixels)
 
 
 @triton.jit
@@ -164,61 +224,138 @@ def gradient_kernel(
     TAPS: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Blur slopes along columns, and write the gradient of the sums times grads (n, 7)."""
-    n, pixels, index = _block(height, width, BLOCK)
-    own = blurred + n * 3 * pixels
-    by_mean = _blur_columns(own, window, index, pixels, width, TAPS, BLOCK)
-    by_square = _blur_columns(own + pixels, window, index, pixels, width, TAPS, BLOCK)
-    by_product = _blur_columns(own + 2 * pixels, window, index, pixels, width, TAPS, BLOCK)
-    p = tl.load(preds + n * pixels + index, index < pixels, 0.0)
-    t = tl.load(targets + n * pixels + index, index < pixels, 0.0)
+    """Blur derivatives along columns and compute the gradient of the predicted masks.
+
+    Args:
+        grads: Gradient of the sums, float32. (n, 7)
+        preds: Predicted masks p in [0, 1], float32. (n, H, W)
+        targets: Ground-truth masks t in [0, 1], float32. (n, H, W)
+        window: Weights of SSIM's window, float32. (TAPS,)
+        blurred: Derivatives that `slope_rows_kernel` blurred along rows, float32. (n, 3, H, W)
+        out: Output for the gradient, float32. (n, H, W)
+        weight: Weight of a foreground pixel, relative to a background pixel.
+        height: Rows H of the masks.
+        width: Columns W of the masks.
+        TAPS: Size of the window.
+        BLOCK: Number of pixels of a program.
+    """
+    n, pixels, index = _block(height, width, BLOCK=BLOCK)
+    slopes = blurred + n * 3 * pixels
+    by_mean = _blur_columns(
+        slopes, window, index=index, pixels=pixels, width=width, TAPS=TAPS, BLOCK=BLOCK
+    )
+    by_square = _blur_columns(
+        slopes + pixels, window, index=index, pixels=pixels, width=width, TAPS=TAPS, BLOCK=BLOCK
+    )
+    by_product = _blur_columns(
+        slopes + 2 * pixels, window, index=index, pixels=pixels, width=width, TAPS=TAPS, BLOCK=BLOCK
+    )
+    p = tl.load(preds + n * pixels + index, mask=index < pixels, other=0.0)
+    t = tl.load(targets + n * pixels + index, mask=index < pixels, other=0.0)
     sign = (p > t).to(tl.float32) - (p < t).to(tl.float32)
     slope = tl.load(grads + n * 7) * sign + tl.load(grads + n * 7 + 1)
     ssim = by_mean + 2 * p * by_square + t * by_product
     total = (1 + (weight - 1) * t) * slope - tl.load(grads + n * 7 + 2) * ssim
-    tl.store(out + n * pixels + index, total, index < pixels)
+    tl.store(out + n * pixels + index, total, mask=index < pixels)
 
 
 def _blur_products(preds, targets, window):
-    """Return the products' blurs along rows (n, 4, H, W), and the grid of the blocks."""
+    """Blur p, t, p^2 + t^2 and p t along rows. (n, H, W), (n, H, W), (size,) -> (n, 4, H, W)"""
     instances, height, width = preds.shape
     maps = torch.empty(instances, 4, height, width, dtype=torch.float32, device=preds.device)
-    grid = triton.cdiv(height * width, BLOCK), instances
-    rows_kernel[grid](
-        preds, targets, window, maps, height, width, TAPS=len(window), BLOCK=BLOCK, **OPTIONS
+    rows_kernel[_num_blocks(preds), instances](
+        preds,
+        targets,
+        window=window,
+        maps=maps,
+        height=height,
+        width=width,
+        TAPS=len(window),
+        BLOCK=BLOCK,
+        **OPTIONS,
     )
-    return maps, grid
+    return maps
+
+
+def _num_blocks(masks):
+    """Number of blocks of a mask."""
+    return triton.cdiv(masks.shape[1] * masks.shape[2], BLOCK)
 
 
 def raster_loss_sums(preds, targets, window, weight):
-    """Return the sums of `raster_loss_sums_reference`; the first three are differentiable."""
+    """Compute the sums of `raster_loss_sums_reference`.
+
+    Args:
+        preds: Predicted masks in [0, 1], float32. (n, H, W)
+        targets: Ground-truth masks in [0, 1], float32. (n, H, W)
+        window: Weights of SSIM's window, float32. (size,)
+        weight: Weight of a foreground pixel, relative to a background pixel.
+
+    Returns:
+        Sums, float32. The first three are differentiable in ``preds``. (n, 7)
+    """
     if not preds.numel():
         return preds.new_zeros(len(preds), 7)
-    preds, targets = preds.contiguous(), targets.contiguous()
-    height, width = preds.shape[1:]
+    preds = preds.contiguous()
+    targets = targets.contiguous()
+    instances, height, width = preds.shape
+    blocks = _num_blocks(preds)
+    sums = torch.empty(instances, blocks, 7, dtype=torch.float32, device=preds.device)
     with torch.cuda.device_of(preds):
-        maps, grid = _blur_products(preds, targets, window)
-        sums = torch.empty(len(preds), grid[0], 7, dtype=torch.float32, device=preds.device)
-        tensors = preds, targets, window, maps, sums
-        sizes = {"TAPS": len(window), "BLOCK": BLOCK, **EXACT_OPTIONS}
-        sums_kernel[grid](*tensors, weight, height, width, **sizes)
+        sums_kernel[blocks, instances](
+            preds,
+            targets,
+            window=window,
+            maps=_blur_products(preds, targets, window=window),
+            sums=sums,
+            weight=weight,
+            height=height,
+            width=width,
+            TAPS=len(window),
+            BLOCK=BLOCK,
+            **EXACT_OPTIONS,
+        )
     return sums.sum(1)
 
 
 def raster_loss_sums_backward(grads, preds, targets, window, weight):
-    """Return the gradient in the predictions. (n, H, W)"""
-    preds, targets = preds.contiguous(), targets.contiguous()
+    """Compute the gradient of `raster_loss_sums`.
+
+    Args:
+        grads: Gradient of the sums, float32. (n, 7)
+        preds: Predicted masks in [0, 1], float32. (n, H, W)
+        targets: Ground-truth masks in [0, 1], float32. (n, H, W)
+        window: Weights of SSIM's window, float32. (size,)
+        weight: Weight of a foreground pixel, relative to a background pixel.
+
+    Returns:
+        Gradient of the predicted masks, float32. (n, H, W)
+    """
+    preds = preds.contiguous()
+    targets = targets.contiguous()
     gradient = torch.empty_like(preds)
     if not preds.numel():
         return (gradient,)
     instances, height, width = preds.shape
-    sizes = {"TAPS": len(window), "BLOCK": BLOCK, **OPTIONS}
+    blocks = _num_blocks(preds)
+    sizes = {"height": height, "width": width, "TAPS": len(window), "BLOCK": BLOCK}
     slopes = torch.empty(instances, 3, height, width, dtype=torch.float32, device=preds.device)
     with torch.cuda.device_of(preds):
-        maps, grid = _blur_products(preds, targets, window)
-        slopes_kernel[grid](window, maps, slopes, height, width, **sizes)
-        blurred = maps.view(-1)[: slopes.numel()]  # the maps are not needed any more
-        slope_rows_kernel[grid[0], 3 * instances](window, slopes, blurred, height, width, **sizes)
-        tensors = grads.contiguous(), preds, targets, window, blurred, gradient
-        gradient_kernel[grid](*tensors, weight, height, width, **sizes)
+        maps = _blur_products(preds, targets, window=window)
+        slopes_kernel[blocks, instances](window, maps, slopes=slopes, **sizes, **OPTIONS)
+        blurred = maps.view(-1)[: slopes.numel()]  # the memory of the maps is free by now
+        slope_rows_kernel[blocks, 3 * instances](
+            window, slopes, blurred=blurred, **sizes, **OPTIONS
+        )
+        gradient_kernel[blocks, instances](
+            grads.contiguous(),
+            preds,
+            targets=targets,
+            window=window,
+            blurred=blurred,
+            out=gradient,
+            weight=weight,
+            **sizes,
+            **OPTIONS,
+        )
     return (gradient,)

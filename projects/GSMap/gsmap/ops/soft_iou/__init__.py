@@ -6,28 +6,32 @@ from torch import Tensor
 from gsmap.ops.backends import choose_backend, fused_operator
 from gsmap.ops.soft_iou.reference import pairwise_minima_reference
 
-_EPS = 1e-6  # added to the union: two empty masks have IoU 0
+_EPS = 1e-6  # added to the union, so that two empty masks have IoU 0
 _pairwise_minima = fused_operator(
     "soft_iou.pairwise_minima",
     "Tensor preds, Tensor targets",
-    lambda *masks: tuple(map(len, masks)),
+    lambda preds, targets: (len(preds), len(targets)),
 )
 
 
 def pairwise_soft_iou(preds: Tensor, targets: Tensor, backend: str = "auto") -> Tensor:
-    r"""Return the soft IoU in [0, 1] of every prediction with every ground truth. (N, K)
+    r"""Compute the soft IoU of each prediction with each ground truth.
 
-    :math:`\sum_p \min(a, b) / \sum_p \max(a, b)`. Only the minimum is summed per pair, without an
-    (N, K, H, W) tensor; the IoU of two empty masks is 0.
+    The IoU is :math:`\sum_p \min(a, b) / \sum_p \max(a, b)`, and 0 for two empty masks. Only sums
+    of minima are computed per pair, without an (N, K, H, W) tensor.
 
     Args:
-        preds: Masks in [0, 1]. (N, H, W)
-        targets: Masks in [0, 1]. (K, H, W)
-        backend: As in `choose_backend`. The fused kernels give no gradient; ``"auto"`` takes them
-            where none is asked for.
+        preds: Predicted masks in [0, 1]. (N, H, W)
+        targets: Ground-truth masks in [0, 1]. (K, H, W)
+        backend: Backend, see `choose_backend`. The fused kernels have no gradient; ``"auto"`` takes
+            them where no gradient is needed.
+
+    Returns:
+        Soft IoU in [0, 1]. (N, K)
 
     Raises:
-        ValueError: If the shapes disagree or ``backend`` does not serve.
+        ValueError: If the shapes disagree, or if ``backend`` is unknown or does not support the
+            inputs.
     """
     if preds.ndim != 3 or targets.ndim != 3 or preds.shape[1:] != targets.shape[1:]:
         raise ValueError(
@@ -35,40 +39,64 @@ def pairwise_soft_iou(preds: Tensor, targets: Tensor, backend: str = "auto") -> 
             f"got {tuple(preds.shape)} and {tuple(targets.shape)}."
         )
     dtype = torch.promote_types(preds.dtype, torch.float32)
-    preds, targets = preds.to(dtype).flatten(1), targets.to(dtype).flatten(1)  # (N, HW), (K, HW)
+    preds = preds.to(dtype).flatten(1)  # (N, HW)
+    targets = targets.to(dtype).flatten(1)  # (K, HW)
     wants_gradient = torch.is_grad_enabled() and (preds.requires_grad or targets.requires_grad)
-    backend = choose_backend(
-        "reference" if backend == "auto" and wants_gradient else backend,
-        preds,
-        kernel="pairwise_soft_iou",
-    )
+    if backend == "auto" and wants_gradient:
+        backend = "reference"
+    backend = choose_backend(backend, preds, kernel="pairwise_soft_iou")
     if backend == "reference":
         minima = pairwise_minima_reference(preds, targets)
     else:
-        preds, targets = preds.detach(), targets.detach()
-        minima = _pairwise_minima(preds, targets, backend)
-    return _iou(minima, preds.sum(-1)[:, None], targets.sum(-1))
+        minima = _pairwise_minima(preds.detach(), targets.detach(), backend)
+    return _iou(minima, preds.sum(-1)[:, None], targets=targets.sum(-1))
 
 
 def soft_iou(preds: Tensor, targets: Tensor) -> Tensor:
-    """Return the soft IoU in [0, 1] of pairs of masks in [0, 1]. 2 x (M, H, W) -> (M,)"""
+    """Compute the soft IoU of each predicted mask with its ground truth.
+
+    Args:
+        preds: Predicted masks in [0, 1]. (M, H, W)
+        targets: Ground-truth masks in [0, 1]. (M, H, W)
+
+    Returns:
+        Soft IoU in [0, 1]. (M,)
+    """
     minima = torch.minimum(preds, targets).sum((1, 2))
-    return _iou(minima, preds.sum((1, 2)), targets.sum((1, 2)))
+    return _iou(minima, preds.sum((1, 2)), targets=targets.sum((1, 2)))
 
 
 def _iou(minima: Tensor, preds: Tensor, targets: Tensor) -> Tensor:
-    """Return sums of minima over those of maxima, since min + max = a + b; 0 of empty masks."""
-    return minima / (preds + targets - minima + _EPS)
+    """Soft IoU from the sums of minima and of both masks; 0 for empty masks."""
+    maxima = preds + targets - minima  # since min(a, b) + max(a, b) = a + b
+    return minima / (maxima + _EPS)
 
 
 def dice_loss(preds: Tensor, targets: Tensor) -> Tensor:
-    """Return 1 - (2 sum(p t) + 1) / (sum p + sum t + 1) of pairs of masks. 2 x (n, H, W) -> (n,)"""
+    """Compute the dice loss 1 - (2 sum(p t) + 1) / (sum p + sum t + 1) of each mask.
+
+    Args:
+        preds: Predicted masks p in [0, 1]. (n, H, W)
+        targets: Ground-truth masks t in [0, 1]. (n, H, W)
+
+    Returns:
+        Losses in [0, 1]. (n,)
+    """
     overlap = (preds * targets).sum((1, 2))
     return 1 - (2 * overlap + 1) / (preds.sum((1, 2)) + targets.sum((1, 2)) + 1)
 
 
 def pairwise_dice_loss(preds: Tensor, targets: Tensor) -> Tensor:
-    """Dice loss of every prediction with every target. (N, H, W), (K, H, W) -> (N, K)"""
-    preds, targets = preds.flatten(1), targets.flatten(1)
+    """Compute the dice loss of each prediction with each ground truth, see `dice_loss`.
+
+    Args:
+        preds: Predicted masks in [0, 1]. (N, H, W)
+        targets: Ground-truth masks in [0, 1]. (K, H, W)
+
+    Returns:
+        Losses in [0, 1]. (N, K)
+    """
+    preds = preds.flatten(1)
+    targets = targets.flatten(1)
     overlap = preds @ targets.T
     return 1 - (2 * overlap + 1) / (preds.sum(-1)[:, None] + targets.sum(-1) + 1)

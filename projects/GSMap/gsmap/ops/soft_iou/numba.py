@@ -1,9 +1,10 @@
 # numba infers the types of its kernels:
 # mypy: disable-error-code="no-untyped-def"
-"""Fused CPU kernel (numba): the sum of minima of every pair of masks.
+"""Fused CPU kernel (numba): sum of minima of each pair of masks.
 
-A target is 0 almost everywhere, and so is the minimum: each target's pixels that are not 0 are
-listed once, and every prediction is read at those alone. A sum runs in a fixed order in one thread.
+A ground-truth mask, and so the minimum, is zero almost everywhere. The nonzero pixels of each
+target are listed once, and each prediction is read only at these pixels. A sum runs in a fixed
+order in one thread.
 """
 
 import numpy as np
@@ -15,23 +16,39 @@ from gsmap.ops._numba import run_in_threads
 
 @njit(nogil=True, cache=True)
 def list_pixels(targets):
-    """Return where each target's list of pixels that are not 0 starts, their indices and values."""
+    """List the nonzero pixels of each target (K, pixels).
+
+    Returns:
+        Start of each target's list (K + 1,), indices of the pixels (n,) and their values (n,).
+    """
     starts = np.zeros(len(targets) + 1, np.int64)
     for k in range(len(targets)):
         starts[k + 1] = starts[k] + np.count_nonzero(targets[k])
-    indices, values = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.float32)
+    indices = np.empty(starts[-1], np.int32)
+    values = np.empty(starts[-1], np.float32)
     for k in range(len(targets)):
         position = starts[k]
         for pixel in range(targets.shape[1]):
             if targets[k, pixel] != 0:
-                indices[position], values[position] = pixel, targets[k, pixel]
+                indices[position] = pixel
+                values[position] = targets[k, pixel]
                 position += 1
     return starts, indices, values
 
 
 @njit(nogil=True, cache=True)
 def sum_minima(preds, starts, indices, values, out, first, last):
-    """Write the sums of minima (N, K) of predictions (N, pixels) with every listed target."""
+    """Sum the minima of the predictions ``first`` to ``last - 1`` and each target.
+
+    Args:
+        preds: Flat predicted masks, float32. (N, pixels)
+        starts: Start of each target's list of pixels. (K + 1,)
+        indices: Indices of the listed pixels. (n,)
+        values: Values of the listed pixels. (n,)
+        out: Output for the sums, float32. (N, K)
+        first: First prediction.
+        last: One past the last prediction.
+    """
     for n in range(first, last):
         pred = preds[n]
         for k in range(len(starts) - 1):
@@ -42,8 +59,8 @@ def sum_minima(preds, starts, indices, values, out, first, last):
 
 
 def pairwise_minima(preds, targets):
-    """Sum the minimum of every pair of flat float32 masks. (N, pixels), (K, pixels) -> (N, K)"""
+    """Sum the minima of each pair of flat float32 masks. (N, pixels), (K, pixels) -> (N, K)"""
     minima = torch.empty(len(preds), len(targets), dtype=torch.float32)
-    starts, pixels, values = list_pixels(targets.contiguous().numpy())
-    run_in_threads(sum_minima, len(pixels), preds, starts, pixels, values, minima)
+    starts, indices, values = list_pixels(targets.contiguous().numpy())
+    run_in_threads(sum_minima, len(indices), preds, starts, indices, values, minima)
     return minima

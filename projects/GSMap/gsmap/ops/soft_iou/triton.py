@@ -1,9 +1,9 @@
 # Triton infers the types of its kernels:
 # mypy: disable-error-code="no-untyped-def"
-"""Triton kernel: the sum of minima of every pair of masks.
+"""Triton kernel: sum of minima of each pair of masks.
 
-A program owns one pair and walks over its pixels in blocks, one partial sum per lane, added up at
-the end: no atomics, so two runs give the same bits.
+A program computes one pair. It loops over blocks of pixels with one partial sum per lane, and adds
+these at the end. There are no atomics, so repeated runs are equal to the bit.
 """
 
 import torch
@@ -15,9 +15,18 @@ BLOCK = 1024
 
 @triton.jit
 def minima_kernel(preds, targets, minima, pixels, BLOCK: tl.constexpr):
-    """Sum min(a, b) over the pixels of one pair: (N, pixels), (K, pixels) to (N, K)."""
-    k, n = tl.program_id(0).to(tl.int64), tl.program_id(1).to(tl.int64)
-    sums = tl.zeros((BLOCK,), tl.float32)
+    """Sum the minima of one pair of masks.
+
+    Args:
+        preds: Flat predicted masks, float32. (N, pixels)
+        targets: Flat ground-truth masks, float32. (K, pixels)
+        minima: Output for the sums, float32. (N, K)
+        pixels: Number of pixels of a mask.
+        BLOCK: Number of pixels read at a time.
+    """
+    k = tl.program_id(0).to(tl.int64)
+    n = tl.program_id(1).to(tl.int64)
+    sums = tl.zeros((BLOCK,), dtype=tl.float32)
     for start in range(0, pixels, BLOCK):
         index = start + tl.arange(0, BLOCK)
         pred = tl.load(preds + n * pixels + index, mask=index < pixels, other=0.0)
@@ -27,11 +36,16 @@ def minima_kernel(preds, targets, minima, pixels, BLOCK: tl.constexpr):
 
 
 def pairwise_minima(preds, targets):
-    """Sum the minimum of every pair of flat float32 masks. (N, pixels), (K, pixels) -> (N, K)"""
+    """Sum the minima of each pair of flat float32 masks. (N, pixels), (K, pixels) -> (N, K)"""
     minima = preds.new_empty(len(preds), len(targets))
     if minima.numel():
-        preds, targets = preds.contiguous(), targets.contiguous()
         with torch.cuda.device_of(preds):
-            launch = minima_kernel[len(targets), len(preds)]
-            launch(preds, targets, minima, preds.shape[1], BLOCK=BLOCK, num_warps=4)
+            minima_kernel[len(targets), len(preds)](
+                preds.contiguous(),
+                targets.contiguous(),
+                minima=minima,
+                pixels=preds.shape[1],
+                BLOCK=BLOCK,
+                num_warps=4,
+            )
     return minima
