@@ -97,7 +97,7 @@ def push_table(reduction: str, band_m: float, args: argparse.Namespace) -> str:
 
 def miss(reduction: str, band_m: float, length_m: float, size: tuple[int, int]) -> float:
     """Return the loss of an empty prediction for a line of a length."""
-    target = draw_polylines(straight_line(length_m)[None], GRID.resized(*size), band_m)
+    target = draw_polylines(straight_line(length_m)[None], GRID.with_size(*size), band_m)
     normalize, weight = REDUCTIONS[reduction]
     empty = torch.zeros_like(target)
     return raster_loss(empty, target, foreground_weight=weight, normalize=normalize).item()

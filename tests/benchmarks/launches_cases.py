@@ -18,7 +18,7 @@ from benchmarks.pretended_gpu import DEVICE, NAME, PretendedGPU, available
 from gsmap.apis.fast_frame import StaticFrame
 from gsmap.apis.map_inferencer import MapInferencer
 from gsmap.ops import backends
-from gsmap.structures.tensors import LateValues, constant, uploaded
+from gsmap.structures.tensors import LateValues, constant, upload
 
 pytestmark = pytest.mark.skipif(not available(), reason="torch has no backends in Python")
 REPO = Path(__file__).resolve().parents[2]
@@ -103,7 +103,7 @@ def test_waits_are_counted_with_their_line(gpu):
 
 
 def test_what_does_not_wait(gpu):
-    there, again = uploaded([torch.ones(2), torch.arange(3)], torch.device(DEVICE))
+    there, again = upload([torch.ones(2), torch.arange(3)], torch.device(DEVICE))
     assert again.cpu().tolist() == [0, 1, 2]
     constant(there, [1.0, 2.5])
     gpu.clear()

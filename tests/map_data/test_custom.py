@@ -87,7 +87,7 @@ def test_an_unknown_mounting_is_not_the_identity(frame: str, tmp_path: Path, cap
     ]
     from_records(tmp_path / "a.arrow", records, meta, tmp_path)
     file = AnnotationFile(tmp_path / "a.arrow")
-    heights = [FRAME_VIEWS[frame].tilted(sample.ego_from_frame).ground for sample in file]
+    heights = [FRAME_VIEWS[frame].with_mounting(sample.ego_from_frame).ground for sample in file]
     usual = FRAME_VIEWS[frame].ground
     assert heights == [usual, (0, 0, FRAME_VIEWS[frame].ego_ground_z_m - 1.5), usual]
     unknown = [sample.ego_from_frame is None for sample in file]

@@ -46,7 +46,7 @@ def test_height_above_ground_is_kept():
 
 def test_another_raster_covers_the_same_extent():
     grid = BEVGrid((-30, 30), (-15, 15), 100, 200)
-    assert grid.resized(64, 128).pixel_size_m == pytest.approx((60 / 128, 30 / 64))
+    assert grid.with_size(64, 128).pixel_size_m == pytest.approx((60 / 128, 30 / 64))
 
 
 def test_pixels_of_a_size_in_metres_divide_the_extent():

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from gsmap.structures.elements import MapElements, annotated
+from gsmap.structures.elements import MapElements, ground_truth_elements
 
 LINE, RING = [[0.0, 1.0], [2.0, 3.0]], [[4.0, 4.0], [5.0, 4.0], [5.0, 5.0], [4.0, 4.0]]
 
@@ -35,10 +35,10 @@ def test_moved_elements_turn_with_their_gaussians():
     """A quarter turn to the left, then 10 m along x, 20 along y, 3 up."""
     pose = np.array([[0.0, -1, 0, 10], [1, 0, 0, 20], [0, 0, 1, 3], [0, 0, 0, 1]])
     elements = MapElements.from_polylines([LINE], [0], rotations=[[0.0, 1.0]])
-    moved = elements.moved(pose)
+    moved = elements.to_frame(pose)
     np.testing.assert_allclose(moved.points, [[9.0, 20.0], [7.0, 22.0]])
     np.testing.assert_allclose(moved.rotations, [np.pi / 2, 1 + np.pi / 2])
-    high = MapElements.from_polylines([[[0.0, 1.0, 5.0]]], [0]).moved(pose)
+    high = MapElements.from_polylines([[[0.0, 1.0, 5.0]]], [0]).to_frame(pose)
     np.testing.assert_allclose(high.points, [[9.0, 20.0, 8.0]])
 
 
@@ -93,6 +93,6 @@ def test_bad_elements_are_refused(values, message):
 
 
 def test_a_sample_without_ground_truth_is_refused_by_the_name_of_the_transform():
-    assert annotated({"map_instances": []}, object()) == []
+    assert ground_truth_elements({"map_instances": []}, object()) == []
     with pytest.raises(ValueError, match="'a' has no ground truth: leave Exception out of this"):
-        annotated({"map_instances": None, "token": "a"}, Exception())
+        ground_truth_elements({"map_instances": None, "token": "a"}, Exception())

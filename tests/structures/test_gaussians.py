@@ -9,7 +9,7 @@ from gsmap.structures.gaussians import (
     extents_along_line,
     gaussians_along,
     line_errors,
-    stretched,
+    stretch_along_line,
 )
 from gsmap.structures.grid import BEVGrid
 
@@ -227,11 +227,11 @@ def test_factors_stretch_the_extents_along_and_across_the_line():
     scales = torch.rand(4, 6, 2, generator=generator, dtype=torch.float64) + 0.05
     gaussians = Gaussians(means, scales, 3 * means[..., 0])
     factors = torch.tensor([2.0, 0.3], dtype=torch.float64)
-    found = stretched(gaussians, factors)
+    found = stretch_along_line(gaussians, factors)
     torch.testing.assert_close(extents_along_line(found), extents_along_line(gaussians) * factors)
     area = found.scales.prod(-1) / gaussians.scales.prod(-1)
     torch.testing.assert_close(area, torch.full_like(area, 0.6))
-    same = stretched(gaussians, torch.ones(2, dtype=torch.float64))
+    same = stretch_along_line(gaussians, torch.ones(2, dtype=torch.float64))
     torch.testing.assert_close(same.scales, gaussians.scales.sort(descending=True).values)
     torch.testing.assert_close(covariances(same), covariances(gaussians))
 

@@ -12,8 +12,8 @@ from gsmap.structures.gaussians import (
     Gaussians,
     GaussianSpace,
     covariances,
-    fused_gaussians,
-    moved_gaussians,
+    fuse_gaussians,
+    move_gaussians,
     with_covariances,
 )
 from gsmap.structures.grid import BEVGrid
@@ -42,7 +42,7 @@ def test_a_moved_gaussian_is_that_of_its_moved_samples():
     """A hundred thousand samples of each are moved one by one, by a motion that is uncertain."""
     before, motion = some(), turned_by(0.9, 1.0, -4.0)
     drift = torch.tensor([0.4]), torch.tensor([0.05])
-    after = moved_gaussians(before, motion, *drift)
+    after = move_gaussians(before, motion, *drift)
     rng = np.random.default_rng(0)
     for index in range(6):
         mean, spread = before.means[0, index].numpy(), covariances(before)[0, index].numpy()
@@ -58,7 +58,7 @@ def test_a_moved_gaussian_is_that_of_its_moved_samples():
 
 def test_without_noise_a_gaussian_turns_and_keeps_its_size():
     before = some()
-    after = moved_gaussians(before, turned_by(2.0, 3.0), torch.zeros(1), torch.zeros(1))
+    after = move_gaussians(before, turned_by(2.0, 3.0), torch.zeros(1), torch.zeros(1))
     torch.testing.assert_close(after.rotations, before.rotations + 2.0)
     torch.testing.assert_close(after.scales, before.scales)
 
@@ -66,14 +66,14 @@ def test_without_noise_a_gaussian_turns_and_keeps_its_size():
 def test_a_motion_of_each_stream_moves_its_own():
     both = Gaussians(*(torch.cat([part, part]) for part in some()))
     motions = torch.cat([turned_by(0.0), turned_by(math.pi)])
-    after = moved_gaussians(both, motions, torch.zeros(2), torch.zeros(2))
+    after = move_gaussians(both, motions, torch.zeros(2), torch.zeros(2))
     torch.testing.assert_close(after.means[0], both.means[0])
     torch.testing.assert_close(after.means[1], -both.means[1])
 
 
 def test_fusing_is_a_kalman_update():
     first, second = some(seed=1), some(seed=2)
-    fused = fused_gaussians(first, second)
+    fused = fuse_gaussians(first, second)
     for index in range(6):
         one, two = (covariances(g)[0, index].numpy() for g in (first, second))
         mean, seen = (g.means[0, index].numpy() for g in (first, second))
@@ -88,7 +88,7 @@ def test_a_precise_gaussian_wins_and_axes_stay_where_they_were():
     """Far more precise along x, as far less along y: the place is of one, then of the other."""
     first = Gaussians(torch.zeros(1, 2), torch.tensor([[0.01, 100.0]]), torch.tensor([0.0]))
     second = Gaussians(torch.ones(1, 2), torch.tensor([[1.0, 1.0]]), torch.tensor([0.3]))
-    fused = fused_gaussians(first, second)
+    fused = fuse_gaussians(first, second)
     torch.testing.assert_close(fused.means, torch.tensor([[0.0, 1.0]]), atol=1e-3, rtol=0)
     torch.testing.assert_close(fused.rotations, torch.tensor([0.0]), atol=1e-3, rtol=0)
     torch.testing.assert_close(fused.scales, torch.tensor([[0.01, 1.0]]), atol=1e-3, rtol=0)
@@ -124,11 +124,11 @@ def test_encoding_is_the_inverse_of_decoding(activation: str, literal: bool):
 
 def test_gradients_of_moving_and_fusing():
     def fuse(*parts: torch.Tensor) -> Gaussians:
-        return fused_gaussians(Gaussians(*parts[:3]), Gaussians(*parts[3:]))
+        return fuse_gaussians(Gaussians(*parts[:3]), Gaussians(*parts[3:]))
 
     def move(*parts: torch.Tensor) -> Gaussians:
         drifts = torch.tensor([0.3]), torch.tensor([0.1])
-        return moved_gaussians(Gaussians(*parts), turned_by(0.4, 2.0), *drifts)
+        return move_gaussians(Gaussians(*parts), turned_by(0.4, 2.0), *drifts)
 
     oblong = [part[:, :-1].clone().requires_grad_() for part in some(seed=3)]
     other = [part[:, :-1].clone().requires_grad_() for part in some(seed=4)]
@@ -138,7 +138,7 @@ def test_gradients_of_moving_and_fusing():
 
 def test_a_round_gaussian_has_finite_gradients():
     parts = [part[:, -1:].clone().requires_grad_() for part in some()]
-    fused = fused_gaussians(Gaussians(*parts), Gaussians(*(part.detach() for part in parts)))
+    fused = fuse_gaussians(Gaussians(*parts), Gaussians(*(part.detach() for part in parts)))
     sum(part.sum() for part in fused).backward()
     assert all(part.grad.isfinite().all() for part in parts[:2])
     torch.testing.assert_close(fused.scales, parts[1] / math.sqrt(2))

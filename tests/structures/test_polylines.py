@@ -16,7 +16,7 @@ from gsmap.structures.polylines import (
     clip_to_box,
     equivalent_orders,
     is_closed,
-    padded,
+    pad_lines,
     parts_inside,
     resample,
     resample_all,
@@ -34,9 +34,9 @@ def test_resampling_keeps_both_ends_and_spaces_by_arc_length():
 
 def test_lines_of_any_length_are_stacked():
     lines = [np.array([[1.0, 2], [3, 4]]), np.array([[5.0, 6]])]
-    assert padded(lines).tolist() == [[[1, 2], [3, 4]], [[5, 6], [5, 6]]]
-    assert padded(lines, 3, "constant")[1].tolist() == [[5, 6], [0, 0], [0, 0]]
-    assert (padded([]).shape, padded([], 7).shape) == ((0, 2, 2), (0, 7, 2))
+    assert pad_lines(lines).tolist() == [[[1, 2], [3, 4]], [[5, 6], [5, 6]]]
+    assert pad_lines(lines, 3, "constant")[1].tolist() == [[5, 6], [0, 0], [0, 0]]
+    assert (pad_lines([]).shape, pad_lines([], 7).shape) == ((0, 2, 2), (0, 7, 2))
 
 
 def test_a_line_that_crosses_itself_or_the_border_has_several_parts():

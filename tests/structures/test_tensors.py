@@ -5,12 +5,12 @@ import sys
 import pytest
 import torch
 
-from gsmap.structures.tensors import constant, kept, uncompiled, uploaded
+from gsmap.structures.tensors import cached_constant, constant, exclude_from_compile, upload
 
 
 def test_nothing_is_copied_on_the_host():
     tensors = [torch.rand(3), torch.arange(4)]
-    assert [a is b for a, b in zip(uploaded(tensors, torch.device("cpu")), tensors, strict=True)]
+    assert [a is b for a, b in zip(upload(tensors, torch.device("cpu")), tensors, strict=True)]
 
 
 def test_constants_are_made_once():
@@ -26,7 +26,9 @@ def test_a_constant_made_in_inference_serves_a_training():
     like = torch.zeros(1)
     with torch.inference_mode():
         factor = constant(like, [3.0, 4.25])
-        computed = kept(like, ("test", torch.float32), lambda: like.new_tensor([2.0]).exp())
+        computed = cached_constant(
+            like, ("test", torch.float32), lambda: like.new_tensor([2.0]).exp()
+        )
     weight = torch.ones(2, requires_grad=True)
     (weight * factor * computed).sum().backward()
     torch.testing.assert_close(weight.grad, torch.tensor([3.0, 4.25]) * torch.tensor(2.0).exp())
@@ -34,7 +36,9 @@ def test_a_constant_made_in_inference_serves_a_training():
 
 def test_compilers_and_exporters_see_numbers_and_leave_nothing_behind():
     def scaled(x: torch.Tensor) -> torch.Tensor:
-        return x * constant(x, [1.5, 987.0]) + kept(x, ("sum", x.dtype), lambda: x.new_zeros(2) + 1)
+        return x * constant(x, [1.5, 987.0]) + cached_constant(
+            x, ("sum", x.dtype), lambda: x.new_zeros(2) + 1
+        )
 
     x = torch.tensor([2.0, 1.0])
     expected = torch.tensor([4.0, 988.0])
@@ -62,7 +66,7 @@ def test_a_function_that_is_left_as_it_is_never_meets_the_compiler(monkeypatch):
     """With the compiler and before it is imported, as part of what is compiled and alone."""
     seen = []
 
-    @uncompiled
+    @exclude_from_compile
     def noted(x: torch.Tensor, factor: float) -> torch.Tensor:
         seen.append(torch.compiler.is_compiling())
         return x * factor

@@ -133,7 +133,8 @@ def read_drive(annotations: AnnotationFile, scene: str, maps: Mapping[str, MapEl
             f"no sample of scene {scene!r} has results: give the results of {annotations.path}."
         )
     frames = [
-        DriveFrame(s, maps[s.token].with_coordinates(2).moved(s.global_from_frame)) for s in samples
+        DriveFrame(s, maps[s.token].with_coordinates(2).to_frame(s.global_from_frame))
+        for s in samples
     ]
     return Drive(scene, meta.classes, meta.x_range, meta.y_range, frames)
 

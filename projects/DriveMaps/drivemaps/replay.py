@@ -74,7 +74,7 @@ class Replay:
     def moments(self) -> Iterator[Moment]:
         """Go through the drive and let its map grow: yield what there is to see at each frame."""
         view, drive = self.view, self.drive
-        views = [view.tilted(frame.sample.ego_from_frame) for frame in drive.frames]
+        views = [view.with_mounting(frame.sample.ego_from_frame) for frame in drive.frames]
         places = cKDTree([f.sample.global_from_frame[:2, 3] for f in drive.frames])
         lines = [shapely.linestrings(line) for line in self.elements.polylines]
         explored = shapely.Polygon()
@@ -87,7 +87,7 @@ class Replay:
                         points = shapely.get_coordinates(part)
                         nearest = places.query(points)[1]
                         seen.append((label, _raised(drive, views, points, nearest)))
-            local = [ground.lifted(frame.to_frame(p)) for p in frame.elements.polylines]
+            local = [ground.lift(frame.to_frame(p)) for p in frame.elements.polylines]
             yield Moment(frame, local, seen)
 
 
@@ -98,7 +98,7 @@ def _raised(
     raised = np.empty((len(points), 3))
     for number in np.unique(nearest):
         frame, rows = drive.frames[number], nearest == number
-        local = views[number].lifted(frame.to_frame(points[rows]))
+        local = views[number].lift(frame.to_frame(points[rows]))
         pose = frame.sample.global_from_frame
         raised[rows] = np.column_stack([points[rows], local @ pose[2, :3] + pose[2, 3]])
     return raised

@@ -46,7 +46,7 @@ def _picture(moment: Moment, replay: Replay, width_px: int) -> np.ndarray:
         cameras,
         panels,
         BEVGrid(drive.x_range, drive.y_range),
-        replay.view.tilted(sample.ego_from_frame),
+        replay.view.with_mounting(sample.ego_from_frame),
         MapStyle(classes=drive.classes),
         found,
         drive.scene,

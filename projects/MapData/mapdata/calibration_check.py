@@ -61,7 +61,7 @@ def calibration_figure(
         camera_views(sample.cameras, data_root, sample.token, grey=True),
         [BEVPanel("From above", _elements([*lines, *wedges]))],
         BEVGrid(*RANGES[frame]),
-        frame_view(frame, ground_z_m).tilted(sample.ego_from_frame),
+        frame_view(frame, ground_z_m).with_mounting(sample.ego_from_frame),
         style,
         _elements(lines),
         f"ground plane of {sample.token}",

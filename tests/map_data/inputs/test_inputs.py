@@ -60,7 +60,7 @@ def test_another_frame_sees_the_same_cameras_and_ground(town):
     spot = np.array([7.0, 2.0, 0.0, 1.0])  # on the ground, ahead and to the left
     for frame, seen in (("lidar", sample), ("ego", ego), ("lidar", back)):
         at = invert_rigid(ground_from_frame(seen, frame)) @ spot
-        a, b, c = FRAME_VIEWS[frame].tilted(seen.ego_from_frame).ground
+        a, b, c = FRAME_VIEWS[frame].with_mounting(seen.ego_from_frame).ground
         assert at[2] == pytest.approx(a * at[0] + b * at[1] + c)
         world = seen.global_from_frame @ at
         np.testing.assert_allclose(

@@ -101,7 +101,7 @@ def check_encoder(golden: Golden, name: str) -> Iterator[Row]:
     layers = {"num_heads": 4, "ffn_dims": 96}
     sizes = {"position_dims": 256, "position_size": (171, 256)}
     built = BezierBEVEncoder(GRID, 24, 7.5, 64, (2, 3), layers, **sizes)
-    built.grid = GRID.resized(6, 8)
+    built.grid = GRID.with_size(6, 8)
     built.bev_embedding = nn.Embedding(48, 64)
     encoder = parts.load(built, "bev_encoder.")
     matrices = ground_matrices(golden, IMAGE).expand(2, -1, -1, -1)

@@ -26,7 +26,7 @@ from gsmap.models.hdmapnet.losses import LineMapLosses
 from gsmap.models.hdmapnet.targets import MakeLineMaps
 from gsmap.structures.calibration import calibration_arrays
 from gsmap.structures.grid import BEVGrid
-from gsmap.structures.polylines import sampled as sampled_line
+from gsmap.structures.polylines import points_at_steps as sampled_line
 
 CONFIG = "hdmapnet/hdmapnet_effb0_30e.py"
 STATE = "hdmapnet_state.json"

@@ -67,7 +67,7 @@ def test_the_cost_chooses_the_order_by_its_own_distance():
 
 def test_the_mirrored_row_is_a_switch():
     cross = {"type": "SpatialCrossAttention", "num_levels": 1}
-    grid = ALONG_X.resized(4, 2)
+    grid = ALONG_X.with_size(4, 2)
     right, released = (
         StreamMapNetEncoderLayer(cross, mirrored=mirrored).centres(grid, torch.device("cpu"))
         for mirrored in (False, True)

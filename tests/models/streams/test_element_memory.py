@@ -14,7 +14,7 @@ from gsmap.apis.export import ExportedDetector
 from gsmap.models.streams.element_memory import ElementMemory
 from gsmap.models.streams.memory import StreamMemory
 from gsmap.structures.gaussians import Gaussians, covariances, gaussians_along
-from gsmap.structures.line_update import nearest_places, seen_again
+from gsmap.structures.line_update import nearest_places, update_from_known_lines
 from gsmap.structures.past import Past
 from gsmap.structures.rigid import rigid
 
@@ -64,7 +64,7 @@ def test_nearest_places_are_shapelys():
 
 def test_a_point_is_updated_across_the_line_as_by_a_kalman_filter_and_not_along_it():
     new, known = line(1.0, low=-7.0, high=9.0, across=0.4), line(0.0, across=0.3)
-    found = seen_again(new, ZERO, known, ZERO, gate_m=3.0)
+    found = update_from_known_lines(new, ZERO, known, ZERO, gate_m=3.0)
     gain = 0.4**2 / (0.4**2 + 0.3**2)
     beside = new.means[0, :, 1] <= 8.0
     x, y = found.means[0].unbind(-1)
@@ -83,14 +83,14 @@ def test_a_point_is_updated_across_the_line_as_by_a_kalman_filter_and_not_along_
 )
 def test_another_class_a_far_line_and_one_that_lies_ahead_change_nothing(known, labels, gate_m):
     new = line(1.0)
-    found = seen_again(new, ZERO, known, labels, gate_m)
+    found = update_from_known_lines(new, ZERO, known, labels, gate_m)
     for ours, own in zip(found, new, strict=True):
         assert torch.equal(ours, own)
 
 
 def test_of_two_lines_the_nearer_one_is_seen_again():
     known = Gaussians(*(torch.cat(both) for both in zip(line(3.0), line(0.4), strict=True)))
-    found = seen_again(line(1.0), ZERO, known, torch.zeros(2, dtype=torch.long), 3.0)
+    found = update_from_known_lines(line(1.0), ZERO, known, torch.zeros(2, dtype=torch.long), 3.0)
     torch.testing.assert_close(found.means[0, :, 0], torch.full((9,), 0.7).double())
 
 
@@ -102,7 +102,7 @@ def test_among_many_lines_an_element_is_updated_as_by_the_nearest_one_alone():
     places = starts + steps * torch.arange(9.0)[:, None]
     now, known = (gaussians_along(points, 0.3) for points in places)
     labels = torch.arange(24) % 2
-    found = seen_again(now, labels, known, labels, gate_m)
+    found = update_from_known_lines(now, labels, known, labels, gate_m)
     for index, points in enumerate(places[0]):
         same = (labels == labels[index]).nonzero()[:, 0]
         near = nearest_places(points.expand(len(same), -1, -1), known.means[same])
@@ -110,7 +110,7 @@ def test_among_many_lines_an_element_is_updated_as_by_the_nearest_one_alone():
         mean[near.beside.sum(-1) < 2] = torch.inf
         one = same[mean.argmin()][None]
         own = Gaussians(*(part[index, None] for part in now))
-        alone = seen_again(
+        alone = update_from_known_lines(
             own, labels[one], Gaussians(*(part[one] for part in known)), labels[one], gate_m
         )
         torch.testing.assert_close(found.means[index], alone.means[0])

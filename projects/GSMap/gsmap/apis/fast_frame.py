@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from gsmap.structures.calibration import calibration_arrays
 from gsmap.structures.grid import padded_size
-from gsmap.structures.tensors import tensor_versions, uploaded
+from gsmap.structures.tensors import tensor_versions, upload
 from gsmap.utils.errors import InputError, WorkError
 
 if TYPE_CHECKING:
@@ -167,7 +167,7 @@ class FastFrames:
         images = batch["inputs"]["img"]
         if any(sample.metainfo.get("image_steps") for sample in samples):
             preprocessor = self.frame.model.data_preprocessor
-            pixels = torch.stack(uploaded(images, self.device))
+            pixels = torch.stack(upload(images, self.device))
             images = preprocessor.run_noted_steps(pixels, samples)
         else:
             images = torch.stack(list(images))

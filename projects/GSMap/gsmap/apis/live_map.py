@@ -89,7 +89,7 @@ class LiveMap:
     ) -> MapElements:
         """Return the map elements of one frame, in the frame of the calibration, as `predict`."""
         found = self._inferencer.elements(self.predict(images, can_bus, at, stream))
-        return found.moved(self._frame_from_models)
+        return found.to_frame(self._frame_from_models)
 
     def predict(
         self,

@@ -10,7 +10,7 @@ from mmengine.structures import BaseDataElement
 from torch import Tensor
 
 from gsmap.structures.grid import padded_size
-from gsmap.structures.tensors import uploaded
+from gsmap.structures.tensors import upload
 
 
 @MODELS.register_module()
@@ -29,7 +29,7 @@ class MapDataPreprocessor(Det3DDataPreprocessor):
         if self.device.type == "cpu" or not some_on_host:
             return super().cast_data(data)
         replacements = {}
-        for tensor, copy in zip(tensors, uploaded(tensors, self.device), strict=True):
+        for tensor, copy in zip(tensors, upload(tensors, self.device), strict=True):
             replacements[id(tensor)] = copy
         return _replace_tensors(data, replacements)
 

@@ -1,4 +1,4 @@
-"""Extents, rasters and polylines; nothing here knows of a model or of OpenMMLab."""
+"""Extents, rasters, polylines and Gaussians, independent of models and of OpenMMLab."""
 
 from gsmap.utils.lazy import lazy_names
 

@@ -15,8 +15,8 @@ from gsmap.structures.polylines import Points, resample
 from gsmap.utils.errors import InputError
 
 MAX_DEGREE = 5
-SAMPLES = 100  # points of a piece that a fit looks at, both ends included
-_WORK = 2000  # points that the search for joints may look at, for each vertex of a line
+SAMPLES = 100  # points of a line and of a piece that a fit compares, both ends included
+_WORK = 2000  # limit of the search for joints: compared points for each vertex of a line
 
 Float = NDArray[np.float64]
 Deviation = Callable[[Float, Float], float]
@@ -24,38 +24,39 @@ Deviation = Callable[[Float, Float], float]
 
 @cache
 def bernstein(degree: int, num_points: int = SAMPLES) -> Float:
-    """Return what each control point of a piece weighs at equal steps of its parameter.
+    """Compute the weights of the control points of a piece at equal steps of its parameter.
 
     Args:
-        degree: Of the piece, 1 to ``MAX_DEGREE``.
-        num_points: Steps from 0 to 1, both included.
+        degree: Degree of the piece, 1 to ``MAX_DEGREE``.
+        num_points: Number of values of the parameter from 0 to 1, both included.
 
     Returns:
         Weights, whose rows sum to 1. (num_points, degree + 1)
 
     Raises:
-        ValueError: If the degree is another.
+        ValueError: If the degree is out of range.
     """
     if not 1 <= degree <= MAX_DEGREE:
         raise InputError(f"the degree of a Bezier curve must be 1 to {MAX_DEGREE}, got {degree}.")
-    t, k = np.linspace(0, 1, num_points)[:, None], np.arange(degree + 1)
-    numbers: Float = np.array([comb(degree, each) for each in k.tolist()], np.float64)
-    return numbers * t**k * (1 - t) ** (degree - k)
+    t = np.linspace(0, 1, num_points)[:, None]
+    k = np.arange(degree + 1)
+    binomials: Float = np.array([comb(degree, each) for each in k.tolist()], np.float64)
+    return binomials * t**k * (1 - t) ** (degree - k)
 
 
 def curve_points(controls: Points, degree: int, num_points: int = SAMPLES) -> Float:
-    """Return points of a piecewise curve.
+    """Compute points of a piecewise curve.
 
     Args:
         controls: Control points in metres. (k * degree + 1, D)
-        degree: Of each piece.
-        num_points: Points of a piece, both ends included.
+        degree: Degree of each piece.
+        num_points: Number of points of a piece, both ends included.
 
     Returns:
         Points in metres; joints occur once. (k * (num_points - 1) + 1, D)
 
     Raises:
-        ValueError: If the control points are not those of one piece or more.
+        ValueError: If the number of control points does not fit k >= 1 pieces.
     """
     controls = np.asarray(controls, dtype=np.float64)
     weights = bernstein(degree, num_points)
@@ -64,22 +65,25 @@ def curve_points(controls: Points, degree: int, num_points: int = SAMPLES) -> Fl
             f"pieces of degree {degree} have {degree} control points each and one at the end, got "
             f"points of shape {controls.shape}."
         )
-    pieces = [weights @ controls[a : a + degree + 1] for a in range(0, len(controls) - 1, degree)]
-    return np.concatenate([pieces[0], *(piece[1:] for piece in pieces[1:])])
+    pieces = []
+    for start in range(0, len(controls) - 1, degree):
+        piece = weights @ controls[start : start + degree + 1]
+        pieces.append(piece if start == 0 else piece[1:])
+    return np.concatenate(pieces)
 
 
 @cache
 def _inverse(degree: int) -> Float:
-    """Return what makes control points of a piece's points, by least squares. (degree + 1, 100)"""
+    """Matrix from points of a piece to its control points, by least squares. (degree + 1, 100)"""
     return np.linalg.pinv(bernstein(degree))
 
 
 def fit_piece(points: Points, degree: int) -> Float:
-    """Fit one piece to a line: least squares at equal lengths, then the line's own ends.
+    """Fit one piece to a line: least squares at equal lengths, with the ends of the line.
 
     Args:
         points: Vertices in metres. (n >= 2, D)
-        degree: Of the piece.
+        degree: Degree of the piece.
 
     Returns:
         Control points in metres. (degree + 1, D)
@@ -90,45 +94,59 @@ def fit_piece(points: Points, degree: int) -> Float:
 
 
 def mean_deviation(line: Float, curve: Float, ignored_m: float = 0.05) -> float:
-    """Return how far a curve is from a line in the mean, in metres: BeMapNet's measure.
+    """Compute the mean distance of a line and a curve, as in BeMapNet.
 
     Args:
-        line: Vertices of the line, in metres; 100 equidistant points of it count. (n, D)
-        curve: Points of the curve. (m, D)
-        ignored_m: Distances up to this count as 0.
+        line: Vertices of the line in metres, resampled to 100 points. (n, D)
+        curve: Points of the curve in metres. (m, D)
+        ignored_m: Distances up to this one, in metres, count as 0.
+
+    Returns:
+        Mean of the mean distances of both directions, in metres.
     """
-    from scipy.spatial import distance  # reading a result file needs neither scipy nor shapely
+    from scipy.spatial import distance  # imported here: result files are read without scipy
 
     between = distance.cdist(resample(line, SAMPLES), curve)
-    nearest = between.min(0), between.min(1)
-    return float(np.mean([np.where(near <= ignored_m, 0, near).mean() for near in nearest]))
+    from_curve = between.min(0)
+    from_line = between.min(1)
+    mean_from_curve = np.where(from_curve <= ignored_m, 0, from_curve).mean()
+    mean_from_line = np.where(from_line <= ignored_m, 0, from_line).mean()
+    return float(np.mean([mean_from_curve, mean_from_line]))
 
 
 def largest_deviation(line: Float, curve: Float) -> float:
-    """Return the largest distance of a line (n, D) and a curve (m, D), in metres (Hausdorff).
+    """Compute the largest distance of a line and a curve in the plane (Hausdorff distance).
 
-    Both directions count, in the plane: the given points of the curve, the vertices of the line,
-    and 100 equidistant points of it.
+    Both directions count: points of the curve, and vertices and 100 equidistant points of the line.
+
+    Args:
+        line: Vertices of the line in metres. (n, D)
+        curve: Points of the curve in metres. (m, D)
+
+    Returns:
+        Largest distance in metres.
     """
-    from gsmap.structures.curve_kernels import largest_deviation as compiled  # reading needs none
+    # Imported here: result files are read without numba.
+    from gsmap.structures.curve_kernels import largest_deviation as compiled
 
-    return compiled(_in_plane(line), _in_plane(curve), SAMPLES, np.inf)
+    return compiled(_in_plane(line), _in_plane(curve), num_points=SAMPLES, enough=np.inf)
 
 
 def _in_plane(points: Float) -> Float:
-    """Return x and y of points, as the kernels take them. (n, D) -> (n, 2)"""
+    """Contiguous x and y of points. (n, D) -> (n, 2)"""
     return np.ascontiguousarray(points[:, :2], np.float64)
 
 
-def _fits(degree: int, max_error_m: float, deviation: Deviation) -> Callable[[Float], bool]:
-    """Return a test of whether one piece is near enough to a part of a line (n, D)."""
+def _fit_test(degree: int, max_error_m: float, deviation: Deviation) -> Callable[[Float], bool]:
+    """Create a test whether one piece is close enough to a part of a line (n, D)."""
 
     def fits(part: Float) -> bool:
-        return deviation(part, curve_points(fit_piece(part, degree), degree)) < max_error_m
+        curve = curve_points(fit_piece(part, degree), degree)
+        return deviation(part, curve) < max_error_m
 
     def fits_compiled(part: Float) -> bool:
-        apart_m = deviation_of_fit(_in_plane(part), inverse, weights, max_error_m)
-        return bool(apart_m < max_error_m)
+        error_m = deviation_of_fit(_in_plane(part), inverse, weights=weights, enough=max_error_m)
+        return bool(error_m < max_error_m)
 
     if deviation is not largest_deviation:
         return fits
@@ -145,16 +163,21 @@ def fit_joints(
     max_error_m: float = 0.1,
     deviation: Deviation = largest_deviation,
 ) -> list[int]:
-    """Return the vertices of a line at which the pieces of its curve meet, both ends included.
+    """Find the vertices of a line at which the pieces of its curve meet.
 
-    Each piece reaches as far as the error allows. Lines for which that search takes too long, such
-    as long ones that turn at each vertex, are searched on by twice the reach as long as that fits.
+    Each piece is as long as the error allows. The search has a limit of work, which long lines that
+    turn at each vertex can reach. It then continues by doubling the length of a piece as long as
+    the piece fits.
 
     Args:
         points: Vertices in metres. (n >= 2, D)
-        degree: Of the pieces, 1 to ``MAX_DEGREE``.
-        max_error_m: A piece is accepted below this deviation, in metres.
-        deviation: Takes the vertices of a part of the line (n, D) and points of its curve (m, D).
+        degree: Degree of the pieces, 1 to ``MAX_DEGREE``.
+        max_error_m: Deviation in metres below which a piece is accepted, > 0.
+        deviation: Function from the vertices of a part of the line (n, D) and the points of its
+            curve (m, D) to the deviation in metres.
+
+    Returns:
+        Indices of the vertices in rising order, both ends included.
 
     Raises:
         ValueError: If the line has fewer than two points, or a setting is out of range.
@@ -164,18 +187,21 @@ def fit_joints(
         raise InputError(f"max_error_m must be more than 0, got {max_error_m}.")
     if len(points) < 2:
         raise InputError(f"a line has two points or more, got {len(points)}.")
-    fits = _fits(degree, max_error_m, deviation)
-    last, work = len(points) - 1, _WORK * len(points)
+    fits = _fit_test(degree, max_error_m, deviation=deviation)
+    last = len(points) - 1
+    work = _WORK * len(points)
     joints = [0]
     while joints[-1] < last:
-        start, end = joints[-1], last
+        start = joints[-1]
+        end = last
         while end > start + 1 and work > 0:
             work -= end - start + SAMPLES
             if fits(points[start : end + 1]):
                 break
             end -= 1
         if work <= 0:
-            end, farther = start + 1, min(start + 2, last)
+            end = start + 1
+            farther = min(start + 2, last)
             while end < farther and fits(points[start : farther + 1]):
                 end = farther
                 farther = min(2 * farther - start, last)
@@ -184,12 +210,12 @@ def fit_joints(
 
 
 def controls_between(points: Points, joints: Sequence[int], degree: int) -> Float:
-    """Return the control points of pieces that meet at some vertices of a line.
+    """Fit pieces that meet at given vertices of a line.
 
     Args:
         points: Vertices in metres. (n >= 2, D)
-        joints: Numbers of the vertices, rising, with both ends. (k + 1,)
-        degree: Of the pieces.
+        joints: Indices of the vertices in rising order, both ends included. (k + 1,)
+        degree: Degree of the pieces.
 
     Returns:
         Control points in metres. (k * degree + 1, D)
@@ -205,16 +231,17 @@ def fit_pieces(
     max_error_m: float = 0.1,
     deviation: Deviation = largest_deviation,
 ) -> Float:
-    """Fit a line with few pieces: each reaches as far as the error allows.
+    """Fit a line with few pieces, each as long as the error allows.
 
     Joints are vertices of the line (`fit_joints`). A piece between neighbouring vertices is exact,
-    so that there is always a fit. BeMapNet's own fits are those with ``deviation=mean_deviation``.
+    so there is always a fit. BeMapNet uses ``deviation=mean_deviation``.
 
     Args:
         points: Vertices in metres. (n >= 2, D)
-        degree: Of the pieces, 1 to ``MAX_DEGREE``.
-        max_error_m: A piece is accepted below this deviation, in metres.
-        deviation: Takes the vertices of a part of the line (n, D) and points of its curve (m, D).
+        degree: Degree of the pieces, 1 to ``MAX_DEGREE``.
+        max_error_m: Deviation in metres below which a piece is accepted, > 0.
+        deviation: Function from the vertices of a part of the line (n, D) and the points of its
+            curve (m, D) to the deviation in metres.
 
     Returns:
         Control points in metres. (k * degree + 1, D)
@@ -222,4 +249,5 @@ def fit_pieces(
     Raises:
         ValueError: If the line has fewer than two points, or a setting is out of range.
     """
-    return controls_between(points, fit_joints(points, degree, max_error_m, deviation), degree)
+    joints = fit_joints(points, degree, max_error_m=max_error_m, deviation=deviation)
+    return controls_between(points, joints, degree=degree)

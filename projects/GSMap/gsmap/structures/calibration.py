@@ -1,4 +1,4 @@
-"""A sample's calibration as the arrays that the cameras' BEV encoders read."""
+"""Calibration of a sample as arrays for the BEV encoders of cameras."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -9,39 +9,57 @@ from numpy.typing import NDArray
 from gsmap.utils.errors import InputError
 
 NUM_CAN_BUS = 18
-OF_ONE_FRAME = slice(3, 17)  # of ``can_bus``; the rest are changes since an earlier frame
+OF_ONE_FRAME = slice(3, 17)  # of ``can_bus``; other entries are changes since an earlier frame
 
-# A camera 1 km ahead of the vehicle that looks further ahead: everything in range is behind it, and
-# its frustum lies out of range. So both ways of making BEV features get nothing from it.
+# Camera 1 km ahead of the vehicle with ahead as its direction. The whole range is behind the camera
+# and its frustum out of range, so it contributes to no BEV cell, by projection or by lifting.
 OUT_OF_SIGHT = np.array(
     [[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, -1000.0], [0, 0, 0, 1.0]]
 )  # cam_from_frame
 
 
 def without_history(can_bus: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-    """Return vehicle signals as MapTR has them of a single frame: `OF_ONE_FRAME`, zeros around it.
+    """Set the vehicle signals outside of `OF_ONE_FRAME` to zero, as in MapTR for a single frame.
 
-    (18,) -> (18,); ValueError if there is another number.
+    Args:
+        can_bus: Vehicle signals in MapTR's layout. (18,)
+
+    Returns:
+        Vehicle signals. (18,)
+
+    Raises:
+        ValueError: If the number of signals is wrong.
     """
     if can_bus.shape != (NUM_CAN_BUS,):
         raise InputError(f"can_bus must hold {NUM_CAN_BUS} values, got shape {can_bus.shape}.")
-    return np.pad(can_bus[OF_ONE_FRAME], (OF_ONE_FRAME.start, NUM_CAN_BUS - OF_ONE_FRAME.stop))
+    signals = np.zeros_like(can_bus)
+    signals[OF_ONE_FRAME] = can_bus[OF_ONE_FRAME]
+    return signals
 
 
 def calibration_arrays(
     meta: Mapping[str, Any], names: Iterable[str]
 ) -> dict[str, NDArray[np.float32]]:
-    """Return what an encoder reads of a sample's metainfo. (V, 4, 4) each, ``can_bus`` (18,)
+    """Compute arrays for an encoder from the metainfo of a sample.
+
+    The arrays are:
+
+    * ``img_from_frame`` and its inverse ``frame_from_img``: between metres in the annotation frame
+      and (u * d, v * d, d, 1), with pixels u, v of the image of the network and depth d in metres.
+    * ``img_from_ground`` and its inverse ``ground_from_img``: with z as the height above the plane
+      z = 0 of the vehicle.
+    * ``cam_from_ground`` and ``ego_from_cam``: transforms in metres.
+    * ``cam2img``, ``img_aug_matrix`` and ``can_bus``: fields of the metainfo. ``can_bus`` is
+      processed by `without_history`, and zero if the sample lacks it.
 
     Args:
-        meta: Of ``lidar2img``, ``lidar2cam``, ``cam2img``, ``img_aug_matrix`` (V, 4, 4),
-            ``lidar2ego`` (4, 4) and ``can_bus`` (18,) those that the names need. ``can_bus`` is
-            given `without_history`; without it the vehicle's motion is zero.
-        names: ``img_from_frame`` and ``frame_from_img``, between metres in the annotation frame and
-            (u * d, v * d, d, 1) in pixels of the network's image; ``img_from_ground``, the former
-            with z above the plane on which the vehicle stands, its inverse ``ground_from_img``, and
-            ``cam_from_ground``, to metres of the camera; ``cam2img``; ``img_aug_matrix``;
-            ``ego_from_cam``; ``can_bus``.
+        meta: Metainfo of the sample: ``lidar2img``, ``lidar2cam``, ``cam2img`` and
+            ``img_aug_matrix`` (V, 4, 4), ``lidar2ego`` (4, 4) and ``can_bus`` (18,), as far as the
+            arrays need them.
+        names: Names of the arrays.
+
+    Returns:
+        Arrays by name: ``can_bus`` (18,), others (V, 4, 4).
 
     Raises:
         ValueError: If the sample lacks a field.
@@ -61,7 +79,7 @@ def calibration_arrays(
     def img_from_ground() -> NDArray[np.float64]:
         return field("lidar2img") @ _frame_from_ground(field("lidar2ego"))
 
-    # Inverses are taken in float64, so that they are as exact as float32 can hold them.
+    # Inverses are computed in float64, so that their float32 values are correctly rounded.
     derived = {
         "img_from_frame": lambda: field("lidar2img"),
         "img_from_ground": img_from_ground,
@@ -70,12 +88,18 @@ def calibration_arrays(
         "frame_from_img": lambda: np.linalg.inv(field("lidar2img")),
         "ego_from_cam": lambda: field("lidar2ego") @ np.linalg.inv(field("lidar2cam")),
     }
-    values = {name: derived[name]() if name in derived else field(name) for name in names}
-    return {name: value.astype(np.float32) for name, value in values.items()}
+    arrays = {}
+    for name in names:
+        values = derived[name]() if name in derived else field(name)
+        arrays[name] = values.astype(np.float32)
+    return arrays
 
 
 def _frame_from_ground(ego_from_frame: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-    """Return what lifts (x, y, height above z = 0 of the vehicle, 1) to the annotation frame."""
-    lifting = np.eye(4)
-    lifting[2, [0, 1, 3]] = -ego_from_frame[2, [0, 1, 3]] / ego_from_frame[2, 2]
-    return lifting
+    """Transform from (x, y, height above the plane z = 0 of the vehicle) to the annotation frame.
+
+    (4, 4) -> (4, 4)
+    """
+    transform = np.eye(4)
+    transform[2, [0, 1, 3]] = -ego_from_frame[2, [0, 1, 3]] / ego_from_frame[2, 2]
+    return transform

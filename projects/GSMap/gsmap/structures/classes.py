@@ -1,4 +1,4 @@
-"""Names of map classes that mean the same everywhere."""
+"""Names of map classes with one meaning in all data sets."""
 
 AREA_CLASSES = ("ped_crossing", "stop_line", "intersection", "carpark_area", "carpark")
-"""Classes whose elements enclose an area: nuScenes' layers, and MapVR's name of the fourth."""
+"""Classes of areas: layers of nuScenes, and ``carpark``, the name of ``carpark_area`` in MapVR."""

@@ -1,4 +1,4 @@
-"""Compiled distances of lines and their curves; ``bezier`` is their only user."""
+"""Distances of lines and their Bezier curves, compiled by numba for ``bezier``."""
 
 import math
 
@@ -6,50 +6,59 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-import gsmap.utils.compilation  # noqa: F401 - says that kernels are compiled
+import gsmap.utils.compilation  # noqa: F401 - logs that kernels are compiled
 
 Float = NDArray[np.float64]
 
 
 @njit(cache=True)
-def resampled(points: Float, num_points: int) -> Float:
-    """Return points of a line at equal lengths, both ends included. (n, 2) -> (P, 2)"""
+def resample_line(points: Float, num_points: int) -> Float:
+    """Resample a line at equal distances, both ends included. (n, 2) -> (P, 2)"""
     along = np.zeros(len(points))
     for i in range(1, len(points)):
-        dx, dy = points[i, 0] - points[i - 1, 0], points[i, 1] - points[i - 1, 1]
+        dx = points[i, 0] - points[i - 1, 0]
+        dy = points[i, 1] - points[i - 1, 1]
         along[i] = along[i - 1] + math.sqrt(dx * dx + dy * dy)
-    found, i = np.empty((num_points, 2)), 0
+    samples = np.empty((num_points, 2))
+    i = 0
     for k in range(num_points):
-        at = along[-1] * k / (num_points - 1)
-        while i < len(points) - 2 and along[i + 1] < at:
+        distance = along[-1] * k / (num_points - 1)
+        while i < len(points) - 2 and along[i + 1] < distance:
             i += 1
         length = along[i + 1] - along[i]
-        share = min((at - along[i]) / length, 1.0) if length > 0.0 else 1.0
+        share = min((distance - along[i]) / length, 1.0) if length > 0.0 else 1.0
         for axis in range(2):
-            found[k, axis] = points[i, axis] + share * (points[i + 1, axis] - points[i, axis])
-    return found
+            samples[k, axis] = points[i, axis] + share * (points[i + 1, axis] - points[i, axis])
+    return samples
 
 
 @njit(cache=True)
 def largest_distance(points: Float, line: Float, enough: float) -> float:
-    """Return the largest distance of points from a line, in metres.
+    """Compute the largest distance of points from a line.
 
     Args:
-        points: The points. (n, 2)
-        line: Vertices of the line. (m, 2)
-        enough: A distance of so much ends the search.
+        points: Points in metres. (n, 2)
+        line: Vertices of the line in metres. (m, 2)
+        enough: Distance in metres at which the search ends.
+
+    Returns:
+        Largest distance in metres, or a distance of at least ``enough``.
     """
     largest = 0.0
     for p in range(len(points)):
-        x, y = points[p, 0], points[p, 1]
+        x = points[p, 0]
+        y = points[p, 1]
         nearest = np.inf
         for s in range(len(line) - 1):
-            along_x, along_y = line[s + 1, 0] - line[s, 0], line[s + 1, 1] - line[s, 1]
-            to_x, to_y = x - line[s, 0], y - line[s, 1]
+            along_x = line[s + 1, 0] - line[s, 0]
+            along_y = line[s + 1, 1] - line[s, 1]
+            to_x = x - line[s, 0]
+            to_y = y - line[s, 1]
             length = along_x * along_x + along_y * along_y
             share = (to_x * along_x + to_y * along_y) / length if length > 0.0 else 0.0
             share = min(max(share, 0.0), 1.0)
-            to_x, to_y = to_x - share * along_x, to_y - share * along_y
+            to_x = to_x - share * along_x
+            to_y = to_y - share * along_y
             nearest = min(nearest, to_x * to_x + to_y * to_y)
         largest = max(largest, nearest)
         if largest >= enough * enough:
@@ -59,32 +68,40 @@ def largest_distance(points: Float, line: Float, enough: float) -> float:
 
 @njit(cache=True)
 def largest_deviation(line: Float, curve: Float, num_points: int, enough: float) -> float:
-    """Return the largest distance of a line and a curve, in metres.
+    """Compute the largest distance of a line and a curve, in both directions.
 
     Args:
-        line: Vertices of the line. (n, 2)
-        curve: Points of the curve. (m, 2)
-        num_points: Points of the line at equal lengths that count beside its vertices.
-        enough: A distance of so much ends the search.
+        line: Vertices of the line in metres. (n, 2)
+        curve: Points of the curve in metres. (m, 2)
+        num_points: Number of equidistant points of the line that count in addition to its vertices.
+        enough: Distance in metres at which the search ends.
+
+    Returns:
+        Largest distance in metres, or a distance of at least ``enough``.
     """
-    largest = largest_distance(resampled(line, num_points), curve, enough)
+    largest = largest_distance(resample_line(line, num_points), curve, enough=enough)
     if largest < enough:
-        largest = max(largest, largest_distance(line, curve, enough))
+        largest = max(largest, largest_distance(line, curve, enough=enough))
     if largest < enough:
-        largest = max(largest, largest_distance(curve, line, enough))
+        largest = max(largest, largest_distance(curve, line, enough=enough))
     return largest
 
 
 @njit(cache=True)
 def deviation_of_fit(line: Float, inverse: Float, weights: Float, enough: float) -> float:
-    """Return the largest distance of a line and of the piece that is fitted to it, in metres.
+    """Fit one piece to a line and compute the largest distance of both.
 
     Args:
-        line: Vertices of the line. (n, 2)
-        inverse: What makes control points of points at equal lengths. (degree + 1, P)
-        weights: What makes points of the curve of control points. (P, degree + 1)
-        enough: A distance of so much ends the search.
+        line: Vertices of the line in metres. (n, 2)
+        inverse: Matrix from points at equal distances to control points. (degree + 1, P)
+        weights: Matrix from control points to points of the curve. (P, degree + 1)
+        enough: Distance in metres at which the search ends.
+
+    Returns:
+        Largest distance in metres, or a distance of at least ``enough``.
     """
-    controls = inverse @ resampled(line, len(weights))
-    controls[0], controls[-1] = line[0], line[-1]
-    return largest_deviation(line, weights @ controls, len(weights), enough)
+    controls = inverse @ resample_line(line, len(weights))
+    controls[0] = line[0]
+    controls[-1] = line[-1]
+    curve = weights @ controls
+    return largest_deviation(line, curve, num_points=len(weights), enough=enough)

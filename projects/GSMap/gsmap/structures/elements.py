@@ -1,4 +1,4 @@
-"""The map of one sample, predicted or annotated: all its polylines and rings in flat arrays."""
+"""Map of one sample, predicted or annotated: its polylines and rings in flat arrays."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,10 +16,15 @@ BoolArray = npt.NDArray[np.bool_]
 PerElement = Sequence[Any] | npt.NDArray[Any]
 
 
-def annotated(results: Mapping[str, Any], transform: object) -> Sequence[Any]:
-    """Return the elements of a sample in a pipeline, ``map_instances``.
+def ground_truth_elements(results: Mapping[str, Any], transform: object) -> Sequence[Any]:
+    """Return the ground-truth elements of a sample in a pipeline, ``map_instances``.
 
-    ValueError if there is no ground truth, so that the transform should be left out.
+    Args:
+        results: Results of the pipeline so far.
+        transform: Transform that needs the elements, named in the message.
+
+    Raises:
+        ValueError: If the sample has no ground truth.
     """
     elements: Sequence[Any] | None = results["map_instances"]
     if elements is None:
@@ -31,25 +36,26 @@ def annotated(results: Mapping[str, Any], transform: object) -> Sequence[Any]:
 
 
 FARTHEST_M = 1e5
-"""How far from the vehicle a point of a map around it may lie, and how long a line may be."""
+"""Largest distance in metres of a point of a map from the vehicle, and largest length of a line."""
 MOST_M = 1e6
-"""How long all lines of a map around a vehicle may be together."""
+"""Largest length in metres of all lines of the map around a vehicle together."""
 
 
 @dataclass(frozen=True, eq=False)
 class MapElements:
-    """Polylines and rings of one sample, one after another in one array.
+    """Polylines and rings of one sample, concatenated in one array.
 
-    ``from_polylines`` builds and checks them.
+    ``from_polylines`` creates and checks them.
 
     Args:
         points: Vertices of all elements, (x, y) or (x, y, z) in metres in the frame of the
             annotations. (M, D)
-        offsets: Element i owns the vertices ``offsets[i]:offsets[i + 1]``. (N + 1,)
+        offsets: Element i has the vertices ``offsets[i]:offsets[i + 1]``. (N + 1,)
         labels: Class index of each element. (N,)
         scores: Confidence of each element in [0, 1], or None for ground truth. (N,)
-        scales: Standard deviations of each vertex's Gaussian in metres, if it has one. (M, 2)
-        rotations: Angle of its first axis from +x in radians, anticlockwise. (M,)
+        scales: Standard deviations of the Gaussian of each vertex in metres, or None. (M, 2)
+        rotations: Angle of the first axis of the Gaussian of each vertex from +x in radians,
+            anticlockwise, or None. (M,)
     """
 
     points: FloatArray
@@ -68,20 +74,25 @@ class MapElements:
         scales: PerElement | None = None,
         rotations: PerElement | None = None,
     ) -> "MapElements":
-        """Build the elements of a sample from separate polylines.
+        """Create the elements of a sample from separate polylines.
 
         Args:
-            polylines: Arrays or nested lists of vertices in metres; z is dropped unless all have
-                it. N x (P, 2 or 3)
+            polylines: Arrays or nested lists of vertices in metres; z is dropped unless all
+                vertices have it. N x (P, 2 or 3)
             labels: Class indices. (N,)
             scores: Confidences in [0, 1], or None for ground truth. (N,)
-            scales: Standard deviations of the vertices' Gaussians in metres. N x (P, 2)
-            rotations: Angles of their first axes from +x in radians. N x (P,)
+            scales: Standard deviations of the Gaussians of the vertices in metres, or None.
+                N x (P, 2)
+            rotations: Angles of the first axes of the Gaussians from +x in radians, or None.
+                N x (P,)
+
+        Returns:
+            Elements.
 
         Raises:
-            ValueError: If the lengths disagree, the points are not (x, y[, z]), a point is not
-                finite, a score is outside [0, 1], or a Gaussian is none: a scale that is not
-                positive, a value that is not finite.
+            ValueError: If the lengths disagree, a point is not (x, y) or (x, y, z), a point is not
+                finite, a score is outside [0, 1], a scale is not positive and finite, or a rotation
+                is not finite.
         """
         labels = np.asarray(labels, np.int64).reshape(-1)
         scores = None if scores is None else np.asarray(scores, np.float64).reshape(-1)
@@ -93,22 +104,26 @@ class MapElements:
                     f"got {len(given)}."
                 )
         try:
-            points = _joined(polylines)
+            points = _concatenate(polylines)
         except (TypeError, IndexError, ValueError) as error:
             raise InputError(f"polylines must be lists of (x, y) or (x, y, z): {error}") from error
         offsets = np.cumsum([0, *map(len, polylines)])
-        _require(np.isfinite(points).all(axis=1), offsets, "point that is not finite")
-        if scores is not None and not ((scores >= 0) & (scores <= 1)).all():  # NaN is not
-            index = ((scores >= 0) & (scores <= 1)).argmin()
-            raise InputError(f"element {index} has the score {scores[index]}, not in [0, 1].")
-        scales = _per_vertex(scales, "scales", (len(points), 2))
-        rotations = _per_vertex(rotations, "rotations", (len(points),))
+        finite = np.isfinite(points).all(axis=1)
+        _require(finite, offsets, fault="point that is not finite")
+        if scores is not None:
+            in_range = (scores >= 0) & (scores <= 1)  # False for NaN
+            if not in_range.all():
+                index = in_range.argmin()
+                raise InputError(f"element {index} has the score {scores[index]}, not in [0, 1].")
+        scales = _per_vertex(scales, "scales", shape=(len(points), 2))
+        rotations = _per_vertex(rotations, "rotations", shape=(len(points),))
         if scales is not None:
             positive = ((scales > 0) & np.isfinite(scales)).all(axis=1)
-            _require(positive, offsets, "Gaussian whose scales are not positive numbers")
+            _require(positive, offsets, fault="Gaussian whose scales are not positive numbers")
         if rotations is not None:
-            _require(np.isfinite(rotations), offsets, "Gaussian whose rotation is not finite")
-        return cls(points, offsets, labels, scores, scales, rotations)
+            finite = np.isfinite(rotations)
+            _require(finite, offsets, fault="Gaussian whose rotation is not finite")
+        return cls(points, offsets, labels, scores=scores, scales=scales, rotations=rotations)
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -120,88 +135,123 @@ class MapElements:
 
     @property
     def polylines(self) -> list[FloatArray]:
-        """The vertices of each element, as views. N x (P, D)"""
+        """Vertices of each element, as views. N x (P, D)"""
         return [self.points[a:b] for a, b in pairwise(self.offsets.tolist())]
 
     @property
     def rows(self) -> Iterator[tuple[FloatArray, int, float]]:
-        """Vertices (P, D), label and confidence of one element after another."""
-        values = self.labels.tolist(), self.confidence.tolist()
-        return zip(self.polylines, *values, strict=True)
+        """Vertices (P, D), label and confidence of each element."""
+        labels = self.labels.tolist()
+        confidences = self.confidence.tolist()
+        return zip(self.polylines, labels, confidences, strict=True)
 
     @property
     def confidence(self) -> FloatArray:
-        """The scores; ones if there are none. (N,)"""
+        """Scores, or ones without scores. (N,)"""
         return np.ones(len(self)) if self.scores is None else self.scores
 
     @property
     def has_gaussians(self) -> bool:
-        """Whether every vertex carries a Gaussian."""
+        """Whether each vertex has a Gaussian."""
         return self.scales is not None and self.rotations is not None
 
     def with_coordinates(self, dim: int) -> "MapElements":
-        """Return the elements with ``dim`` coordinates a vertex; ValueError if there are fewer."""
-        found = self.points.shape[1]
-        if found == dim:
+        """Drop coordinates of the vertices.
+
+        Args:
+            dim: Number of coordinates, from the first one, that remain.
+
+        Returns:
+            Elements with ``dim`` coordinates per vertex.
+
+        Raises:
+            ValueError: If the vertices have fewer coordinates.
+        """
+        num_coordinates = self.points.shape[1]
+        if num_coordinates == dim:
             return self
-        if found < dim and len(self.points):
-            raise InputError(f"points must have {dim} coordinates, got {found}.")
+        if num_coordinates < dim and len(self.points):
+            raise InputError(f"points must have {dim} coordinates, got {num_coordinates}.")
         points = self.points[:, :dim] if len(self.points) else np.empty((0, dim))
         return replace(self, points=np.ascontiguousarray(points))
 
-    def moved(self, transform: FloatArray) -> "MapElements":
-        """Return the elements in another level frame: moved by position and yaw of a pose.
+    def to_frame(self, transform: FloatArray) -> "MapElements":
+        """Transform the elements to another level frame, by the position and yaw of a pose.
 
-        Ground truth is cut out of maps in just this way, so that the two are inverse to each other;
-        roll and pitch would move a point 30 m away by centimetres.
+        Ground truth is cut out of maps by the inverse of this transform. Roll and pitch are
+        ignored; they would move a point 30 m away by centimetres.
 
         Args:
-            transform: From the frame of the elements to the other one, in metres. (4, 4)
+            transform: Transform from the frame of the elements to the other one, in metres. (4, 4)
+
+        Returns:
+            Elements in the other frame.
         """
-        cos, sin = transform[:2, 0] / np.hypot(*transform[:2, 0])
+        axis_x, axis_y = transform[:2, 0]
+        cos, sin = transform[:2, 0] / np.hypot(axis_x, axis_y)
         turn = np.eye(self.points.shape[1])
         turn[:2, :2] = [[cos, -sin], [sin, cos]]
         points = self.points @ turn.T + transform[: len(turn), 3]
-        turned = None if self.rotations is None else self.rotations + np.arctan2(sin, cos)
-        return replace(self, points=points, rotations=turned)
+        rotations = self.rotations
+        if rotations is not None:
+            rotations = rotations + np.arctan2(sin, cos)
+        return replace(self, points=points, rotations=rotations)
 
     def select(self, index: IntArray | BoolArray) -> "MapElements":
-        """Return some of the elements, by positions in their order (K,), or by a mask (N,)."""
+        """Select elements.
+
+        Args:
+            index: Indices (K,) or a mask (N,) of the elements.
+
+        Returns:
+            Selected elements.
+        """
         rows = np.flatnonzero(index) if index.dtype == np.bool_ else np.asarray(index)
         counts = self.num_points[rows]
         offsets = np.append(0, np.cumsum(counts))
-        take = np.repeat(self.offsets[rows] - offsets[:-1], counts) + np.arange(offsets[-1])
-        scores, scales, rotations = (
-            None if values is None else values[chosen]
-            for values, chosen in ((self.scores, rows), (self.scales, take), (self.rotations, take))
+        shifts = np.repeat(self.offsets[rows] - offsets[:-1], counts)
+        vertices = shifts + np.arange(offsets[-1])
+        return MapElements(
+            points=self.points[vertices],
+            offsets=offsets,
+            labels=self.labels[rows],
+            scores=None if self.scores is None else self.scores[rows],
+            scales=None if self.scales is None else self.scales[vertices],
+            rotations=None if self.rotations is None else self.rotations[vertices],
         )
-        return MapElements(self.points[take], offsets, self.labels[rows], scores, scales, rotations)
 
 
-def _require(right: BoolArray, offsets: IntArray, fault: str) -> None:
-    """Raise ValueError with the first element of which a vertex is not right. (M,), (N + 1,)"""
-    if not right.all():
-        index = np.searchsorted(offsets, right.argmin(), side="right") - 1
+def _require(valid: BoolArray, offsets: IntArray, fault: str) -> None:
+    """Raise ValueError with the first element that has an invalid vertex. (M,), (N + 1,)"""
+    if not valid.all():
+        index = np.searchsorted(offsets, valid.argmin(), side="right") - 1
         raise InputError(f"element {index} has a {fault}.")
 
 
-def _joined(polylines: PerElement) -> FloatArray:
-    """Return the vertices of all polylines. (M, 2 or 3)"""
-    filled = [p for p in polylines if len(p)]
-    if not filled:
+def _concatenate(polylines: PerElement) -> FloatArray:
+    """Concatenate the vertices of all polylines. N x (P, 2 or 3) -> (M, 2 or 3)"""
+    nonempty = [polyline for polyline in polylines if len(polyline)]
+    if not nonempty:
         return np.empty((0, 2))
-    arrays = isinstance(filled[0], np.ndarray)
-    rows = list(chain.from_iterable(filled)) if not arrays else []
-    dims = {p.shape[1] for p in filled} if arrays else set(map(len, rows))
+    are_arrays = isinstance(nonempty[0], np.ndarray)
+    if are_arrays:
+        rows = []
+        dims = {polyline.shape[1] for polyline in nonempty}
+    else:
+        rows = list(chain.from_iterable(nonempty))
+        dims = set(map(len, rows))
     if not dims <= {2, 3}:
         raise InputError(f"points have {sorted(dims)} coordinates")
-    if arrays:
-        return np.concatenate([p[:, : min(dims)] for p in filled], dtype=np.float64)
-    return np.array(rows if len(dims) == 1 else [row[:2] for row in rows], dtype=np.float64)
+    if are_arrays:
+        dim = min(dims)
+        return np.concatenate([polyline[:, :dim] for polyline in nonempty], dtype=np.float64)
+    if len(dims) > 1:
+        rows = [row[:2] for row in rows]
+    return np.array(rows, dtype=np.float64)
 
 
 def _per_vertex(values: Any, name: str, shape: tuple[int, ...]) -> FloatArray | None:
-    """Join what each polyline's vertices carry, and check that every vertex has it."""
+    """Concatenate values per vertex of all polylines and check their number."""
     if values is None:
         return None
     if not len(values):

@@ -1,4 +1,4 @@
-"""The extent of the map in metres and its raster: every metres <-> [0, 1] <-> pixel conversion."""
+"""Extent of a map in metres and its raster: conversions between metres, [0, 1] and pixels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from gsmap.utils.errors import InputError
 
-if TYPE_CHECKING:  # what scores files and knows no tensors starts without torch
+if TYPE_CHECKING:  # evaluation of result files imports no torch
     import torch
     from torch import Tensor
 
@@ -18,17 +18,17 @@ Array = TypeVar("Array", npt.NDArray[Any], "Tensor")
 
 @dataclass(frozen=True)
 class BEVGrid:
-    """A bird's-eye-view rectangle in metres, divided into ``height`` x ``width`` pixels.
+    """Bird's-eye-view rectangle in metres, divided into ``height`` x ``width`` pixels.
 
-    Row 0 lies at the smallest y, column 0 at the smallest x; a pixel's value is taken at its
+    Row 0 is at the smallest y and column 0 at the smallest x. The value of a pixel belongs to its
     centre, so pixel (row, col) has the continuous pixel coordinates (col + 0.5, row + 0.5).
 
     Args:
         x_range: Smallest and largest x in metres.
         y_range: Smallest and largest y in metres.
-        height: Number of rows H (along y).
-        width: Number of columns W (along x).
-        forward: Axis of the direction of travel, ``"x"`` or ``"y"``; by default the longer side.
+        height: Number H of rows, along y.
+        width: Number W of columns, along x.
+        forward: Axis of the direction of travel, ``"x"`` or ``"y"``; None for the longer side.
 
     Raises:
         ValueError: If a range is empty, a size is not positive or ``forward`` is unknown.
@@ -45,7 +45,7 @@ class BEVGrid:
             low, high = (float(v) for v in getattr(self, name))
             if not low < high:
                 raise InputError(f"{name} must be (low, high) with low < high, got {(low, high)}.")
-            object.__setattr__(self, name, (low, high))  # a config's lists, made hashable
+            object.__setattr__(self, name, (low, high))  # hashable, also from lists of a config
         if self.height < 1 or self.width < 1:
             raise InputError(f"height and width must be >= 1, got {self.height} x {self.width}.")
         if self.forward is None:
@@ -57,102 +57,143 @@ class BEVGrid:
     @property
     def extent_m(self) -> tuple[float, float]:
         """Size along x and y in metres."""
-        return self.x_range[1] - self.x_range[0], self.y_range[1] - self.y_range[0]
+        length_x = self.x_range[1] - self.x_range[0]
+        length_y = self.y_range[1] - self.y_range[0]
+        return length_x, length_y
 
     @property
     def pixel_size_m(self) -> tuple[float, float]:
         """Size of one pixel along x and y in metres."""
-        return self.extent_m[0] / self.width, self.extent_m[1] / self.height
+        length_x, length_y = self.extent_m
+        return length_x / self.width, length_y / self.height
 
-    def resized(self, height: int, width: int) -> "BEVGrid":
-        """Return the same extent with another raster size."""
+    def with_size(self, height: int, width: int) -> "BEVGrid":
+        """Create a grid with equal extent and another number of rows and columns."""
         return replace(self, height=height, width=width)
 
     def rasterized(self, pixel_m: float | Sequence[float]) -> "BEVGrid":
-        """Return the same extent in pixels of a side in metres, or of sizes along x and y.
+        """Create a grid with equal extent and another size of pixels.
 
-        ValueError if the pixels do not divide the extent.
+        Args:
+            pixel_m: Side of a pixel in metres, or its sizes along x and y.
+
+        Raises:
+            ValueError: If the pixels do not divide the extent.
         """
-        sizes = (pixel_m, pixel_m) if isinstance(pixel_m, (int, float)) else tuple(pixel_m)
-        counts = [extent / size for extent, size in zip(self.extent_m, sizes, strict=True)]
-        width, height = (round(count) for count in counts)
-        if min(width, height) < 1 or max(abs(counts[0] - width), abs(counts[1] - height)) > 1e-3:
+        if isinstance(pixel_m, (int, float)):
+            pixel_m = (pixel_m, pixel_m)
+        size_x, size_y = pixel_m
+        length_x, length_y = self.extent_m
+        columns = length_x / size_x
+        rows = length_y / size_y
+        width = round(columns)
+        height = round(rows)
+        if min(width, height) < 1 or max(abs(columns - width), abs(rows - height)) > 1e-3:
             raise InputError(
-                f"pixels of {sizes[0]:g} x {sizes[1]:g} m do not divide the map of "
-                f"{self.extent_m[0]:g} x {self.extent_m[1]:g} m."
+                f"pixels of {size_x:g} x {size_y:g} m do not divide the map of "
+                f"{length_x:g} x {length_y:g} m."
             )
-        return self.resized(height, width)
+        return self.with_size(height, width)
 
     def norm_from_metres(self, points: Array) -> Array:
-        """Map metres to [0, 1] over the extent. (..., 2)"""
+        """Convert metres to [0, 1] over the extent. (..., 2) -> (..., 2)"""
         return self._in_units(points, self.extent_m)
 
     def px_from_metres(self, points: Array) -> Array:
-        """Map metres to continuous pixels (u along x, v along y), centres at + 0.5. (..., 2)"""
+        """Convert metres to continuous pixels (u along x, v along y). (..., 2) -> (..., 2)"""
         return self._in_units(points, self.pixel_size_m)
 
     def metres_from_norm(self, points: Array) -> Array:
-        """Map [0, 1] over the extent to metres. (..., 2)"""
-        return _affine(points, self.extent_m, (self.x_range[0], self.y_range[0]))
+        """Convert [0, 1] over the extent to metres. (..., 2) -> (..., 2)"""
+        lower_corner = (self.x_range[0], self.y_range[0])
+        return _affine(points, scale=self.extent_m, shift=lower_corner)
 
     def front_from_metres(self, points: Array) -> Array:
-        """Map metres to [0, 1] from the front edge to the rear and from the left to the right.
+        """Convert metres to [0, 1] from front to rear and from left to right.
 
-        (..., 2)
+        Args:
+            points: Points (x, y) in metres. (..., 2)
+
+        Returns:
+            Share of the way from the front edge, then from the left edge. (..., 2)
         """
         order, scale, shift = self._front
-        return _affine(_chosen(self.norm_from_metres(points), order), scale, shift)
+        coordinates = _reorder(self.norm_from_metres(points), order)
+        return _affine(coordinates, scale=scale, shift=shift)
 
     def metres_from_front(self, points: Array) -> Array:
-        """Map [0, 1] from the front edge and from the left to metres. (..., 2)"""
+        """Convert [0, 1] from front to rear and from left to right to metres.
+
+        Args:
+            points: Share of the way from the front edge, then from the left edge. (..., 2)
+
+        Returns:
+            Points (x, y) in metres. (..., 2)
+        """
         order, scale, shift = self._front
-        return self.metres_from_norm(_chosen(_affine(points, scale, shift), order))
+        coordinates = _affine(points, scale=scale, shift=shift)
+        return self.metres_from_norm(_reorder(coordinates, order))
 
     @property
     def _front(self) -> tuple[list[int], tuple[float, float], tuple[float, float]]:
-        """Return how [0, 1] over the map is turned to the front and back: order, scale, shift."""
-        along_x = self.forward == "x"
-        return ([0, 1], (-1, -1), (1, 1)) if along_x else ([1, 0], (-1, 1), (1, 0))
+        """Order of the axes, scale and shift between [0, 1] over the map and from the front."""
+        if self.forward == "x":
+            return [0, 1], (-1, -1), (1, 1)
+        return [1, 0], (-1, 1), (1, 0)
 
     def _in_units(self, points: Array, sizes_m: tuple[float, float]) -> Array:
-        """Measure points from the lower corner in units of given sizes. (..., 2)"""
-        shift = -self.x_range[0] / sizes_m[0], -self.y_range[0] / sizes_m[1]
-        return _affine(points, (1 / sizes_m[0], 1 / sizes_m[1]), shift)
+        """Convert metres to units of given sizes, from the lower corner. (..., 2) -> (..., 2)"""
+        size_x, size_y = sizes_m
+        scale = (1 / size_x, 1 / size_y)
+        shift = (-self.x_range[0] / size_x, -self.y_range[0] / size_y)
+        return _affine(points, scale=scale, shift=shift)
 
     def pixel_centres(
         self, device: "torch.device | str | None" = None, dtype: "torch.dtype | None" = None
     ) -> "Tensor":
-        """Return the centre (x, y) of every pixel in metres, float32 by default. (H, W, 2)"""
+        """Compute the centres of all pixels.
+
+        Args:
+            device: Device of the result; None for torch's default.
+            dtype: Type of the result; None for float32.
+
+        Returns:
+            Centres (x, y) in metres. (H, W, 2)
+        """
         import torch
 
-        dtype, (dx, dy) = dtype or torch.float32, self.pixel_size_m
+        dtype = dtype or torch.float32
+        dx, dy = self.pixel_size_m
         x = self.x_range[0] + dx * (torch.arange(self.width, device=device, dtype=dtype) + 0.5)
         y = self.y_range[0] + dy * (torch.arange(self.height, device=device, dtype=dtype) + 0.5)
-        return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
+        return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
 
 
-def _chosen(points: Array, order: list[int]) -> Array:
-    """Return coordinates in an order, without a list of indices to upload. (..., 2)"""
+def _reorder(points: Array, order: list[int]) -> Array:
+    """Reorder coordinates, without uploading a list of indices to a GPU. (..., 2) -> (..., 2)"""
     if isinstance(points, np.ndarray):
         return points[..., order]
     import torch
 
-    return torch.stack([points[..., axis] for axis in order], -1)
+    return torch.stack([points[..., axis] for axis in order], dim=-1)
 
 
 def _affine(points: Array, scale: tuple[float, float], shift: tuple[float, float]) -> Array:
-    """Return ``points * scale + shift`` on (x, y); further entries (z) are kept. (..., >= 2)"""
+    """Compute ``points * scale + shift`` on (x, y); z does not change. (..., 2 or more)"""
     if points.shape[-1] < 2:
         raise InputError(f"points must end in (x, y), got shape {tuple(points.shape)}.")
     if isinstance(points, np.ndarray):
         xy = points[..., :2] * np.asarray(scale) + np.asarray(shift)
-        return np.concatenate([xy, points[..., 2:]], -1).astype(points.dtype, copy=False)
+        return np.concatenate([xy, points[..., 2:]], axis=-1).astype(points.dtype, copy=False)
     import torch
 
-    x, y = points[..., 0] * scale[0] + shift[0], points[..., 1] * scale[1] + shift[1]
-    return torch.cat([torch.stack([x, y], -1), points[..., 2:]], -1)
+    x = points[..., 0] * scale[0] + shift[0]
+    y = points[..., 1] * scale[1] + shift[1]
+    return torch.cat([torch.stack([x, y], dim=-1), points[..., 2:]], dim=-1)
 
 
 def padded_size(size: tuple[int, int], divisor: int) -> tuple[int, int]:
-    """Return height and width rounded up to multiples of ``divisor``."""
-    return -(-size[0] // divisor) * divisor, -(-size[1] // divisor) * divisor
+    """Round a height and width up to multiples of ``divisor``."""
+    height = -(-size[0] // divisor) * divisor
+    width = -(-size[1] // divisor) * divisor
+    return height, width

@@ -1,4 +1,4 @@
-"""What the streams of a batch have left."""
+"""Memory of the streams of a batch."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,15 +9,15 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Past:
-    """What the streams of a batch have left, and how the vehicle has moved since.
+    """Memory that the previous frames left, and the motion of the vehicle since then.
 
     Args:
-        memory: It, by name, without gradient; zeros where a stream starts, nothing if all do.
-            (B, ...) each
-        now_from_then: Takes metres then to metres now, the identity where a stream starts.
-            (B, 4, 4)
-        seconds: The time since then. (B,)
-        continues: Which streams continue. (B,)
+        memory: Tensors by name, without gradient; zeros for a stream that starts, and empty if all
+            streams start. (B, ...) each
+        now_from_then: Transform from the previous to the current frame in metres; the identity for
+            a stream that starts. (B, 4, 4)
+        seconds: Time since the previous frame in seconds. (B,)
+        continues: Whether a stream continues, bool. (B,)
     """
 
     memory: Mapping[str, Tensor]
@@ -27,7 +27,9 @@ class Past:
 
     @property
     def then_from_now(self) -> Tensor:
-        """What takes metres now to metres then. (B, 4, 4)"""
+        """Transform from the current to the previous frame in metres. (B, 4, 4)"""
         turn = self.now_from_then[:, :3, :3].transpose(1, 2)
         shift = -turn @ self.now_from_then[:, :3, 3:]
-        return torch.cat([torch.cat([turn, shift], 2), self.now_from_then[:, 3:]], 1)
+        upper_rows = torch.cat([turn, shift], dim=2)
+        last_row = self.now_from_then[:, 3:]
+        return torch.cat([upper_rows, last_row], dim=1)

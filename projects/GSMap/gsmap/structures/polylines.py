@@ -12,10 +12,11 @@ from gsmap.utils.errors import InputError
 Points = NDArray[np.floating[Any]]
 
 PADDING = -10000.0
-"""Fills the rows of ``equivalent_orders`` that are not used."""
+"""Value of the unused rows of ``equivalent_orders``."""
 
 
 def _check_polyline(points: Points, num_points: int = 2) -> Points:
+    """Convert a polyline (n, D) to float64; ValueError if a shape or ``num_points`` is wrong."""
     points = np.asarray(points)
     if points.ndim != 2 or len(points) < 2 or points.shape[1] < 2:
         raise InputError(f"points must have shape (n >= 2, 2 or 3), got {points.shape}.")
@@ -30,36 +31,50 @@ def is_closed(points: Points) -> bool:
 
 
 def arc_lengths(points: Points) -> NDArray[np.float64]:
-    """Return the distance in the plane from the first point to each point along a polyline.
+    """Compute the distance along a polyline from its first point to each point, in the plane.
 
-    Heights do not lengthen a line, as in shapely, which MapTRv2 resamples 3D lines with: the same
-    line with and without z is resampled at the same (x, y). (n, D) in metres -> (n,)
+    Heights do not count, as in shapely, which MapTRv2 uses to resample 3D lines: a line with z and
+    its projection to the plane are resampled at equal (x, y).
+
+    Args:
+        points: Vertices in metres. (n, D)
+
+    Returns:
+        Distances in metres. (n,)
     """
     steps = np.linalg.norm(np.diff(np.asarray(points, np.float64)[:, :2], axis=0), axis=-1)
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
-def sampled(points: Points, step: float) -> NDArray[np.float64]:
-    """Return a point at every step from the start of a line; the rest at the end is dropped.
+def points_at_steps(points: Points, step: float) -> NDArray[np.float64]:
+    """Sample a line at equal steps from its start; a shorter rest at its end is dropped.
 
-    Steps are measured in the plane, in the points' unit. (n, D) -> (m, D)
+    Args:
+        points: Vertices of the line. (n, D)
+        step: Distance of the samples along the line in the plane, in the unit of the points.
+
+    Returns:
+        Samples. (m, D)
     """
     along = arc_lengths(points)
-    at = np.arange(0.0, along[-1], step)
-    return np.stack([np.interp(at, along, axis) for axis in points.T], -1)
+    distances = np.arange(0.0, along[-1], step)
+    return np.stack([np.interp(distances, along, column) for column in points.T], axis=-1)
 
 
-def padded(
+def pad_lines(
     lines: Sequence[NDArray[Any]],
     length: int | None = None,
     mode: Literal["constant", "edge"] = "edge",
 ) -> NDArray[Any]:
-    """Stack lines, the last point of the shorter ones repeated. (K, P, D)
+    """Stack lines of different lengths and pad the shorter ones at their end.
 
     Args:
-        lines: Points of each line, one or more. (n, D) each
-        length: Number P of points; None means those of the longest line, or 2 without any.
-        mode: ``"constant"`` fills lines with zeros instead.
+        lines: Points of each line, at least one. K x (n, D)
+        length: Number P of points; None for the length of the longest line, or 2 without lines.
+        mode: Padding: ``"edge"`` repeats the last point, ``"constant"`` is zero.
+
+    Returns:
+        Lines. (K, P, D)
     """
     length = length or max(map(len, lines), default=2)
     rows = [np.pad(line, ((0, length - len(line)), (0, 0)), mode) for line in lines]
@@ -69,19 +84,19 @@ def padded(
 def parts_inside(
     points: Points, x_range: tuple[float, float], y_range: tuple[float, float]
 ) -> list[NDArray[np.float64]]:
-    """Return the parts of a line in a rectangle, as shapely cuts it.
+    """Cut a line with a rectangle by shapely.
 
-    Unlike in `clip_to_box`, a line that crosses itself becomes several.
+    Unlike in `clip_to_box`, a line that crosses itself is cut at the crossing.
 
     Args:
-        points: Vertices in metres; fewer than two have no part. (n, 2)
+        points: Vertices in metres; a line of fewer than two has no parts. (n, 2)
         x_range: Smallest and largest x of the rectangle, in metres.
-        y_range: Smallest and largest y, likewise.
+        y_range: Smallest and largest y of the rectangle, in metres.
 
     Returns:
-        The parts. each (m >= 2, 2)
+        Parts of the line inside the rectangle, each (m >= 2, 2).
     """
-    import shapely  # reading a result file needs neither scipy nor shapely
+    import shapely  # imported here: result files are read without scipy and shapely
 
     if len(points) < 2:
         return []
@@ -91,61 +106,73 @@ def parts_inside(
 
 
 def resample(points: Points, num_points: int) -> NDArray[np.float64]:
-    """Resample a polyline at equal arc length in the plane, both end points included.
+    """Resample a polyline at equal distances in the plane, both ends included.
 
-    z is interpolated. ValueError if it is no polyline or ``num_points`` is below 2. (n, D) in
-    metres -> (P, D)
+    Args:
+        points: Vertices in metres; z is interpolated. (n, D)
+        num_points: Number P of points, at least 2.
+
+    Returns:
+        Points. (P, D)
+
+    Raises:
+        ValueError: If ``points`` is no polyline or ``num_points`` is less than 2.
     """
     points = _check_polyline(points, num_points)
-    return resample_all(points, np.array([0, len(points)]), num_points)[0]
+    offsets = np.array([0, len(points)])
+    return resample_all(points, offsets, num_points=num_points)[0]
 
 
 def resample_all(
     points: Points, offsets: NDArray[np.integer[Any]], num_points: int
 ) -> NDArray[np.float64]:
-    """Resample many polylines as `resample` does one. (N, P, D)
+    """Resample polylines at equal distances in the plane, see `resample`.
 
     Args:
-        points: Vertices of all polylines. (M, D)
-        offsets: Polyline i has the vertices ``offsets[i]:offsets[i + 1]``, zeros if none. (N + 1,)
-        num_points: Points P of each result, at equal distances in the plane.
+        points: Vertices of all polylines, in metres. (M, D)
+        offsets: Polyline i has the vertices ``offsets[i]:offsets[i + 1]``. (N + 1,)
+        num_points: Number P of points of each result, at least 2.
+
+    Returns:
+        Points, zeros for a polyline without vertices. (N, P, D)
     """
     counts = np.diff(offsets)
     resampled = np.zeros((len(counts), num_points, points.shape[1]))
     if not counts.any():
         return resampled
     vertex = np.minimum(np.arange(counts.max()), counts[:, None] - 1) + offsets[:-1, None]
-    padded = points[vertex.clip(0)]  # (N, n, D), the last vertex repeated
+    vertices = points[vertex.clip(0)]  # (N, n, D), the last vertex repeated
+    steps = np.linalg.norm(np.diff(vertices[..., :2], axis=1), axis=-1)
     along = np.zeros(vertex.shape)
-    np.cumsum(np.linalg.norm(np.diff(padded[..., :2], axis=1), axis=-1), axis=1, out=along[:, 1:])
+    np.cumsum(steps, axis=1, out=along[:, 1:])
     distances = np.arange(num_points) * (along[:, -1:] / (num_points - 1))  # (N, P)
     distances[:, -1] = along[:, -1]
     for i in np.flatnonzero(counts):
         n = counts[i]
         for axis in range(points.shape[1]):
-            resampled[i, :, axis] = np.interp(distances[i], along[i, :n], padded[i, :n, axis])
+            resampled[i, :, axis] = np.interp(distances[i], along[i, :n], vertices[i, :n, axis])
     return resampled
 
 
 def equivalent_orders(
     points: Points, num_points: int, rng: np.random.Generator | None = None
 ) -> NDArray[np.float64]:
-    """Return the point orders that describe the same map element ("v2" of MapTR).
+    """Compute the point orders that describe one map element ("v2" of MapTR).
 
-    An open polyline has two: as it is, and reversed. A ring, whose last vertex equals its first,
-    has one for each of its K vertices, which starts there and runs in the ring's own direction;
-    order k starts at vertex -k. Of more than P - 1 vertices, P - 1 are taken.
+    An open polyline has two orders: forward and reversed. A ring, whose last vertex equals its
+    first, has one order for each of its K vertices, which starts there and keeps the direction of
+    the ring; order k starts at vertex -k. P - 1 vertices are selected if there are more.
 
     Args:
         points: Vertices at full resolution, in metres. (n, D)
-        num_points: Points P of an order, at equal arc length.
-        rng: Draws which of a ring's vertices are taken; None spreads them evenly.
+        num_points: Number P of points of an order, at equal distances in the plane.
+        rng: Generator for a random selection of vertices of a ring; None for an even one.
 
     Returns:
-        The orders; unused rows hold ``PADDING``. (max(P - 1, 2), P, D)
+        Orders; unused rows are ``PADDING``. (max(P - 1, 2), P, D)
 
     Raises:
-        ValueError: If it is no polyline or ``num_points`` is below 2.
+        ValueError: If ``points`` is no polyline or ``num_points`` is less than 2.
     """
     points = _check_polyline(points, num_points)
     slots = max(num_points - 1, 2)
@@ -164,84 +191,98 @@ def equivalent_orders(
     twice = np.concatenate([points, points[1:]])  # a second lap, so that no distance wraps around
     along = arc_lengths(twice)
     laps = along[-rolls % count, None] + np.linspace(0.0, along[count], num_points)
-    orders[: len(rolls)] = np.stack([np.interp(laps, along, column) for column in twice.T], -1)
+    orders[: len(rolls)] = np.stack([np.interp(laps, along, column) for column in twice.T], axis=-1)
     return orders
 
 
 def sampled_orders(points: Points, closed: bool) -> NDArray[np.float64]:
-    """Return the point orders of a resampled line as StreamMapNet takes them.
+    """Compute the point orders of a resampled line as in StreamMapNet.
 
-    An open line has two, as it is and reversed. A closed one starts at each of its P - 1 different
-    points, and each also reversed; it is not resampled again. Unused rows hold ``PADDING``. (P, D)
-    in metres, first = last if closed -> (2 (P - 1), P, D)
+    An open line has two orders: forward and reversed. A closed line has two orders for each of its
+    P - 1 different points, which start there: forward and reversed. It is not resampled again.
+
+    Args:
+        points: Points in metres; the last equals the first if closed. (P, D)
+        closed: Whether the line is closed.
+
+    Returns:
+        Orders; unused rows are ``PADDING``. (2 (P - 1), P, D)
     """
     orders = np.full((2 * (len(points) - 1), *points.shape), PADDING)
     if not closed:
-        orders[0], orders[1] = points, points[::-1]
+        orders[0] = points
+        orders[1] = points[::-1]
         return orders
     ring = points[:-1]
-    turned = [np.roll(way, step, 0) for way in (ring, ring[::-1]) for step in range(len(ring))]
-    orders[:, :-1] = turned
+    for step in range(len(ring)):
+        orders[step, :-1] = np.roll(ring, step, axis=0)
+        orders[len(ring) + step, :-1] = np.roll(ring[::-1], step, axis=0)
     orders[:, -1] = orders[:, 0]
     return orders
 
 
 def shortest_orders(lines: Points, least_gain_m: float = 1e-3) -> NDArray[np.int64]:
-    """Return orders of the points of lines in which the way through them is short.
+    """Reorder the points of lines so that the path through them is short (2-opt, Croes 1958).
 
-    The part of a line whose reversal shortens it most is reversed, until none does (2-opt, Croes
-    1958), so a line that runs back and forth runs straight. A line that ends where it begins, by
-    less than its mean step, keeps its ends.
+    The part of a line whose reversal shortens it most is reversed, until no reversal shortens it.
+    This straightens a line that runs back and forth. A line keeps its ends if they are closer than
+    its mean step.
 
     Args:
-        lines: Points of each line in metres; the way is one in the plane. (M, P, 2 or 3)
-        least_gain_m: Metres that a reversal must save.
+        lines: Points of each line in metres; lengths are measured in the plane. (M, P, 2 or 3)
+        least_gain_m: Smallest shortening by a reversal, in metres.
 
     Returns:
-        Numbers of the points of each line in their new order. (M, P)
+        Indices of the points of each line in their new order. (M, P)
     """
     lines = np.asarray(lines, np.float64)[..., :2]
     count, size = lines.shape[:2]
     apart = np.linalg.norm(lines[:, :, None] - lines[:, None], axis=-1)  # (M, P, P)
     steps = np.linalg.norm(np.diff(lines, axis=1), axis=-1)
-    ring = apart[:, 0, -1] < steps.mean(1) if size > 1 else np.zeros(count, bool)
-    orders, places = np.tile(np.arange(size), (count, 1)), np.arange(size)
-    left = np.arange(count if size > 2 else 0)
-    while len(left):
-        rows = orders[left]
-        ways = apart[left[:, None, None], rows[:, :, None], rows[:, None]]
-        ways = np.pad(ways, ((0, 0), (1, 1), (1, 1)))  # beyond its ends a line goes nowhere
-        step = ways.diagonal(1, 1, 2)  # to each point from the one before it, (m, P + 1)
-        # [i, j]: the steps into and out of points i to j, as they are and with these reversed
-        gain = step[:, :-1, None] + step[:, None, 1:] - ways[:, :-2, 1:-1] - ways[:, 1:-1, 2:]
-        gain[ring[left], 0], gain[ring[left], :, -1] = 0.0, 0.0
-        gain = np.triu(gain, 1).reshape(len(left), -1)
+    is_ring = apart[:, 0, -1] < steps.mean(1) if size > 1 else np.zeros(count, bool)
+    places = np.arange(size)
+    orders = np.tile(places, (count, 1))
+    active = np.arange(count if size > 2 else 0)  # lines that a reversal may shorten
+    while len(active):
+        rows = orders[active]
+        paths = apart[active[:, None, None], rows[:, :, None], rows[:, None]]
+        paths = np.pad(paths, ((0, 0), (1, 1), (1, 1)))  # no step before the start, after the end
+        step = paths.diagonal(1, 1, 2)  # from the point before to each point, (m, P + 1)
+        # gain[i, j]: steps to point i and from point j, minus these steps with i to j reversed
+        gain = step[:, :-1, None] + step[:, None, 1:] - paths[:, :-2, 1:-1] - paths[:, 1:-1, 2:]
+        gain[is_ring[active], 0] = 0.0
+        gain[is_ring[active], :, -1] = 0.0
+        gain = np.triu(gain, 1).reshape(len(active), -1)
         best = gain.argmax(1)
-        better = gain[np.arange(len(left)), best] > least_gain_m
-        left = left[better]
-        first, last = (ends[better, None] for ends in np.divmod(best, size))
+        improves = gain[np.arange(len(active)), best] > least_gain_m
+        active = active[improves]
+        first, last = np.divmod(best[improves, None], size)
         inside = (places >= first) & (places <= last)
-        turned = np.where(inside, first + last - places, places)
-        orders[left] = np.take_along_axis(orders[left], turned, 1)
+        reversal = np.where(inside, first + last - places, places)
+        orders[active] = np.take_along_axis(orders[active], reversal, axis=1)
     return orders
 
 
 def bounding_boxes(points: Points) -> Points:
-    """Return axis-aligned boxes (xmin, ymin, xmax, ymax) in metres. (..., P, D) -> (..., 4)."""
+    """Axis-aligned boxes (x_min, y_min, x_max, y_max) of lines. (..., P, D) -> (..., 4)"""
     xy = np.asarray(points)[..., :2]
-    return np.concatenate([xy.min(-2), xy.max(-2)], -1)
+    return np.concatenate([xy.min(-2), xy.max(-2)], axis=-1)
 
 
 def clamp(points: Points, x_range: tuple[float, float], y_range: tuple[float, float]) -> Points:
-    """Return points with those outside a rectangle moved to its nearest edge. (..., D)
+    """Move points outside of a rectangle to its nearest edge.
 
     Args:
-        points: Points that begin with (x, y); further entries are kept. (..., D)
-        x_range: Smallest and largest x, in the unit of the points.
-        y_range: Smallest and largest y.
+        points: Points (x, y) and further entries, which do not change. (..., D)
+        x_range: Smallest and largest x of the rectangle, in the unit of the points.
+        y_range: Smallest and largest y of the rectangle, in the unit of the points.
+
+    Returns:
+        Points. (..., D)
     """
+    low, high = np.transpose([x_range, y_range])
     clamped = np.array(points)
-    clamped[..., :2] = np.clip(clamped[..., :2], *np.transpose([x_range, y_range]))
+    clamped[..., :2] = np.clip(clamped[..., :2], low, high)
     return clamped
 
 
@@ -250,35 +291,41 @@ def clip_to_box(
 ) -> list[NDArray[np.float64]]:
     """Cut a polyline with an axis-aligned rectangle (Liang and Barsky, 1984).
 
-    Direction is kept, further coordinates are interpolated, and a ring that is cut comes back as
-    open pieces, none of which ends at the ring's arbitrary start. Pieces that only touch the
-    rectangle are left out. ValueError if it is no polyline.
+    Pieces keep the direction of the polyline, and further coordinates are interpolated. A ring is
+    cut into open pieces; its arbitrary start does not end a piece. Pieces that only touch the
+    rectangle are left out.
 
     Args:
         points: Vertices in metres. (n, D)
         x_range: Smallest and largest x of the rectangle, in metres.
-        y_range: Smallest and largest y, likewise.
+        y_range: Smallest and largest y of the rectangle, in metres.
 
     Returns:
-        The pieces inside, in order. each (m >= 2, D)
+        Pieces inside the rectangle, in their order, each (m >= 2, D).
+
+    Raises:
+        ValueError: If ``points`` is no polyline.
     """
     points = _check_polyline(points)
-    start, step = points[:-1], np.diff(points, axis=0)
-    moving = step.any(axis=-1)
-    start, step = start[moving], step[moving]
-    edges = np.array([x_range, y_range]).T[:, None]  # the lower ones, then the upper ones
+    step = np.diff(points, axis=0)
+    has_length = step.any(axis=-1)
+    start = points[:-1][has_length]
+    step = step[has_length]
+    edges = np.array([x_range, y_range]).T[:, None]  # lower edges, then upper edges
     with np.errstate(divide="ignore", invalid="ignore"):
         cuts = (edges - start[:, :2]) / step[:, :2]  # (2, n, 2), infinite if parallel to an edge
     along_edge = (step[:, :2] == 0) & np.isnan(cuts)
     cuts = np.where(along_edge, [[[-np.inf]], [[np.inf]]], cuts)
-    # where segments enter and leave the rectangle, in [0, 1]; enter > leave: missed
-    enter, leave = cuts.min(0).max(-1).clip(min=0), cuts.max(0).min(-1).clip(max=1)
+    # Shares in [0, 1] of a segment at which it enters and leaves; enter > leave if it misses.
+    enter = cuts.min(0).max(-1).clip(min=0)
+    leave = cuts.max(0).min(-1).clip(max=1)
     hits = np.flatnonzero(enter < leave)
     if not len(hits):
         return []
-    first, last = (start[hits] + at[hits, None] * step[hits] for at in (enter, leave))
-    joined = (np.diff(hits) == 1) & (leave[hits[:-1]] == 1.0) & (enter[hits[1:]] == 0.0)
-    breaks = np.flatnonzero(~joined) + 1
+    first = start[hits] + enter[hits, None] * step[hits]
+    last = start[hits] + leave[hits, None] * step[hits]
+    is_joined = (np.diff(hits) == 1) & (leave[hits[:-1]] == 1.0) & (enter[hits[1:]] == 0.0)
+    breaks = np.flatnonzero(~is_joined) + 1
     ends = [0, *breaks.tolist(), len(hits)]
     pieces = [np.concatenate([first[a : a + 1], last[a:b]]) for a, b in pairwise(ends)]
     runs_through = hits[0] == 0 and hits[-1] == len(start) - 1 and enter[0] == 0 and leave[-1] == 1

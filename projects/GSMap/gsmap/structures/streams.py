@@ -1,4 +1,4 @@
-"""What is kept of a stream of frames, and which frame may follow which."""
+"""Memory of streams of frames, and rules for the order of frames."""
 
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
@@ -14,13 +14,13 @@ from gsmap.utils.errors import InputError
 
 @dataclass(frozen=True)
 class Frame:
-    """A sample as its stream knows it.
+    """Sample of a stream.
 
     Args:
-        token: Its name.
-        scene: Name of its scene.
-        timestamp_ns: Its time in nanoseconds.
-        pose: From the annotation frame to the world. (4, 4)
+        token: Name of the sample.
+        scene: Name of the scene.
+        timestamp_ns: Time in nanoseconds.
+        pose: Transform from the annotation frame to the world in metres. (4, 4)
 
     Raises:
         ValueError: If the pose is no rigid motion.
@@ -42,35 +42,47 @@ class Frame:
 
     @classmethod
     def of(cls, meta: Mapping[str, Any]) -> "Frame":
-        """Read a sample's metainfo; ValueError if a field is missing, or the pose is none."""
-        missing = [k for k in ("scene", "timestamp_ns", "lidar2global") if meta.get(k) is None]
+        """Create a frame from the metainfo of a sample.
+
+        Args:
+            meta: Metainfo with ``scene``, ``timestamp_ns``, ``lidar2global`` and ``token``.
+
+        Raises:
+            ValueError: If a field is missing or the pose is no rigid motion.
+        """
+        fields = ("scene", "timestamp_ns", "lidar2global")
+        missing = [name for name in fields if meta.get(name) is None]
         if missing:
             raise InputError(
                 f"sample {meta.get('token')!r} has no {missing} in its metainfo, which a model "
                 "with memory needs: give each sample its scene, time and pose."
             )
-        pose = np.asarray(meta["lidar2global"], np.float64)
-        return cls(str(meta.get("token")), str(meta["scene"]), int(meta["timestamp_ns"]), pose)
+        return cls(
+            token=str(meta.get("token")),
+            scene=str(meta["scene"]),
+            timestamp_ns=int(meta["timestamp_ns"]),
+            pose=np.asarray(meta["lidar2global"], np.float64),
+        )
 
     def __str__(self) -> str:
         return f"{self.token!r} (scene {self.scene!r}, {self.timestamp_ns / 1e9:.3f} s)"
 
     def seconds_after(self, earlier: "Frame") -> float:
-        """Return the time since another frame."""
+        """Time since another frame in seconds."""
         return (self.timestamp_ns - earlier.timestamp_ns) / 1e9
 
     def motion_from(self, earlier: "Frame") -> NDArray[np.float64]:
-        """Return what takes metres of another frame to metres of this one. (4, 4)"""
+        """Transform from another frame to this one in metres. (4, 4)"""
         return invert_rigid(self.pose) @ earlier.pose
 
 
 @dataclass(frozen=True)
 class StreamState:
-    """The memory of one stream after a frame.
+    """Memory of one stream after a frame.
 
     Args:
-        frame: The frame.
-        values: What it leaves, by name: tensors without gradient, or arrays.
+        frame: Last frame of the stream.
+        values: Memory after the frame, by name: tensors without gradient, or arrays.
     """
 
     frame: Frame
@@ -78,10 +90,13 @@ class StreamState:
 
 
 class Slots:
-    """Streams by their place in the batch, for training.
+    """Streams by their index in the batch, for training.
 
-    A sampler hands each place consecutive samples. Where a sample does not follow the one before
-    (another scene, back in time, a gap), the place starts anew.
+    A sampler supplies each index with consecutive samples. A sample that does not follow the
+    previous one (another scene, an earlier time, a gap) starts a new stream.
+
+    Args:
+        max_gap_s: Longest time between two samples of a stream in seconds.
     """
 
     def __init__(self, max_gap_s: float) -> None:
@@ -89,41 +104,59 @@ class Slots:
         self.states: list[StreamState] = []
 
     def previous(self, frames: Sequence[Frame]) -> list[StreamState | None]:
-        """Return the state that each frame continues, or None."""
-        found: list[StreamState | None] = []
+        """Look up the states that frames continue.
+
+        Args:
+            frames: Frames of a batch.
+
+        Returns:
+            State of the stream of each frame; None for a frame that starts a stream.
+        """
+        states: list[StreamState | None] = []
         for index, frame in enumerate(frames):
             state = self.states[index] if index < len(self.states) else None
-            follows = state is not None and state.frame.scene == frame.scene
-            if state is None or not follows:
-                found.append(None)
-                continue
-            seconds = frame.seconds_after(state.frame)
-            found.append(state if 0 < seconds <= self.max_gap_s else None)
-        return found
+            if state is not None and not self._follows(frame, state):
+                state = None
+            states.append(state)
+        return states
+
+    def _follows(self, frame: Frame, state: StreamState) -> bool:
+        """Whether a frame continues a stream."""
+        if frame.scene != state.frame.scene:
+            return False
+        return 0 < frame.seconds_after(state.frame) <= self.max_gap_s
 
     def keep(self, states: Sequence[StreamState]) -> None:
-        """Keep what the frames leave."""
+        """Store the states after the frames of a batch."""
         self.states = list(states)
 
 
 class Scenes:
     """Streams by the name of their scene, for testing; frames of a scene must come in order.
 
-    A copy, or what is pickled, goes on from where it was, with a model of the same name.
+    Copies, also by pickle, continue with a model of equal name.
 
     Args:
-        max_gap_s: A longer pause, in seconds, starts a stream anew.
-        max_streams: Streams that are kept; the one that has waited longest goes first.
+        max_gap_s: Longest time between two frames of a stream in seconds.
+        max_streams: Largest number of streams; the stream that has waited longest is dropped.
     """
 
     def __init__(self, max_gap_s: float, max_streams: int = 16) -> None:
-        self.max_gap_s, self.max_streams = max_gap_s, max_streams
+        self.max_gap_s = max_gap_s
+        self.max_streams = max_streams
         self.states: OrderedDict[str, StreamState] = OrderedDict()
         self.owner: object = None
 
     def claim(self, owner: object) -> None:
-        """Belong to a model from its first frame on; ValueError, with both names, for another."""
-        if self.owner is None or self.owner == str(owner):  # a copy has the name alone
+        """Bind the streams to a model.
+
+        Args:
+            owner: Model.
+
+        Raises:
+            ValueError: If the streams are bound to another model.
+        """
+        if self.owner is None or self.owner == str(owner):  # a copy stores only the name
             self.owner = owner
         if self.owner is not owner:
             raise InputError(
@@ -132,16 +165,26 @@ class Scenes:
             )
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy has: of the model its name, not the weights."""
-        return {**vars(self), "owner": None if self.owner is None else str(self.owner)}
+        """Attributes of a copy, with the name of the model instead of the model."""
+        attributes = dict(vars(self))
+        if self.owner is not None:
+            attributes["owner"] = str(self.owner)
+        return attributes
 
     def previous(self, frames: Sequence[Frame]) -> list[StreamState | None]:
-        """Return the state that each frame continues, or None.
+        """Look up the states that frames continue.
+
+        Args:
+            frames: Frames of a batch.
+
+        Returns:
+            State of the stream of each frame; None for a frame that starts a stream.
 
         Raises:
-            ValueError: If a frame is not later than the one before it in its scene.
+            ValueError: If two frames are of one scene, or a frame is not later than the previous
+                frame of its scene.
         """
-        found: list[StreamState | None] = []
+        states: list[StreamState | None] = []
         batch: dict[str, Frame] = {}
         for frame in frames:
             if frame.scene in batch:
@@ -150,24 +193,25 @@ class Scenes:
                     "needs what the other leaves; set batch_size=1 or use StreamBatches."
                 )
             batch[frame.scene] = frame
-            found.append(self._followed(frame))
-        return found
+            states.append(self._previous_state(frame))
+        return states
 
-    def _followed(self, frame: Frame) -> StreamState | None:
+    def _previous_state(self, frame: Frame) -> StreamState | None:
+        """State that a frame continues, or None; ValueError if the frame is not later."""
         state = self.states.get(frame.scene)
         if state is None:
             return None
         seconds = frame.seconds_after(state.frame)
         if seconds <= 0:
-            what = "comes twice" if seconds == 0 else "comes too late"
+            fault = "comes twice" if seconds == 0 else "comes too late"
             raise InputError(
-                f"frame {frame} {what}: its stream is at {state.frame} already. Hand a stream its "
+                f"frame {frame} {fault}: its stream is at {state.frame} already. Hand a stream its "
                 "frames once each and in order, or start a new stream."
             )
         return state if seconds <= self.max_gap_s else None
 
     def keep(self, states: Sequence[StreamState]) -> None:
-        """Keep what the frames leave."""
+        """Store the states after the frames of a batch."""
         for state in states:
             self.states[state.frame.scene] = state
             self.states.move_to_end(state.frame.scene)
@@ -176,9 +220,10 @@ class Scenes:
 
 
 class MapStream(Scenes):
-    """One stream of a caller's own, of a single scene, with `MapInferencer`.
+    """Stream of a single scene for `MapInferencer`.
 
-    A frame of another scene, one that comes twice or too late is an error that names both frames.
+    Args:
+        max_gap_s: Longest time between two frames of the stream in seconds.
     """
 
     def __init__(self, max_gap_s: float = 2.0) -> None:
@@ -186,16 +231,26 @@ class MapStream(Scenes):
 
     @property
     def last(self) -> Frame | None:
-        """The frame that the stream has reached."""
+        """Last frame of the stream, or None before the first one."""
         return next((state.frame for state in self.states.values()), None)
 
     def previous(self, frames: Sequence[Frame]) -> list[StreamState | None]:
-        """Return the state that each frame continues; ValueError also for another scene."""
-        reached = self.last or next(iter(frames), None)
+        """Look up the states that frames continue.
+
+        Args:
+            frames: Frames of a batch.
+
+        Returns:
+            State of the stream of each frame; None for a frame that starts the stream.
+
+        Raises:
+            ValueError: If a frame is of another scene, or is not later than the previous frame.
+        """
+        last = self.last or next(iter(frames), None)
         for frame in frames:
-            if reached is not None and frame.scene != reached.scene:
+            if last is not None and frame.scene != last.scene:
                 raise InputError(
-                    f"frame {frame} is of another scene than {reached}, where the stream is: "
+                    f"frame {frame} is of another scene than {last}, where the stream is: "
                     "start a new stream for each scene."
                 )
         return super().previous(frames)

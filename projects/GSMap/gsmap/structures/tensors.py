@@ -1,4 +1,4 @@
-"""Small helpers of tensors that every room uses."""
+"""Helpers for tensors: constants, copies to a device, precision and shapes."""
 
 import functools
 import sys
@@ -11,121 +11,124 @@ from torch._subclasses import FakeTensor
 
 from gsmap.utils.errors import InputError
 
-_ALIGNMENT = 64  # bytes, more than any type or kernel wants
-_LARGE = 2**20  # bytes that a copy of its own is worth
-_MOST_CONSTANTS = 4096  # of a process; further ones are made anew each time
+_ALIGNMENT = 64  # bytes, at least the alignment that any type or kernel needs
+_LARGE = 2**20  # bytes from which a tensor is copied separately
+_MOST_CONSTANTS = 4096  # per process; further constants are not cached
 _constants: dict[Hashable, Tensor] = {}
 _Params = ParamSpec("_Params")
 _Result = TypeVar("_Result")
 
 
-def uncompiled(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
-    """Decorate a function that ``torch.compile`` must leave as it is.
+def exclude_from_compile(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
+    """Decorate a function that ``torch.compile`` must not compile.
 
-    It is ``torch.compiler.disable`` from the moment that the compiler is there: importing it takes
-    a second.
+    The decorator is ``torch.compiler.disable``, applied only once the compiler has been imported,
+    since importing it takes a second.
     """
-    # no cache of functools: the compiler warns of it
-    disabled: list[Callable[_Params, _Result]] = []
+    # A list instead of functools.cache, about which the compiler warns.
+    excluded: list[Callable[_Params, _Result]] = []
 
     @functools.wraps(function)
-    def wrapped(*args: _Params.args, **kwargs: _Params.kwargs) -> _Result:
+    def wrapper(*args: _Params.args, **kwargs: _Params.kwargs) -> _Result:
         if "torch._dynamo" not in sys.modules:
             return function(*args, **kwargs)
-        if not disabled:
-            disabled.append(torch.compiler.disable(function))
-        return disabled[0](*args, **kwargs)
+        if not excluded:
+            excluded.append(torch.compiler.disable(function))
+        return excluded[0](*args, **kwargs)
 
-    return wrapped
+    return wrapper
 
 
 def constant(like: Tensor, values: Any, dtype: torch.dtype | None = None) -> Tensor:
-    """Numbers as a tensor, uploaded once: ``like.new_tensor(values)`` waits for a GPU every time.
+    """Create a tensor of numbers that is uploaded once and cached.
+
+    ``like.new_tensor(values)`` waits for a GPU at every call.
 
     Args:
-        like: Tensor whose device, and whose type by default, the numbers get.
+        like: Tensor with the device, and by default the type, of the result.
         values: A number, or nested sequences of numbers.
-        dtype: Another type.
+        dtype: Type of the result; None for the type of ``like``.
 
     Returns:
-        The tensor, shared by all callers: it must not be written to.
+        Tensor, shared by all callers: it must not be written to.
     """
     dtype = dtype or like.dtype
     if _is_traced(like):
         return like.new_tensor(values, dtype=dtype)
     key = _hashable(values)
-    return kept(like, ("values", key, dtype), lambda: like.new_tensor(key, dtype=dtype))
+    return cached_constant(like, ("values", key, dtype), lambda: like.new_tensor(key, dtype=dtype))
 
 
-def kept(like: Tensor, key: Hashable, make: Callable[[], Tensor]) -> Tensor:
-    """A tensor that depends on nothing but its key, made at the first use on a device.
+def cached_constant(like: Tensor, key: Hashable, make: Callable[[], Tensor]) -> Tensor:
+    """Return a tensor that depends only on its key, computed at its first use on a device.
 
-    It stays for the life of the process, since a captured CUDA graph may read its memory. It is
-    none of a model's buffers, so it is neither copied nor saved with one.
+    The tensor is cached until the process ends, since a captured CUDA graph may read its memory. It
+    is not a buffer of a module, so it is neither copied nor saved with one.
 
     Args:
-        like: Tensor whose device the result gets.
-        key: Name and all settings that the values depend on, their type included.
-        make: Computes the values on that device.
+        like: Tensor with the device of the result.
+        key: Name of the constant and all settings on which its values depend, including their type.
+        make: Function that computes the values on the device.
 
     Returns:
-        The tensor, shared by all callers: it must not be written to.
+        Tensor, shared by all callers: it must not be written to.
     """
     if _is_traced(like):
         return make()
-    place = (like.device, key)
-    found = _constants.get(place)
-    if found is None:
-        with torch.inference_mode(False), torch.no_grad():  # a training may follow
-            found = make()
+    entry = (like.device, key)
+    values = _constants.get(entry)
+    if values is None:
+        with torch.inference_mode(False), torch.no_grad():  # also usable in a later training
+            values = make()
         capturing = like.is_cuda and torch.cuda.is_current_stream_capturing()
         if not capturing and len(_constants) < _MOST_CONSTANTS:
-            _constants[place] = found
-    return found
+            _constants[entry] = values
+    return values
 
 
-def uploaded(tensors: Sequence[Tensor], device: torch.device) -> list[Tensor]:
-    """Copy tensors from the host to a device, without a wait for what the device has to do.
+def upload(tensors: Sequence[Tensor], device: torch.device) -> list[Tensor]:
+    """Copy tensors from the host to a device without waiting for pending work of the device.
 
-    Small ones go as one block of memory, of which the results are views.
+    Small tensors are copied as one block of memory, and the results are views of the block.
 
     Args:
-        tensors: Of any shapes and types.
-        device: Where they go; on the host, tensors stay as they are.
+        tensors: Tensors of any shapes and types.
+        device: Device of the copies. If it is the host, tensors are returned as they are.
 
     Returns:
-        The tensors there, contiguous.
+        Contiguous tensors on the device.
     """
     if device.type == "cpu":
         return [tensor.to(device) for tensor in tensors]
     pinned = device.type == "cuda"
-    found: list[Tensor] = []
-    places = []  # of small tensors: number, first byte, bytes
+    copies: list[Tensor] = []
+    ranges: dict[int, slice] = {}  # bytes of the block that a small tensor takes
     end = 0
-    for number, tensor in enumerate(tensors):
+    for index, tensor in enumerate(tensors):
         size = tensor.numel() * tensor.element_size()
-        small = tensor.device.type == "cpu" and 0 < size < _LARGE
-        if small:
-            places.append((number, end, size))
+        if tensor.device.type == "cpu" and 0 < size < _LARGE:
+            ranges[index] = slice(end, end + size)
             end += -(-size // _ALIGNMENT) * _ALIGNMENT
-        source = tensor.pin_memory() if pinned and size and not small else tensor
-        found.append(tensor if small else source.to(device, non_blocking=True).contiguous())
+            copies.append(tensor)  # replaced by a view of the block
+            continue
+        source = tensor.pin_memory() if pinned and size else tensor
+        copies.append(source.to(device, non_blocking=True).contiguous())
     block = torch.empty(end, dtype=torch.uint8, pin_memory=pinned)
-    for number, start, size in places:
-        part = block[start : start + size].view(tensors[number].dtype)
-        part.view(tensors[number].shape).copy_(tensors[number])
+    for index, place in ranges.items():
+        part = block[place].view(tensors[index].dtype)
+        part.view(tensors[index].shape).copy_(tensors[index])
     block = block.to(device, non_blocking=True)
-    for number, start, size in places:
-        part = block[start : start + size].view(tensors[number].dtype)
-        found[number] = part.view(tensors[number].shape)
-    return found
+    for index, place in ranges.items():
+        part = block[place].view(tensors[index].dtype)
+        copies[index] = part.view(tensors[index].shape)
+    return copies
 
 
 class LateValues:
-    """Values on their way from a device to the host, which nothing waits for until they are read.
+    """Copy of a tensor on the host that is awaited only when it is read.
 
     Args:
-        values: Of any shape.
+        values: Tensor of any shape on any device.
     """
 
     def __init__(self, values: Tensor) -> None:
@@ -136,35 +139,43 @@ class LateValues:
             self._arrival.record(torch.cuda.current_stream(values.device))
 
     def read(self) -> Tensor:
-        """Return the values, on the host."""
+        """Wait for the copy and return the values on the host."""
         if self._arrival is not None:
             self._arrival.synchronize()
         return self._host
 
 
 def _is_traced(like: Tensor) -> bool:
-    """Return whether a compiler or exporter records the operations on a tensor."""
+    """Whether a compiler or exporter records the operations on a tensor."""
     return torch.compiler.is_compiling() or torch.jit.is_tracing() or isinstance(like, FakeTensor)
 
 
 def _hashable(values: Any) -> Any:
-    """Return nested sequences of numbers, or an array, as tuples."""
-    values = values.tolist() if hasattr(values, "tolist") else values
+    """Convert nested sequences of numbers, or an array, to tuples."""
+    if hasattr(values, "tolist"):
+        values = values.tolist()
     if isinstance(values, Sequence):
         return tuple(_hashable(value) for value in values)
     return values
 
 
 def at_least_float32(values: Tensor) -> Tensor:
-    """Return half-precision values in float32, others as they are: coordinates need the digits."""
+    """Convert half-precision values, too coarse for coordinates, to float32; keep other types."""
     return values.to(torch.promote_types(values.dtype, torch.float32))
 
 
 def in_float32(layer: nn.Module, values: Tensor) -> Tensor:
     """Apply a layer outside of autocast and return its values in float32 or more.
 
-    Neighbouring points differ in digits that half precision lacks: where they fall onto each other
-    the direction of the edge between them, and the gradient of a loss of it, is noise.
+    Half precision has too few digits for neighbouring points. Where two points coincide, the
+    direction of the edge between them, and the gradient of a loss on it, are noise.
+
+    Args:
+        layer: Layer with one input and one output.
+        values: Input of the layer.
+
+    Returns:
+        Output of the layer, at least float32.
     """
     if not torch.is_autocast_enabled(values.device.type):
         return at_least_float32(layer(values))
@@ -173,16 +184,24 @@ def in_float32(layer: nn.Module, values: Tensor) -> Tensor:
 
 
 def check_same_shape(**both: Tensor) -> None:
-    """Raise ValueError if two tensors differ in shape; their names are those in the message."""
-    (of, first), (name, second) = both.items()
+    """Raise ValueError if two tensors, given by their names in the message, differ in shape."""
+    (first_name, first), (name, second) = both.items()
     if first.shape != second.shape:
         raise InputError(
-            f"{name} must have shape {tuple(first.shape)} of {of}, got {tuple(second.shape)}."
+            f"{name} must have shape {tuple(first.shape)} of {first_name}, got "
+            f"{tuple(second.shape)}."
         )
 
 
 def num_depth_bins(depth_range: tuple[float, float, float]) -> int:
-    """Return the number of bins of ``(low, high, step)``; ValueError if there is none."""
+    """Count the depth bins of a range.
+
+    Args:
+        depth_range: Smallest depth, largest depth and size of a bin, in metres.
+
+    Raises:
+        ValueError: If the range has no bin.
+    """
     low, high, step = depth_range
     if step <= 0 or high - low < step:
         raise InputError(
@@ -192,6 +211,6 @@ def num_depth_bins(depth_range: tuple[float, float, float]) -> int:
 
 
 def tensor_versions(module: nn.Module) -> list[tuple[int, int]]:
-    """Return address and version of a module's tensors, which change with every weight."""
+    """Address and version of each tensor of a module, which change with its values."""
     tensors = [*module.parameters(), *module.buffers()]
     return [(t.data_ptr(), 0 if t.is_inference() else t._version) for t in tensors]

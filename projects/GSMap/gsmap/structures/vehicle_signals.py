@@ -1,4 +1,4 @@
-"""A vehicle's motion as 18 numbers in MapTR's layout (``can_bus``)."""
+"""Motion of a vehicle as 18 numbers in MapTR's layout (``can_bus``)."""
 
 from typing import Any
 
@@ -9,29 +9,39 @@ from pyquaternion import Quaternion
 from gsmap.structures.calibration import NUM_CAN_BUS
 
 Pose = tuple[float, NDArray[np.floating[Any]]]
-"""A time in seconds, and the transform from the vehicle to the world then. (4, 4)"""
-_GRAVITY = np.array([0.0, 0.0, 9.81])  # an accelerometer feels it
+"""Time in seconds, and transform from the vehicle to the world at that time in metres (4, 4)."""
+_GRAVITY = np.array([0.0, 0.0, 9.81])  # measured by an accelerometer at rest
 
 
 def pose_signals(global_from_ego: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-    """Return the signals that a vehicle's pose tells, the others zero. (4, 4) -> (18,).
+    """Compute the signals that follow from the pose of a vehicle; the others are zero.
 
-    Entries: position (3), orientation (w, x, y, z), acceleration (3), rotation rate (3), velocity
-    (3), yaw in radians, yaw in degrees in [0, 360).
+    Args:
+        global_from_ego: Transform from the vehicle to the world in metres. (4, 4)
+
+    Returns:
+        Position (3) in metres, orientation (w, x, y, z), acceleration (3) in m/s^2, rotation rate
+        (3) in rad/s, velocity (3) in m/s, yaw in radians, yaw in degrees in [0, 360). (18,)
     """
     values = np.zeros(NUM_CAN_BUS)
     values[:3] = global_from_ego[:3, 3]
     values[3:7] = Quaternion(matrix=global_from_ego, atol=1e-6, rtol=1e-6).elements
     yaw_deg = np.degrees(np.arctan2(global_from_ego[1, 0], global_from_ego[0, 0])) % 360.0
-    values[16:] = np.radians(yaw_deg), yaw_deg
+    values[16] = np.radians(yaw_deg)
+    values[17] = yaw_deg
     return values
 
 
 def pose_only_signals(global_from_ego: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-    """Return the signals that MapTR's code for Argoverse 2 makes of a pose. (4, 4) -> (18,).
+    """Compute signals from a pose like MapTR's code for Argoverse 2.
 
-    They are those of `pose_signals`, but with ones for acceleration, rotation rate and velocity,
-    which are not known there.
+    Acceleration, rotation rate and velocity, which are not recorded there, are one.
+
+    Args:
+        global_from_ego: Transform from the vehicle to the world in metres. (4, 4)
+
+    Returns:
+        Signals in the layout of `pose_signals`. (18,)
     """
     values = pose_signals(global_from_ego)
     values[7:16] = 1.0
@@ -41,22 +51,29 @@ def pose_only_signals(global_from_ego: NDArray[np.floating[Any]]) -> NDArray[np.
 def motion_signals(
     now: Pose, before: Pose | None = None, after: Pose | None = None
 ) -> NDArray[np.float64]:
-    """Return the signals that poses tell: `pose_signals`, and the rates by differences. (18,)
+    """Compute signals from poses: `pose_signals`, and rates from differences of the poses.
 
     Args:
-        now: The pose at the time of the signals.
-        before: An earlier pose of the drive, or None.
-        after: A later one, or None.
+        now: Pose at the time of the signals.
+        before: Earlier pose of the drive, or None.
+        after: Later pose of the drive, or None.
+
+    Returns:
+        Signals in the layout of `pose_signals`. (18,)
     """
-    (time, pose), (start, first), (end, last) = now, before or now, after or now
-    values, to_ego = pose_signals(pose), pose[:3, :3].T
+    time, pose = now
+    start, first = before or now
+    end, last = after or now
+    values = pose_signals(pose)
+    ego_from_global = pose[:3, :3].T
     acceleration = _GRAVITY
     if end > start:
         turn = Quaternion(matrix=first[:3, :3].T @ last[:3, :3], atol=1e-6, rtol=1e-6)
         values[10:13] = turn.axis * turn.radians / (end - start)
-        values[13:16] = to_ego @ (last - first)[:3, 3] / (end - start)
+        values[13:16] = ego_from_global @ (last - first)[:3, 3] / (end - start)
     if end > time > start:
-        speeds = (pose - first)[:3, 3] / (time - start), (last - pose)[:3, 3] / (end - time)
-        acceleration = _GRAVITY + 2 * (speeds[1] - speeds[0]) / (end - start)
-    values[7:10] = to_ego @ acceleration
+        velocity_before = (pose - first)[:3, 3] / (time - start)
+        velocity_after = (last - pose)[:3, 3] / (end - time)
+        acceleration = _GRAVITY + 2 * (velocity_after - velocity_before) / (end - start)
+    values[7:10] = ego_from_global @ acceleration
     return values

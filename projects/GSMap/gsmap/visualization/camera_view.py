@@ -111,7 +111,7 @@ def _draw_areas(
 ) -> None:
     """Fill the closed elements faintly."""
     closed = elements.select(np.array([style.is_closed(label) for label in elements.labels]))
-    rings = (view.lifted(line) for line in closed.polylines)
+    rings = (view.lift(line) for line in closed.polylines)
     shapes = [project_polygon(ring, camera.img_from_frame, camera.size_px) for ring in rings]
     faces = mcolors.to_rgba_array(style.colours(closed.labels), 0.25)
     ax.add_collection(PolyCollection(shapes, facecolors=faces, edgecolors="none", zorder=3))
@@ -121,7 +121,7 @@ def _draw_polylines(
     ax: Axes, elements: MapElements, camera: CameraView, view: FrameView, style: MapStyle
 ) -> None:
     """Draw the polylines, thinner with distance within what stays legible, on a dark edge."""
-    dense = [subdivided(view.lifted(line), _STEP_M) for line in elements.polylines]
+    dense = [subdivided(view.lift(line), _STEP_M) for line in elements.polylines]
     starts = np.concatenate([line[:-1] for line in dense])
     ends = np.concatenate([line[1:] for line in dense])
     owner = np.repeat(elements.labels, [len(line) - 1 for line in dense])

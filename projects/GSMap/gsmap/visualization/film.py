@@ -125,7 +125,7 @@ def _pictures(
             camera_views(sample.cameras, root, sample.token) if root is not None else [],
             [*panels, BEVPanel("Ground truth", truth)],
             BEVGrid(meta.x_range, meta.y_range),
-            frame_view(meta.frame, meta.ground_z_m).tilted(sample.ego_from_frame),
+            frame_view(meta.frame, meta.ground_z_m).with_mounting(sample.ego_from_frame),
             style,
             panels[0].elements,
             f"{sample.scene}, {seconds:.1f} s",

@@ -138,7 +138,7 @@ class MapVisualizer(Visualizer):
         view = frame_view(frame, (self.dataset_meta or {}).get("ground_z_m"))
         if self.ground_z_m is not None:
             return replace(view, ground=(0.0, 0.0, self.ground_z_m))
-        return view.tilted(metainfo.get("lidar2ego"))
+        return view.with_mounting(metainfo.get("lidar2ego"))
 
     def cameras(
         self, metainfo: dict, images: Sequence[np.ndarray] | None = None

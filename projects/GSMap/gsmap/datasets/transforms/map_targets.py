@@ -11,7 +11,7 @@ from mmdet3d.registry import TRANSFORMS
 from mmengine.structures import InstanceData
 
 from gsmap.datasets.annotations.record import MapInstance
-from gsmap.structures.elements import annotated
+from gsmap.structures.elements import ground_truth_elements
 from gsmap.structures.polylines import (
     PADDING,
     bounding_boxes,
@@ -118,7 +118,7 @@ class FormatMapTargets(BaseTransform):
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Add the targets; ValueError if the sample has no ground truth."""
-        elements = annotated(results, self)
+        elements = ground_truth_elements(results, self)
         # seeded from the generator that mmengine seeds in each worker
         rng = np.random.default_rng(np.random.randint(2**31))  # noqa: NPY002
         results["gt_instances_3d"] = map_targets(

@@ -14,7 +14,7 @@ from mmengine.logging import print_log
 from torch.utils.data import get_worker_info
 
 from gsmap.datasets.annotations.record import MapInstance
-from gsmap.structures.elements import annotated
+from gsmap.structures.elements import ground_truth_elements
 from gsmap.structures.grid import padded_size
 from gsmap.structures.polylines import resample
 from gsmap.utils.errors import InputError
@@ -58,7 +58,7 @@ class MakeBEVMask(BaseTransform):
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Draw the mask; ValueError if the sample has no ground truth."""
         masks = np.zeros((self.num_classes or 1, *self.size), np.uint8)
-        for instance in annotated(results, self):
+        for instance in ground_truth_elements(results, self):
             pixels = cells_of(instance, results, self.size)
             channel = channel_of(instance, self.num_classes)
             cv2.polylines(masks[channel], [pixels], False, (1,), self.thickness_px)
@@ -95,7 +95,7 @@ class MakeInstanceMasks(BaseTransform):
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Draw the masks; ValueError if the sample has no ground truth, or no targets yet."""
-        instances = annotated(results, self)
+        instances = ground_truth_elements(results, self)
         if "gt_instances_3d" not in results:
             raise InputError(
                 f"sample {results['token']!r} has no targets yet: put MakeInstanceMasks behind "
@@ -155,7 +155,7 @@ class MakePVMask(BaseTransform):
 
     def _elements(self, results: dict[str, Any]) -> Iterator[tuple[MapInstance, np.ndarray]]:
         """Yield each element with the points that are drawn, (n, 2) or (n, 3)."""
-        elements = annotated(results, self)
+        elements = ground_truth_elements(results, self)
         heights = results.get("map_heights") if self.heights else None
         if self.heights and heights is None and any(e.points.shape[1] == 2 for e in elements):
             _say_flat(self.ground_z_m)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsmap.models.base.pairs import BuiltHead, GroundTruth, MapMatches, Predictions, SampleView
 from gsmap.models.base.parts import WEIGHT
-from gsmap.structures.tensors import uploaded
+from gsmap.structures.tensors import upload
 from gsmap.utils.errors import InputError, NotFiniteError
 
 
@@ -121,7 +121,7 @@ class MapAssigner:
             matches.append(torch.stack([sample, query, query + first_query, gt, row]))
         counts = [query.shape[1] for query, _ in pairs]
         on_host = torch.cat(matches, 2)  # (5, L, M)
-        (packed,) = uploaded([on_host], predictions.scores.device)
+        (packed,) = upload([on_host], predictions.scores.device)
         samples, queries, joined, gts, rows = packed.unbind(0)
         orders = truths.pts_shifts[rows]  # (L, M, S, P, 2 or 3)
         pts = predictions.pts[samples, joined]

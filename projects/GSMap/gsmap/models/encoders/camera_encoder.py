@@ -9,10 +9,10 @@ from mmengine.model import BaseModule
 from torch import Tensor
 
 from gsmap.structures.calibration import calibration_arrays
-from gsmap.structures.tensors import uncompiled, uploaded
+from gsmap.structures.tensors import exclude_from_compile, upload
 
 
-@uncompiled  # numpy's float64 is not for compilers
+@exclude_from_compile  # numpy's float64 is not for compilers
 def stack_calibration(
     img_metas: Sequence[dict[str, Any]], names: Sequence[str], device: torch.device
 ) -> dict[str, Tensor]:
@@ -31,7 +31,7 @@ def stack_calibration(
     for name in names:
         stack = np.stack([sample_arrays[name] for sample_arrays in arrays])
         stacks.append(torch.from_numpy(stack))
-    return dict(zip(names, uploaded(stacks, device), strict=True))
+    return dict(zip(names, upload(stacks, device), strict=True))
 
 
 class CameraEncoder(BaseModule):

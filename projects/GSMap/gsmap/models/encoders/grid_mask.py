@@ -4,7 +4,7 @@ import torch
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
-from gsmap.structures.tensors import uploaded
+from gsmap.structures.tensors import upload
 from gsmap.utils.errors import InputError
 
 
@@ -31,7 +31,7 @@ class GridMask(nn.Module):
         """Mask the images with probability ``prob``. (V, 3, H, W) -> (V, 3, H, W)"""
         if torch.rand(()) >= self.prob:
             return images
-        (mask,) = uploaded([self.draw_mask(*images.shape[-2:])], images.device)
+        (mask,) = upload([self.draw_mask(*images.shape[-2:])], images.device)
         return images * mask.to(images.dtype)
 
     def draw_mask(self, height: int, width: int) -> Tensor:

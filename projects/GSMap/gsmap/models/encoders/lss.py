@@ -54,7 +54,7 @@ class LSSEncoder(CameraEncoder):
     ) -> None:
         super().__init__(init_cfg)
         self.grid = grid.rasterized(bev_pixel_m)
-        self.cells = self.grid.resized(2 * self.grid.height, 2 * self.grid.width)
+        self.cells = self.grid.with_size(2 * self.grid.height, 2 * self.grid.width)
         self.z_range = (float(z_range[0]), float(z_range[1]))
         low, high, step = depth_range
         self.depth_range = (float(low), float(high), float(step))

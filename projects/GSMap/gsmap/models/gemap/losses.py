@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsmap.models.base.losses import MapLoss
 from gsmap.models.base.pairs import MatchedPairs
-from gsmap.structures.tensors import check_same_shape, uploaded
+from gsmap.structures.tensors import check_same_shape, upload
 from gsmap.utils.errors import InputError
 
 NORM_EPS = 1e-6  # added to the product of two lengths: an edge may be a single point
@@ -101,7 +101,7 @@ def euclidean_relation_loss(pred: Tensor, target: Tensor, counts: Sequence[int])
         shares += [1 / max(count, 1) ** 2] * pairs[-1].shape[1]
         first += count
     on_host = [torch.cat(pairs, 1), torch.tensor(shares, dtype=pred.dtype)]
-    pair_indices, pair_weights = uploaded(on_host, pred.device)
+    pair_indices, pair_weights = upload(on_host, pred.device)
     pred_relations = relation_features(pred, pair_indices)
     target_relations = relation_features(target, pair_indices)
     distances = (pred_relations - target_relations).abs()  # (3, ..., R, P, P)

@@ -69,5 +69,5 @@ class GaussianGuidance(Guidance, AddsWeights):
         if not self.sampling:
             return None
         finest = feats if isinstance(feats, Tensor) else feats[0]  # of levels
-        cell_m = self.space.grid.resized(*finest.shape[-2:]).pixel_size_m
+        cell_m = self.space.grid.with_size(*finest.shape[-2:]).pixel_size_m
         return self.space.frames(reference, self.invariant, cell_m)

@@ -18,7 +18,7 @@ from gsmap.models.gsmap.reference import GaussianReference
 from gsmap.models.gsmap.statistics import gaussian_statistics
 from gsmap.models.maptr.cost import OrderedPointsCost
 from gsmap.models.maptr.losses import PointsLoss
-from gsmap.structures.gaussians import Gaussians, stretched
+from gsmap.structures.gaussians import Gaussians, stretch_along_line
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import constant
 from gsmap.utils.errors import InputError
@@ -102,7 +102,7 @@ class GSMapHead(MapHead):
             return found
         factors = constant(found["scales"], self.temperatures)[best.labels][:, None]  # (M, 1, 2)
         means, scales, rotations = found["pts"][..., :2], found["scales"], found["rotations"]
-        _, scales, rotations = stretched(Gaussians(means, scales, rotations), factors)
+        _, scales, rotations = stretch_along_line(Gaussians(means, scales, rotations), factors)
         return {**found, "scales": scales, "rotations": rotations}
 
     def statistics(self, pairs: MatchedPairs) -> dict[str, Tensor]:

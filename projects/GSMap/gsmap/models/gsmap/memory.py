@@ -13,7 +13,7 @@ from torch import Tensor
 from gsmap.models.base.hooks import FlowHead
 from gsmap.models.gsmap.reference import require_gaussians
 from gsmap.models.streams.query_memory import QueryMemory
-from gsmap.structures.gaussians import fused_gaussians, moved_gaussians
+from gsmap.structures.gaussians import fuse_gaussians, move_gaussians
 from gsmap.structures.past import Past
 from gsmap.utils.errors import InputError
 
@@ -28,7 +28,7 @@ class GaussianMemory(QueryMemory):
         covariance: What becomes of the Gaussians that are handed on. ``"points"``: only their
             centres are, each starts with the Gaussian of a new query. ``"moved"``: they move and
             turn with the vehicle, and grow by the noise. ``"fused"``: so, and what the decoder has
-            refined is fused with them (`fused_gaussians`), point by point, in their order.
+            refined is fused with them (`fuse_gaussians`), point by point, in their order.
         noise_m: How far a remembered Gaussian has drifted after one second, standard deviation in
             metres; the variance grows with the time.
         noise_deg: The same for the vehicle's heading, in degrees.
@@ -66,7 +66,7 @@ class GaussianMemory(QueryMemory):
         space = require_gaussians(self, head).space
         spread = past.seconds.sqrt()
         with torch.autocast(points.device.type, enabled=False):
-            gaussians = moved_gaussians(
+            gaussians = move_gaussians(
                 space.decode(references),
                 past.now_from_then,
                 self.noise_m * spread,
@@ -80,7 +80,7 @@ class GaussianMemory(QueryMemory):
             return refined
         space = require_gaussians(self, head).space
         with torch.autocast(refined.device.type, enabled=False):
-            gaussians = fused_gaussians(space.decode(before), space.decode(refined))
+            gaussians = fuse_gaussians(space.decode(before), space.decode(refined))
             fused = space.encode(gaussians, refined)
         # a centre that left the map was put onto its border, where the element need not be
         inside = (before[..., :2] - 0.5).abs().amax(-1, keepdim=True) < 0.5

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from gsmap.ops.soft_iou import soft_iou
 from gsmap.structures.gaussians import AT_FLOOR, Gaussians, extents_along_line
-from gsmap.structures.tensors import uploaded
+from gsmap.structures.tensors import upload
 
 
 @torch.no_grad()
@@ -37,7 +37,7 @@ def gaussian_statistics(
     if not len(labels):
         return {}
     counts = labels.bincount(minlength=len(class_names)).tolist()
-    (order,) = uploaded([labels.argsort(stable=True)], rendered.device)
+    (order,) = upload([labels.argsort(stable=True)], rendered.device)
     iou = soft_iou(rendered, masks)[order].split(counts)
     extents = extents_along_line(gaussians)[order].split(counts)  # (n, P, 2) of each class
     figures = {}

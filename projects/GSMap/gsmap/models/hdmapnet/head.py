@@ -18,7 +18,7 @@ from gsmap.models.hdmapnet.layout import forward_size, metres_from_pixels, orien
 from gsmap.models.hdmapnet.losses import LineMapLosses
 from gsmap.models.hdmapnet.vectorizing import VectorizeConfig, vectorize
 from gsmap.structures.grid import BEVGrid
-from gsmap.structures.polylines import padded
+from gsmap.structures.polylines import pad_lines
 from gsmap.utils.errors import InputError
 
 
@@ -188,7 +188,7 @@ class HDMapNetHead(DetectionHead):
         )
         lines = [line for line in traced_lines if len(line.pixels) > 1]
         lines.sort(key=lambda line: -line.score)
-        pts = padded([metres_from_pixels(line.pixels + 0.5, self.grid) for line in lines])
+        pts = pad_lines([metres_from_pixels(line.pixels + 0.5, self.grid) for line in lines])
         instances = InstanceData(
             scores_3d=torch.tensor([line.score for line in lines]),
             labels_3d=torch.tensor([line.label for line in lines], dtype=torch.long),

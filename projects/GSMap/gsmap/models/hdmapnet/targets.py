@@ -12,9 +12,9 @@ from mmdet3d.registry import TRANSFORMS
 from numpy.typing import NDArray
 
 from gsmap.models.hdmapnet.layout import forward_size, pixels_from_metres
-from gsmap.structures.elements import annotated
+from gsmap.structures.elements import ground_truth_elements
 from gsmap.structures.grid import BEVGrid
-from gsmap.structures.polylines import parts_inside, sampled
+from gsmap.structures.polylines import parts_inside, points_at_steps
 from gsmap.utils.errors import InputError
 from gsmap.utils.settings import check_positive
 
@@ -63,7 +63,7 @@ class MakeLineMaps(BaseTransform):
         Raises:
             ValueError: If the sample has no ground truth, or an element of an unknown class.
         """
-        elements = annotated(results, self)
+        elements = ground_truth_elements(results, self)
         grid = BEVGrid(results["x_range"], results["y_range"], forward=self.forward)
         numbers, directions = self.draw(elements, grid.rasterized(self.pixel_m))
         results["gt_lines"] = torch.from_numpy(numbers)
@@ -132,6 +132,6 @@ class MakeLineMaps(BaseTransform):
                     "MakeLineMaps."
                 )
             # As in the released code, sampling drops the end of a line, and lines below one step.
-            points = sampled(element.points[:, :2].astype(np.float64), self.step_m)
+            points = points_at_steps(element.points[:, :2].astype(np.float64), self.step_m)
             for part in parts_inside(points, grid.x_range, y_range=grid.y_range):
                 yield element.label, pixels_from_metres(part, grid).astype(np.int32)

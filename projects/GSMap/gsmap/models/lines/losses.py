@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gsmap.structures.tensors import constant, uploaded
+from gsmap.structures.tensors import constant, upload
 
 LINE = 0  # index of the logit of a line; the other logit is that of no line
 
@@ -153,7 +153,7 @@ class LineLosses:
 def _uploaded_tuples(tuples: Sequence[Any], device: torch.device) -> list[Any]:
     """Copy NamedTuples of tensors to a device at once."""
     tensors = [tensor for fields in tuples for tensor in fields]
-    on_device = uploaded(tensors, device)
+    on_device = upload(tensors, device)
     result = []
     for fields in tuples:
         result.append(fields._make(on_device[: len(fields)]))

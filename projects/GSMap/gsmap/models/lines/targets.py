@@ -12,9 +12,9 @@ from mmengine.structures import InstanceData
 from numpy.typing import NDArray
 
 from gsmap.models.lines.front import front_size
-from gsmap.structures.elements import annotated
+from gsmap.structures.elements import ground_truth_elements
 from gsmap.structures.grid import BEVGrid
-from gsmap.structures.polylines import is_closed, padded, parts_inside, sampled
+from gsmap.structures.polylines import is_closed, pad_lines, parts_inside, points_at_steps
 from gsmap.utils.errors import InputError
 from gsmap.utils.settings import check_positive
 
@@ -147,7 +147,7 @@ class FormatLineTargets(BaseTransform):
         masks, redrawn = self.masks(parts, pivots=ways, size=front_size(grid))
         results["gt_instances_3d"] = InstanceData(
             labels_3d=torch.tensor(labels, dtype=torch.int64),
-            pts=torch.from_numpy(padded(points_m, self.most())).float(),
+            pts=torch.from_numpy(pad_lines(points_m, self.most())).float(),
             num_pts=torch.tensor([len(key_points) for key_points in points], dtype=torch.int64),
             masks=torch.from_numpy(masks),
             redrawn=torch.from_numpy(redrawn),
@@ -160,7 +160,7 @@ class FormatLineTargets(BaseTransform):
         Raises:
             ValueError: If there is no ground truth.
         """
-        elements = sorted(annotated(results, self), key=lambda element: element.label)
+        elements = sorted(ground_truth_elements(results, self), key=lambda element: element.label)
         grid = BEVGrid(results["x_range"], results["y_range"]).rasterized(self.pixel_m)
         parts = []
         for element in elements:
@@ -187,7 +187,7 @@ class FormatLineTargets(BaseTransform):
             lines = [whole[i : i + 2] for i in longest]
         parts = []
         for line in lines:
-            samples = sampled(line, self.step_m)
+            samples = points_at_steps(line, self.step_m)
             if self.sort_rings and is_closed(line):
                 samples = np.concatenate([samples, line[:1]])
             parts += parts_inside(samples, grid.x_range, grid.y_range)

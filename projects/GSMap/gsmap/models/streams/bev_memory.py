@@ -86,7 +86,7 @@ class BEVMemory(nn.Module, AddsWeights):
             Points in metres, float64. (H, W, 2)
         """
         if not self.end_points:
-            return self.grid.resized(height, width).pixel_centres(dtype=torch.float64)
+            return self.grid.with_size(height, width).pixel_centres(dtype=torch.float64)
         low_x, high_x = self.grid.x_range
         low_y, high_y = self.grid.y_range
         x = torch.linspace(low_x, high_x, width, dtype=torch.float64)

@@ -10,8 +10,8 @@ from mmengine.structures import InstanceData
 from torch import Tensor
 
 from gsmap.models.base.head import MapHead
-from gsmap.structures.gaussians import Gaussians, moved_gaussians
-from gsmap.structures.line_update import seen_again
+from gsmap.structures.gaussians import Gaussians, move_gaussians
+from gsmap.structures.line_update import update_from_known_lines
 from gsmap.structures.past import Past
 from gsmap.utils.errors import InputError
 
@@ -20,7 +20,7 @@ PREFIX = "element_"
 
 @MODELS.register_module()
 class ElementMemory:
-    """Update of detections by the elements of the previous frame (`seen_again`).
+    """Update of detections by the elements of the previous frame (`update_from_known_lines`).
 
     The previous elements are transformed by the ego motion, and their covariances grow by its
     noise. There are no weights and there is no training, so any trained model with Gaussians can
@@ -81,7 +81,7 @@ class ElementMemory:
             rotations=past.memory[f"{PREFIX}rotations"],
         )
         spread = past.seconds.sqrt()
-        previous = moved_gaussians(
+        previous = move_gaussians(
             remembered, past.now_from_then, self.noise_m * spread, self.noise_rad * spread
         )
         updated = []
@@ -101,7 +101,7 @@ class ElementMemory:
         exists = labels >= 0
         is_confident = detections.scores_3d >= self.min_score
         gaussians = detected_gaussians(detections)
-        new = seen_again(
+        new = update_from_known_lines(
             _select(gaussians, is_confident),
             detections.labels_3d[is_confident],
             _select(previous, exists),

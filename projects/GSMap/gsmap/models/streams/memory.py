@@ -19,7 +19,7 @@ from gsmap.models.streams.element_memory import PREFIX, ElementMemory
 from gsmap.models.streams.query_memory import Propagation, QueryMemory
 from gsmap.structures.past import Past
 from gsmap.structures.streams import Frame, MapStream, Scenes, Slots, StreamState
-from gsmap.structures.tensors import uploaded
+from gsmap.structures.tensors import upload
 from gsmap.utils.errors import InputError
 
 # Prefixes of names that keep single precision: half precision would move points by centimetres.
@@ -235,7 +235,7 @@ def stack_past(
     for frame, state in zip(frames, states, strict=True):
         motions.append(np.eye(4) if state is None else frame.motion_from(state.frame))
         seconds.append(0.0 if state is None else frame.seconds_after(state.frame))
-    now_from_then, elapsed, continues = uploaded(
+    now_from_then, elapsed, continues = upload(
         [
             torch.from_numpy(np.stack(motions)),
             torch.tensor(seconds, dtype=torch.float64),

@@ -13,9 +13,9 @@ from mmengine.structures import InstanceData
 from numpy.typing import NDArray
 
 from gsmap.models.vectormapnet.canvas import Canvas, tokenize_points
-from gsmap.structures.elements import annotated
+from gsmap.structures.elements import ground_truth_elements
 from gsmap.structures.grid import BEVGrid, padded_size
-from gsmap.structures.polylines import padded
+from gsmap.structures.polylines import pad_lines
 from gsmap.utils.errors import InputError
 
 Floats = NDArray[np.float64]
@@ -103,7 +103,7 @@ class FormatPolylineTargets(BaseTransform):
         Raises:
             ValueError: If the sample has no ground truth.
         """
-        elements = annotated(results, self)
+        elements = ground_truth_elements(results, self)
         grid = BEVGrid(results["x_range"], results["y_range"])
         canvas = Canvas(grid, self.pixel_m, margin_m=self.margin_m)
         low, high = np.transpose([grid.x_range, grid.y_range])
@@ -128,7 +128,7 @@ class FormatPolylineTargets(BaseTransform):
         instances = results.get("gt_instances_3d", InstanceData())
         if "pts" not in instances:
             instances.labels_3d = torch.tensor(labels, dtype=torch.int64)
-            instances.pts = torch.from_numpy(padded(lines_m)).float()
+            instances.pts = torch.from_numpy(pad_lines(lines_m)).float()
             instances.num_pts = torch.tensor(counts, dtype=torch.int64)
         instances.keypoints = torch.from_numpy((corners * canvas.size).reshape(-1, 4)).float()
         instances.keypoint_tokens = torch.from_numpy(corners * canvas.steps).long().flatten(1)
@@ -146,7 +146,7 @@ class FormatPolylineTargets(BaseTransform):
 def stack_rows(rows: Sequence[NDArray[Any]]) -> torch.Tensor:
     """Stack arrays of different lengths, filled with zeros. (n,) each -> (K, longest n)"""
     columns = [row[:, None] for row in rows]
-    return torch.from_numpy(padded(columns, mode="constant")[..., 0])
+    return torch.from_numpy(pad_lines(columns, mode="constant")[..., 0])
 
 
 @TRANSFORMS.register_module()

@@ -110,7 +110,7 @@ def page_data(
     frames = []
     for index in chosen:
         sample = file[index]
-        tilted = view.tilted(sample.ego_from_frame)
+        tilted = view.with_mounting(sample.ego_from_frame)
         frames.append(
             {
                 "token": sample.token,
