@@ -160,7 +160,7 @@ class Scenes:
             self.owner = owner
         if self.owner is not owner:
             raise InputError(
-                f"this stream is of {self.owner}, and {owner} cannot read what that remembers: "
+                f"this stream is of {self.owner}, and {owner} cannot read its memory: "
                 "start a new stream for each model (new_stream)."
             )
 

@@ -100,14 +100,7 @@ def forward_kernel(
     n = tl.program_id(1).to(tl.int64)
     tile = tl.program_id(0)
     x, y, index, valid = _tile_pixels(
-        tile,
-        x_min,
-        y_min=y_min,
-        step_x=step_x,
-        step_y=step_y,
-        height=height,
-        width=width,
-        TILE=TILE,
+        tile, x_min, y_min, step_x=step_x, step_y=step_y, height=height, width=width, TILE=TILE
     )
     left = tl.min(x)
     right = tl.max(x)
@@ -155,14 +148,7 @@ def backward_kernel(
     n = tl.program_id(1).to(tl.int64)
     tile = tl.program_id(0)
     x, y, index, valid = _tile_pixels(
-        tile,
-        x_min,
-        y_min=y_min,
-        step_x=step_x,
-        step_y=step_y,
-        height=height,
-        width=width,
-        TILE=TILE,
+        tile, x_min, y_min, step_x=step_x, step_y=step_y, height=height, width=width, TILE=TILE
     )
     left = tl.min(x)
     right = tl.max(x)
@@ -248,14 +234,7 @@ def warp_forward_kernel(
     n = tl.program_id(1).to(tl.int64)
     tile = tl.program_id(0)
     x, y, index, valid = _tile_pixels(
-        tile,
-        x_min,
-        y_min=y_min,
-        step_x=step_x,
-        step_y=step_y,
-        height=height,
-        width=width,
-        TILE=TILE,
+        tile, x_min, y_min, step_x=step_x, step_y=step_y, height=height, width=width, TILE=TILE
     )
     left = tl.min(x)
     right = tl.max(x)
@@ -307,14 +286,7 @@ def warp_backward_kernel(
     n = tl.program_id(1).to(tl.int64)
     tile = tl.program_id(0)
     x, y, index, valid = _tile_pixels(
-        tile,
-        x_min,
-        y_min=y_min,
-        step_x=step_x,
-        step_y=step_y,
-        height=height,
-        width=width,
-        TILE=TILE,
+        tile, x_min, y_min, step_x=step_x, step_y=step_y, height=height, width=width, TILE=TILE
     )
     left = tl.min(x)
     right = tl.max(x)

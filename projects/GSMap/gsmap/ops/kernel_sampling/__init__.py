@@ -33,10 +33,11 @@ def sample_kernels(
     bilinear: bool = False,
     backend: str = "auto",
 ) -> Tensor:
-    """Sum weighted pixels around the projections of each BEV cell, over the cameras that see it.
+    """Sum weighted pixels around the projections of each BEV cell in the cameras.
 
-    Each output row is one bag of V * S pixels, with weight zero for cameras that do not see the
-    cell. No size of a tensor depends on values, so the operation can be captured in a CUDA graph.
+    Each output row is one bag of V * S pixels, with weight zero for cameras to which the cell is
+    not visible. No size of a tensor depends on values, so the operation can be captured in a CUDA
+    graph.
 
     Args:
         value: Flattened feature maps, row-major, float32 or half precision.

@@ -67,7 +67,7 @@ def sample_kernels_reference(
     offsets: Tensor,
     bilinear: bool,
 ) -> Tensor:
-    """Sum weighted pixels around the projections of each BEV cell, over the cameras that see it.
+    """Sum weighted pixels around the projections of each BEV cell in the cameras.
 
     Args:
         value: Flattened feature maps, row-major. (B, V, h * w, heads, C)
