@@ -136,11 +136,39 @@ class Interrupting:
 
 sys.meta_path.insert(0, Interrupting())
 """
+INTERRUPTING_BY_NAME = """
+import os, signal, sys
+
+class Interrupting:
+    def find_spec(self, name, path=None, target=None):
+        if name == os.environ["INTERRUPTED_IMPORT"]:
+            signal.raise_signal(signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupting())
+"""
 COMMANDS = {
     "train": ("tools/train.py", "gsmap_maptr_r18_minicity", "--work-dir", "{out}"),
     "build_map": ("tools/build_map.py", "--help"),
     "torchrun": ("tools/dist_run.sh", "1", "tools/train.py"),
 }
+
+
+@pytest.mark.parametrize(
+    ("module", "imported"),
+    [("gsmap", "gsmap.__main__"), ("gsmap", "gsmap.utils.cli"), ("minicity", "minicity.cli")],
+)
+def test_ctrl_c_is_one_line_where_python_runs_a_module(module, imported, tmp_path):
+    (tmp_path / "sitecustomize.py").write_text(INTERRUPTING_BY_NAME)
+    words = ["evaluate", "--help"] if module == "gsmap" else ["--help"]
+    done = subprocess.run(
+        [sys.executable, "-m", module, *words],
+        env={**os.environ, **search_path(tmp_path), "INTERRUPTED_IMPORT": imported},
+        text=True,
+        capture_output=True,
+        check=False,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    assert (done.returncode, done.stderr) == (130, LINE)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import os
 import signal
 import sys
 
+_MODULES = ("gsmap", "minicity")  # that Python can run
 SAID = "interrupted: nothing half-written is left\n"
 
 
@@ -12,11 +13,19 @@ def is_first_rank() -> bool:
     return os.environ.get("RANK", os.environ.get("SLURM_PROCID", "0")) == "0"
 
 
+def _runs_a_module() -> bool:
+    """Whether Python was started as ``python -m gsmap`` or ``python -m minicity``."""
+    if "-m" not in sys.orig_argv[:-1]:
+        return False
+    return sys.orig_argv[sys.orig_argv.index("-m") + 1] in _MODULES
+
+
 def starts_a_command() -> bool:
     """Whether this process is ``gsmap`` or a script of ``tools``, and no worker of one."""
     folder, name = os.path.split(os.path.realpath(sys.argv[0])) if sys.argv else ("", "")
     is_tool = os.path.isfile(os.path.join(folder, "dist_run.sh"))
-    return (name == "gsmap" or is_tool) and "--multiprocessing-fork" not in sys.orig_argv
+    is_command = name == "gsmap" or is_tool or _runs_a_module()
+    return is_command and "--multiprocessing-fork" not in sys.orig_argv
 
 
 def leave_at_once_on_ctrl_c() -> None:
