@@ -57,7 +57,7 @@ def test_pickle_that_would_run_code_is_refused_and_nothing_runs(tmp_path):
     target = tmp_path / "proof"
     path = tmp_path / "attack.pkl"
     path.write_bytes(pickle.dumps({"data_list": [Calls(open, str(target), "w")]}))
-    with pytest.raises(ValueError, match=r"attack.pkl .*asks for io.open"):
+    with pytest.raises(ValueError, match=r"attack.pkl .*asks for _?io.open"):
         load_plain_pickle(path)
     assert not target.exists()
 
