@@ -8,6 +8,7 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 import torch
+from mmdet3d.registry import DATA_SAMPLERS
 from mmengine import Registry
 from mmengine.config import Config
 from torch.utils.data import DataLoader
@@ -68,6 +69,12 @@ def test_settings_that_nothing_can_be_made_of(settings, text):
             PARTS.build(settings)
 
     assert said(build).endswith(text)
+
+
+def test_a_registry_may_have_a_name_of_two_words():
+    text = r"^there is no data sampler of type 'Zzz'\.$"
+    with pytest.raises(InputError, match=text), building(Config()):
+        DATA_SAMPLERS.build({"type": "Zzz"})
 
 
 @PARTS.register_module()

@@ -23,7 +23,7 @@ _UNFIT = (
     ArithmeticError, ImportError,
 )  # fmt: skip
 _UNEXPECTED = re.compile(r"([\w.]+)\(\) got an unexpected keyword argument '(\w+)'")
-_ABSENT = re.compile(r"(\S+) is not in the \S+ registry")
+_ABSENT = re.compile(r"(\S+) is not in the .+? registry")
 
 
 class _Part(NamedTuple):
