@@ -116,7 +116,7 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
 def check_formats(args: argparse.Namespace, ann: AnnotationFile) -> None:
     """Raise an error, before anything is written, if a format lacks its package or an origin."""
     if not 0 < args.speed_limit < math.inf:
-        raise ValueError(f"--speed-limit must be > 0, got {args.speed_limit}.")
+        raise InputError(f"--speed-limit must be > 0, got {args.speed_limit}.")
     for key in EXTRAS.keys() & set(args.formats):
         import_extra(*EXTRAS[key])
     origins = {name: origin_of(args, ann, name) for name in set(ann.column("map_name"))}

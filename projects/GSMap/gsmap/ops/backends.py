@@ -11,6 +11,8 @@ import torch
 from torch import Tensor
 from torch.library import CustomOpDef, custom_op
 
+from gsmap.utils.errors import InputError
+
 PACKAGES = {"cpu": "numba", "triton": "triton"}
 DEVICES = {"cpu": "cpu", "triton": "cuda"}
 INSTALLED = {backend: find_spec(package) is not None for backend, package in PACKAGES.items()}
@@ -48,7 +50,7 @@ def triton_kernels(switch: str) -> set[str]:
         return set(TRITON_KERNELS)
     unknown = names - TRITON_KERNELS.keys()
     if unknown:
-        raise ValueError(
+        raise InputError(
             f"{SWITCH} names {sorted(unknown)}, which are no Triton kernels: choose from "
             f"{sorted(TRITON_KERNELS)}, or 'all'."
         )
@@ -80,7 +82,7 @@ def choose_backend(
     """
     choices = ("auto", "reference", *fused)
     if backend not in choices:
-        raise ValueError(f"backend must be one of {choices}, got {backend!r}.")
+        raise InputError(f"backend must be one of {choices}, got {backend!r}.")
     if backend == "reference":
         return backend
     unordered = kernel in UNORDERED and torch.are_deterministic_algorithms_enabled()
@@ -89,19 +91,19 @@ def choose_backend(
         candidates = [name for name in fused if name != "triton" or trusted]
         return _automatic_backend(candidates, tensor)
     if tensor.dtype != torch.float32:
-        raise ValueError(
+        raise InputError(
             f"backend {backend!r} computes in float32, got {tensor.dtype}: use 'reference'."
         )
     if not INSTALLED[backend]:
-        raise ValueError(f"backend {backend!r} needs {PACKAGES[backend]}, which is not installed.")
+        raise InputError(f"backend {backend!r} needs {PACKAGES[backend]}, which is not installed.")
     if backend == "triton" and unordered:
-        raise ValueError(
+        raise InputError(
             f"backend 'triton' of {kernel} adds gradients up in any order: use 'reference' with "
             "torch.use_deterministic_algorithms."
         )
     interpreted = backend == "triton" and os.environ.get("TRITON_INTERPRET") == "1"
     if tensor.device.type != DEVICES[backend] and not interpreted:
-        raise ValueError(f"backend {backend!r} does not serve tensors on {tensor.device}.")
+        raise InputError(f"backend {backend!r} does not serve tensors on {tensor.device}.")
     return backend
 
 

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import constant
+from gsmap.utils.errors import InputError
 
 
 def cell_indices(points_m: Tensor, grid: BEVGrid, z_range: tuple[float, float]) -> Tensor:
@@ -32,9 +33,9 @@ def cell_indices(points_m: Tensor, grid: BEVGrid, z_range: tuple[float, float]) 
         ValueError: If the points are not 3D or ``z_range`` is empty.
     """
     if points_m.shape[-1] != 3:
-        raise ValueError(f"points_m must end in (x, y, z), got shape {tuple(points_m.shape)}.")
+        raise InputError(f"points_m must end in (x, y, z), got shape {tuple(points_m.shape)}.")
     if not z_range[0] < z_range[1]:
-        raise ValueError(f"z_range must be (low, high) with low < high, got {z_range}.")
+        raise InputError(f"z_range must be (low, high) with low < high, got {z_range}.")
     lower = constant(points_m, [grid.x_range[0], grid.y_range[0], z_range[0]])
     size = constant(points_m, [*grid.pixel_size_m, z_range[1] - z_range[0]])
     limit = constant(points_m, [grid.width, grid.height, 1], torch.long)
@@ -99,7 +100,7 @@ def bev_pool_conv3x3(
     """
     _check_shapes(probs, context, cells=cells)
     if weight.dim() != 4 or weight.shape[1:] != (context.shape[2], 3, 3):
-        raise ValueError(
+        raise InputError(
             f"weight must have shape (O, {context.shape[2]}, 3, 3) to match context, "
             f"got {tuple(weight.shape)}."
         )
@@ -145,13 +146,13 @@ def _neighbours(values: Tensor) -> Tensor:
 def _check_shapes(probs: Tensor, context: Tensor, cells: Tensor) -> None:
     """Raise ValueError if the shapes of the three inputs of a pooling disagree."""
     if probs.dim() != 5 or cells.shape != probs.shape:
-        raise ValueError(
+        raise InputError(
             "probs and cells must both have shape (B, V, D, h, w), "
             f"got {tuple(probs.shape)} and {tuple(cells.shape)}."
         )
     batch, views, _, height, width = probs.shape
     if context.dim() != 5 or context[:, :, 0].shape != (batch, views, height, width):
-        raise ValueError(
+        raise InputError(
             f"context must have shape ({batch}, {views}, C, {height}, {width}) to match probs, "
             f"got {tuple(context.shape)}."
         )

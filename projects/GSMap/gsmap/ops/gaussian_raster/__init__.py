@@ -10,6 +10,7 @@ from gsmap.ops.backends import choose_backend, fused_operator
 from gsmap.ops.gaussian_raster.reference import render_gaussians_reference
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32
+from gsmap.utils.errors import InputError, InputTypeError
 
 _ARGUMENTS = "Tensor gaussians, float[] frame, int height, int width"
 
@@ -74,17 +75,17 @@ def render_gaussians(
 def _check(means: Tensor, scales: Tensor, rotations: Tensor) -> None:
     """Raise if shapes or devices of Gaussians disagree, or if a type is not floating point."""
     if means.ndim < 2 or means.shape[-1] != 2:
-        raise ValueError(f"means must have shape (..., P, 2), got {tuple(means.shape)}.")
+        raise InputError(f"means must have shape (..., P, 2), got {tuple(means.shape)}.")
     for name, tensor, shape in (
         ("means", means, means.shape),
         ("scales", scales, means.shape),
         ("rotations", rotations, means.shape[:-1]),
     ):
         if tensor.shape != shape:
-            raise ValueError(
+            raise InputError(
                 f"{name} must have shape {tuple(shape)} to match means, got {tuple(tensor.shape)}."
             )
         if tensor.device != means.device:
-            raise ValueError(f"{name} must be on {means.device} like means, got {tensor.device}.")
+            raise InputError(f"{name} must be on {means.device} like means, got {tensor.device}.")
         if not tensor.dtype.is_floating_point:
-            raise TypeError(f"{name} must be floating point, got {tensor.dtype}.")
+            raise InputTypeError(f"{name} must be floating point, got {tensor.dtype}.")

@@ -7,6 +7,7 @@ from gsmap.ops.backends import choose_backend, fused_operator
 from gsmap.ops.polyline_raster.reference import draw_reference, soft_rasters_reference
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32
+from gsmap.utils.errors import InputError
 
 LANE_GAP_PX = 0.01  # shift of a line's way back in MapVR, which closes the line to a polygon
 DISTANCES = ("squared", "plain")
@@ -51,11 +52,11 @@ def draw_polylines(
             does not support the inputs.
     """
     if polylines.ndim != 3 or polylines.shape[-1] != 2 or polylines.shape[1] < 2:
-        raise ValueError(
+        raise InputError(
             f"polylines must have shape (K, P, 2) with P >= 2, got {tuple(polylines.shape)}."
         )
     if not width_m > 0:
-        raise ValueError(f"width_m must be > 0, got {width_m}.")
+        raise InputError(f"width_m must be > 0, got {width_m}.")
     flags = _flags(filled, "filled", polylines=polylines)
     polylines = at_least_float32(polylines.detach())
     dx, dy = grid.pixel_size_m
@@ -116,13 +117,13 @@ def soft_rasters(
             ``backend`` is unknown or does not support the inputs.
     """
     if vertices.ndim != 3 or vertices.shape[-1] != 2 or not vertices.shape[1]:
-        raise ValueError(
+        raise InputError(
             f"vertices must have shape (n, V, 2) with V >= 1, got {tuple(vertices.shape)}."
         )
     if not (line_softness > 0 and polygon_softness > 0):
-        raise ValueError(f"softness must be > 0, got {line_softness} and {polygon_softness}.")
+        raise InputError(f"softness must be > 0, got {line_softness} and {polygon_softness}.")
     if distance not in DISTANCES:
-        raise ValueError(f"distance must be one of {DISTANCES}, got {distance!r}.")
+        raise InputError(f"distance must be one of {DISTANCES}, got {distance!r}.")
     flags = _flags(is_polygon, "is_polygon", polylines=vertices)
     plain = distance == "plain"
     with torch.autocast(vertices.device.type, enabled=False):
@@ -154,7 +155,7 @@ def _flags(flags: Tensor | None, name: str, polylines: Tensor) -> Tensor:
     if flags is None:
         return torch.zeros(len(polylines), dtype=torch.bool, device=polylines.device)
     if flags.shape != polylines.shape[:1] or flags.dtype != torch.bool:
-        raise ValueError(
+        raise InputError(
             f"{name} must be bool of shape {(len(polylines),)}, one flag per polyline, "
             f"got {flags.dtype} of shape {tuple(flags.shape)}."
         )

@@ -8,6 +8,7 @@ from torch.utils.checkpoint import checkpoint
 
 from gsmap.ops.backends import choose_backend, fused_operator
 from gsmap.ops.raster_loss.reference import gaussian_window, raster_loss_sums_reference
+from gsmap.utils.errors import InputError
 
 NORMALIZATIONS = ("both", "foreground", "pixels")
 MIN_FOREGROUND = 0.005  # "foreground": a smaller ground truth counts as this share of the raster
@@ -66,12 +67,12 @@ def raster_loss(
             does not support the inputs.
     """
     if preds.ndim != 3 or preds.shape != targets.shape:
-        raise ValueError(
+        raise InputError(
             "preds and targets must both have shape (n, H, W), "
             f"got {tuple(preds.shape)} and {tuple(targets.shape)}."
         )
     if normalize not in NORMALIZATIONS:
-        raise ValueError(f"normalize must be one of {NORMALIZATIONS}, got {normalize!r}.")
+        raise InputError(f"normalize must be one of {NORMALIZATIONS}, got {normalize!r}.")
     dtype = torch.promote_types(preds.dtype, torch.float32)
     preds = preds.to(dtype)
     targets = targets.detach().to(dtype)

@@ -5,6 +5,7 @@ from torch import Tensor
 
 from gsmap.ops.backends import choose_backend, fused_operator
 from gsmap.ops.soft_iou.reference import pairwise_minima_reference
+from gsmap.utils.errors import InputError
 
 _EPS = 1e-6  # added to the union, so that two empty masks have IoU 0
 _pairwise_minima = fused_operator(
@@ -34,7 +35,7 @@ def pairwise_soft_iou(preds: Tensor, targets: Tensor, backend: str = "auto") -> 
             inputs.
     """
     if preds.ndim != 3 or targets.ndim != 3 or preds.shape[1:] != targets.shape[1:]:
-        raise ValueError(
+        raise InputError(
             "preds and targets must have shapes (N, H, W) and (K, H, W), "
             f"got {tuple(preds.shape)} and {tuple(targets.shape)}."
         )
