@@ -1,1 +1,1 @@
-"""Measurements of speed and memory, each a subcommand of ``python -m benchmarks``."""
+"""Measurements of speed and memory: one subcommand of ``python -m benchmarks`` each."""

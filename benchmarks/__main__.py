@@ -5,7 +5,8 @@ import sys
 
 from gsmap.utils.cli import CommandParser, run_command
 
-# command -> module, imported when asked for: the libraries of one would count in another's memory
+# Module of each command. A module is imported only for its command: libraries of the others would
+# count in the measured memory.
 COMMANDS = {
     "data": "data_commands",
     "eval": "evaluation",
@@ -29,10 +30,11 @@ COMMANDS = {
 
 
 def main() -> None:
+    """Run the benchmark of the command line."""
     parser = CommandParser(description=__doc__)
     subparsers = parser.add_subparsers(required=True)
-    asked_for = COMMANDS.keys() & set(sys.argv[1:2])
-    for name in sorted(asked_for or COMMANDS):
+    requested = COMMANDS.keys() & set(sys.argv[1:2])
+    for name in sorted(requested or COMMANDS):
         module = importlib.import_module(f"benchmarks.{COMMANDS[name]}")
         text = str(module.__doc__)
         command = subparsers.add_parser(name, help=text.splitlines()[0], description=text)

@@ -1,4 +1,4 @@
-"""How long Argoverse 2 ground truth takes: what results/speed.md states."""
+"""Time to extract Argoverse 2 ground truth, as in results/speed.md."""
 
 import resource
 import time
@@ -19,39 +19,38 @@ _SETS = {
 
 
 def measure_extraction(root: Path, split: str = "val", stride: int = 10) -> dict[str, float]:
-    """Time the extraction at every N-th pose of a split's logs, in CPU time of this process.
+    """Measure the extraction at every N-th pose of a split's logs, in CPU time of this process.
 
     Args:
-        root: Data root.
+        root: Root folder of the data set.
         split: Split of the logs.
-        stride: N.
+        stride: N, >= 1.
 
     Returns:
         Milliseconds per frame by set of classes, milliseconds per log for its preparation, the
         number of frames, and the largest resident memory of the process in MB.
     """
     log_dirs = find_logs(root, split)
-    started = time.process_time()
+    start = time.process_time()
     maps = [Argoverse2Map.from_log(log_dir) for log_dir in log_dirs]
-    prepared = time.process_time() - started
-    frames = [
-        (log_map, pose)
-        for log_map, log_dir in zip(maps, log_dirs, strict=True)
-        for pose in list(Argoverse2Log(log_dir).poses.values())[::stride]
-    ]
+    preparation_s = time.process_time() - start
+    frames = []
+    for log_map, log_dir in zip(maps, log_dirs, strict=True):
+        poses = list(Argoverse2Log(log_dir).poses.values())
+        for pose in poses[::stride]:
+            frames.append((log_map, pose))
 
-    def per_frame(extract: Callable[..., object]) -> float:
-        before = time.process_time()
+    def ms_per_frame(extract: Callable[..., object]) -> float:
+        start = time.process_time()
         for log_map, pose in frames:
             extract(log_map, pose)
-        return 1e3 * (time.process_time() - before) / len(frames)
+        return 1e3 * (time.process_time() - start) / len(frames)
 
-    result = {
-        f"maptrv2_{name}_ms": per_frame(lambda m, pose, c=classes: m.extract(pose, c))
-        for name, classes in _SETS.items()
-    }
-    result["maptr_three_classes_ms"] = per_frame(lambda m, pose: m.extract(pose, compat="maptr"))
-    result["preparation_ms_per_log"] = 1e3 * prepared / len(maps)
+    result = {}
+    for name, classes in _SETS.items():
+        result[f"maptrv2_{name}_ms"] = ms_per_frame(lambda m, pose, c=classes: m.extract(pose, c))
+    result["maptr_three_classes_ms"] = ms_per_frame(lambda m, pose: m.extract(pose, compat="maptr"))
+    result["preparation_ms_per_log"] = 1e3 * preparation_s / len(maps)
     result["frames"] = len(frames)
     result["max_rss_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return result

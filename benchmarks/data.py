@@ -1,4 +1,4 @@
-"""Measurements behind ``results/speed.md``, run by ``python -m benchmarks data``."""
+"""Measurements of data sets for ``results/speed.md``: ``python -m benchmarks data``."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -22,57 +22,75 @@ _MEGABYTE = 2**20
 
 
 def tile_annotations(source: Path, target: Path, count: int) -> None:
-    """Write an annotation file of ``count`` samples by repeating another one's."""
+    """Write an annotation file that repeats the samples of another one.
+
+    Args:
+        source: Annotation file to repeat.
+        target: Annotation file to write.
+        count: Number of samples.
+    """
     file = AnnotationFile(source)
-    known = list(file)
+    source_samples = list(file)
 
     def samples() -> Iterator[MapSample]:
         for number in range(count):
-            sample = known[number % len(known)]
+            sample = source_samples[number % len(source_samples)]
             yield replace(sample, token=f"{sample.token}_{number}")
 
     write_annotations(target, file.meta, samples())
 
 
 def _unique_bytes() -> int:
-    """Memory of this process that it shares with no other."""
+    """Memory of this process that no other process shares, in bytes."""
     return psutil.Process().memory_full_info().uss
 
 
 def _read_in_worker(file: AnnotationFile, reads: int) -> tuple[int, int, int, int]:
-    """Read random samples in a fresh process and report the memory that it took."""
+    """Read random samples in a fresh process.
+
+    Args:
+        file: Annotation file.
+        reads: Number of samples to read.
+
+    Returns:
+        Unique memory before and after reading, and resident memory, all in bytes; and the number
+        of points read.
+    """
     before = _unique_bytes()
     order = np.random.default_rng(0).integers(len(file), size=reads)
-    points = sum(len(i.points) for row in order for i in file[int(row)].instances or [])
+    points = 0
+    for row in order:
+        for instance in file[int(row)].instances or []:
+            points += len(instance.points)
     return before, _unique_bytes(), psutil.Process().memory_info().rss, points
 
 
 def measure_loading(path: Path, reads: int = 5000) -> dict[str, float]:
-    """Measure opening an annotation file and reading from it in an extra process.
+    """Measure the time to open an annotation file, and the memory of a process that reads it.
 
     Args:
-        path: The file.
-        reads: How many random samples the extra process reads.
+        path: Annotation file.
+        reads: Number of random samples that the extra process reads.
 
     Returns:
-        ``open_s`` and ``read_ms`` per sample, both of CPU time; ``worker_mb``, all that the extra
-        process holds for itself, the interpreter and its libraries included; ``worker_growth_mb``,
-        what reading added to it; ``worker_rss_mb``, with shared pages; ``file_mb``; ``samples``.
+        CPU times ``open_s``, and ``read_ms`` per sample; ``worker_mb``, the unique memory of an
+        extra process with the interpreter and its libraries; ``worker_growth_mb``, its growth by
+        reading; ``worker_rss_mb``, with shared pages; ``file_mb``; and ``samples``.
     """
     start = time.process_time()
     file = AnnotationFile(path)
     file.instance_counts()
-    opened = time.process_time() - start
+    open_s = time.process_time() - start
     start = time.process_time()
     for row in np.random.default_rng(1).integers(len(file), size=1000):
         file[int(row)]
-    read = time.process_time() - start
+    read_ms = time.process_time() - start  # seconds of 1000 reads
     before, after, rss, _ = in_own_process(_read_in_worker, file, reads)
     return {
         "samples": len(file),
         "file_mb": path.stat().st_size / _MEGABYTE,
-        "open_s": opened,
-        "read_ms": read,
+        "open_s": open_s,
+        "read_ms": read_ms,
         "worker_mb": after / _MEGABYTE,
         "worker_growth_mb": (after - before) / _MEGABYTE,
         "worker_rss_mb": rss / _MEGABYTE,
@@ -82,10 +100,11 @@ def measure_loading(path: Path, reads: int = 5000) -> dict[str, float]:
 class PerItemGroundTruth:
     """Ground truth made for each item by a walk over all records of the map, with the devkit.
 
-    The way of code that makes it in the data loader: what ``NuScenesLocalMap`` is measured against.
+    This is the method of code that makes ground truth in the data loader, for comparison with
+    ``NuScenesLocalMap``.
 
     Args:
-        nusc_map: A map of the devkit.
+        nusc_map: Map of the devkit.
         x_range: Smallest and largest x in metres.
         y_range: Smallest and largest y in metres.
     """
@@ -94,99 +113,138 @@ class PerItemGroundTruth:
         self, nusc_map: Any, x_range: tuple[float, float], y_range: tuple[float, float]
     ) -> None:
         self._map = nusc_map
-        self._x_range, self._y_range = x_range, y_range
+        self._x_range = x_range
+        self._y_range = y_range
 
     def instances(self, global_from_frame: np.ndarray) -> list[MapInstance]:
-        """Return the elements around a pose."""
-        yaw = np.arctan2(global_from_frame[1, 0], global_from_frame[0, 0])
-        box = shapely.box(self._x_range[0], self._y_range[0], self._x_range[1], self._y_range[1])
+        """Elements around a pose.
+
+        Args:
+            global_from_frame: Pose of the frame, in metres. (4, 4)
+
+        Returns:
+            Elements in the frame.
+        """
         x, y = global_from_frame[:2, 3]
-        turned = affinity.rotate(box, yaw, origin=(0, 0), use_radians=True)
-        patch = affinity.translate(turned, x, y)
+        yaw = np.arctan2(global_from_frame[1, 0], global_from_frame[0, 0])
+        x_min, x_max = self._x_range
+        y_min, y_max = self._y_range
+        box = shapely.box(x_min, y_min, x_max, y_max)
+        rotated = affinity.rotate(box, yaw, origin=(0, 0), use_radians=True)
+        patch = affinity.translate(rotated, xoff=x, yoff=y)
 
-        def local(geometry: shapely.Geometry) -> shapely.Geometry:
-            moved = affinity.translate(geometry, -x, -y)
-            return affinity.rotate(moved, -yaw, origin=(0, 0), use_radians=True)
+        def to_frame(geometry: shapely.Geometry) -> shapely.Geometry:
+            shifted = affinity.translate(geometry, xoff=-x, yoff=-y)
+            return affinity.rotate(shifted, -yaw, origin=(0, 0), use_radians=True)
 
-        found = [MapInstance(0, line) for line in self._dividers(patch, local)]
-        crossings = shapely.union_all(self._areas("ped_crossing", patch, local))
-        found += [MapInstance(1, shapely.get_coordinates(r)) for r in self._rings(crossings)]
-        layers = [self._areas(name, patch, local) for name in ("road_segment", "lane")]
-        surface = shapely.union_all([shapely.union_all(layer) for layer in layers])
+        instances = []
+        for line in self._dividers(patch, to_frame):
+            instances.append(MapInstance(0, line))
+        crossings = shapely.union_all(self._areas("ped_crossing", patch, to_frame=to_frame))
+        for ring in _rings(crossings):
+            instances.append(MapInstance(1, shapely.get_coordinates(ring)))
+        segments = shapely.union_all(self._areas("road_segment", patch, to_frame=to_frame))
+        lanes = shapely.union_all(self._areas("lane", patch, to_frame=to_frame))
+        surface = shapely.union_all([segments, lanes])
         inner = box.buffer(-0.2, join_style="mitre")
-        for ring in self._rings(surface):
-            pieces = shapely.get_parts(shapely.line_merge(ring.intersection(inner)))
-            found += [MapInstance(2, shapely.get_coordinates(piece)) for piece in pieces]
-        return found
+        for ring in _rings(surface):
+            for piece in shapely.get_parts(shapely.line_merge(ring.intersection(inner))):
+                instances.append(MapInstance(2, shapely.get_coordinates(piece)))
+        return instances
 
-    def _dividers(self, patch: shapely.Polygon, local: Callable[..., Any]) -> list[np.ndarray]:
+    def _dividers(self, patch: shapely.Polygon, to_frame: Callable[..., Any]) -> list[np.ndarray]:
+        """Dividers inside a patch of the map, in the frame. Each (n, 2)"""
         lines = []
         for layer in ("road_divider", "lane_divider"):
             for record in getattr(self._map, layer):
-                if len(self._map.get("line", record["line_token"])["node_tokens"]) < 2:
+                token = record["line_token"]
+                if len(self._map.get("line", token)["node_tokens"]) < 2:
                     continue
-                line = self._map.extract_line(record["line_token"]).intersection(patch)
+                line = self._map.extract_line(token).intersection(patch)
                 if not line.is_empty:
-                    parts = shapely.get_parts(local(line))
-                    lines += [shapely.get_coordinates(part) for part in parts]
+                    for part in shapely.get_parts(to_frame(line)):
+                        lines.append(shapely.get_coordinates(part))
         return lines
 
     def _areas(
-        self, layer: str, patch: shapely.Polygon, local: Callable[..., Any]
+        self, layer: str, patch: shapely.Polygon, to_frame: Callable[..., Any]
     ) -> list[shapely.Geometry]:
+        """Areas of a layer inside a patch of the map, in the frame."""
         areas = []
         for record in getattr(self._map, layer):
             polygon = self._map.extract_polygon(record["polygon_token"])
             if polygon.is_valid:
-                cut = polygon.intersection(patch)
-                if not cut.is_empty:
-                    areas.append(local(cut))
+                part = polygon.intersection(patch)
+                if not part.is_empty:
+                    areas.append(to_frame(part))
         return areas
 
-    def _rings(self, area: shapely.Geometry) -> list[shapely.Geometry]:
-        polygons = shapely.get_parts(area)
-        return list(shapely.get_rings(polygons[shapely.get_type_id(polygons) == 3]))
+
+def _rings(area: shapely.Geometry) -> list[shapely.Geometry]:
+    """Rings of the polygons of an area."""
+    parts = shapely.get_parts(area)
+    polygons = parts[shapely.get_type_id(parts) == 3]
+    return list(shapely.get_rings(polygons))
 
 
 def per_item_orders(instances: Sequence[MapInstance], num_points: int) -> list[np.ndarray]:
-    """Return each element's equivalent orders, one call per point. each (S, P, 2)."""
+    """Equivalent orders of each element's points, resampled by one call per point.
 
-    def resampled(points: np.ndarray) -> np.ndarray:
+    Args:
+        instances: Elements.
+        num_points: Number of points P of each order.
+
+    Returns:
+        Both directions of a line, or all rotations of a ring, in metres. Each (S, P, 2)
+    """
+
+    def resample(points: np.ndarray) -> np.ndarray:
         line = shapely.LineString(points)
-        distances = np.linspace(0, line.length, num_points)
+        distances = np.linspace(0, line.length, num=num_points)
         return np.array([line.interpolate(distance).coords[0] for distance in distances])
 
     orders = []
     for instance in instances:
         points = instance.points
         if is_closed(points):
-            rolled = (
-                np.roll(points[:-1], k, axis=0) for k in range(min(len(points), num_points) - 1)
-            )
-            orders.append(np.stack([resampled(np.concatenate([r, r[:1]])) for r in rolled]))
+            rings = []
+            for k in range(min(len(points), num_points) - 1):
+                ring = np.roll(points[:-1], k, axis=0)
+                rings.append(resample(np.concatenate([ring, ring[:1]])))
+            orders.append(np.stack(rings))
         else:
-            orders.append(np.stack([resampled(points), resampled(points[::-1])]))
+            orders.append(np.stack([resample(points), resample(points[::-1])]))
     return orders
 
 
-def open_maps(root: Path, x_range: tuple[float, float], y_range: tuple[float, float]) -> tuple:
-    """Open all maps of a data root both ways.
+def open_maps(
+    root: Path, x_range: tuple[float, float], y_range: tuple[float, float]
+) -> tuple[dict[str, NuScenesLocalMap], dict[str, PerItemGroundTruth]]:
+    """Open all maps of a data root with both methods.
+
+    Args:
+        root: Data root with the map expansion.
+        x_range: Smallest and largest x of the ground truth in metres.
+        y_range: Smallest and largest y of the ground truth in metres.
 
     Returns:
         ``NuScenesLocalMap`` by name, and ``PerItemGroundTruth`` by name.
     """
     from nuscenes.map_expansion.map_api import NuScenesMap, locations
 
-    prepared, per_item = {}, {}
+    prepared = {}
+    per_item = {}
     for name in locations:
         if (root / f"maps/expansion/{name}.json").is_file():
             layers = open_layers(root, name, CLASSES)
             prepared[name] = NuScenesLocalMap(layers, CLASSES, x_range, y_range)
-            per_item[name] = PerItemGroundTruth(NuScenesMap(str(root), name), x_range, y_range)
+            nusc_map = NuScenesMap(str(root), name)
+            per_item[name] = PerItemGroundTruth(nusc_map, x_range, y_range=y_range)
     return prepared, per_item
 
 
 def _cpu_ms(work: Callable[[], Any]) -> float:
+    """Processor time of a call in milliseconds."""
     start = time.process_time()
     work()
     return 1e3 * (time.process_time() - start)
@@ -197,40 +255,48 @@ def measure_ground_truth(root: Path, annotations: Path, repeats: int = 3) -> dic
 
     Args:
         root: Data root with the map expansion.
-        annotations: Annotation file whose poses serve.
-        repeats: How many times each way runs over all poses; the fastest counts.
+        annotations: Annotation file with the poses.
+        repeats: Number of passes of each method over all poses; the fastest counts.
 
     Returns:
         CPU time in milliseconds per frame (``prepared_ms``, ``per_item_ms``) and their ratio.
     """
     file = AnnotationFile(annotations)
-    prepared, per_item = open_maps(root, file.meta.x_range, file.meta.y_range)
+    prepared, per_item = open_maps(root, file.meta.x_range, y_range=file.meta.y_range)
     poses = [(sample.map_name, sample.global_from_frame) for sample in file]
 
-    def quickly() -> None:
+    def run_prepared() -> None:
         for name, pose in poses:
             prepared[name].instances(pose)
 
-    def slowly() -> None:
+    def run_per_item() -> None:
         for name, pose in poses:
             per_item[name].instances(pose)
 
-    spent = np.array([[_cpu_ms(quickly), _cpu_ms(slowly)] for _ in range(repeats)])
-    fast, slow = spent.min(0) / len(poses)
-    return {"prepared_ms": fast, "per_item_ms": slow, "ratio": slow / fast}
+    prepared_times = []
+    per_item_times = []
+    for _ in range(repeats):
+        prepared_times.append(_cpu_ms(run_prepared))
+        per_item_times.append(_cpu_ms(run_per_item))
+    prepared_ms = min(prepared_times) / len(poses)
+    per_item_ms = min(per_item_times) / len(poses)
+    return {
+        "prepared_ms": prepared_ms,
+        "per_item_ms": per_item_ms,
+        "ratio": per_item_ms / prepared_ms,
+    }
 
 
 def measure_pipeline(config: Any, root: Path, count: int = 20) -> dict[str, float]:
     """Measure the training pipeline, with ground truth from the file and made per item, in turns.
 
-    Made per item means: elements out of the map by a walk over its records, and their point orders
-    by one call per point, as MapTR's data set does. Images are loaded and changed by the same
-    transforms.
+    Made per item means: elements from the map by a walk over its records, and their point orders
+    by one call per point, as in MapTR's data set. Both methods share the transforms of images.
 
     Args:
         config: Config of a ``VectorizedMapDataset``.
         root: Data root with the map expansion.
-        count: How many samples each way delivers.
+        count: Number of samples of each pass, >= 1.
 
     Returns:
         CPU time in milliseconds per sample (``file_ms``, ``per_item_ms``) and the ratio.
@@ -239,14 +305,14 @@ def measure_pipeline(config: Any, root: Path, count: int = 20) -> dict[str, floa
 
     dataset = DATASETS.build(deepcopy(config))
     meta = dataset.metainfo
-    _, per_item = open_maps(root, meta["x_range"], meta["y_range"])
+    _, per_item = open_maps(root, meta["x_range"], y_range=meta["y_range"])
     dataset[0]
 
-    def from_file() -> None:
+    def run_from_file() -> None:
         for number in range(count):
             dataset[number % len(dataset)]
 
-    def by_item() -> None:
+    def run_per_item() -> None:
         for number in range(count):
             results = dataset.get_data_info(number % len(dataset))
             truth = per_item[results["map_name"]].instances(results["lidar2global"])
@@ -256,6 +322,11 @@ def measure_pipeline(config: Any, root: Path, count: int = 20) -> dict[str, floa
                 else:
                     results = transform(results)
 
-    spent = np.array([[_cpu_ms(from_file), _cpu_ms(by_item)] for _ in range(3)])
-    fast, slow = spent.min(0) / count
-    return {"file_ms": fast, "per_item_ms": slow, "ratio": slow / fast}
+    file_times = []
+    per_item_times = []
+    for _ in range(3):
+        file_times.append(_cpu_ms(run_from_file))
+        per_item_times.append(_cpu_ms(run_per_item))
+    file_ms = min(file_times) / count
+    per_item_ms = min(per_item_times) / count
+    return {"file_ms": file_ms, "per_item_ms": per_item_ms, "ratio": per_item_ms / file_ms}

@@ -1,4 +1,4 @@
-"""Loading, ground truth, pipeline: what results/speed.md states."""
+"""Speed and memory of loading, ground truth and pipeline, as in results/speed.md."""
 
 import argparse
 import json
@@ -10,17 +10,20 @@ from benchmarks.memory import measure_memory
 
 
 def loading(args: argparse.Namespace) -> dict[str, float]:
+    """Measure the loading of a tiled annotation file."""
     with tempfile.TemporaryDirectory() as folder:
         tiled = Path(folder, "tiled.arrow")
-        benchmarks.tile_annotations(args.annotations, tiled, args.samples)
+        benchmarks.tile_annotations(args.annotations, tiled, count=args.samples)
         return benchmarks.measure_loading(tiled)
 
 
 def ground_truth(args: argparse.Namespace) -> dict[str, float]:
+    """Measure ground truth per frame."""
     return benchmarks.measure_ground_truth(args.root, args.annotations)
 
 
 def pipeline(args: argparse.Namespace) -> dict[str, float]:
+    """Measure training samples."""
     from mmengine.config import Config
     from mmengine.registry import init_default_scope
 
@@ -29,27 +32,30 @@ def pipeline(args: argparse.Namespace) -> dict[str, float]:
     init_default_scope("mmdet3d")
     config = Config.fromfile(args.config).train_dataloader.dataset
     config.update(data_root=str(args.root), ann_file=str(args.annotations.resolve()), split=None)
-    return benchmarks.measure_pipeline(config, args.root, args.samples)
+    return benchmarks.measure_pipeline(config, args.root, count=args.samples)
 
 
 def images(args: argparse.Namespace) -> dict[str, float]:
+    """Measure the image steps of a sample."""
     from benchmarks.images import measure_images
 
-    return measure_images(args.folder, args.samples, args.workers)
+    return measure_images(args.folder, count=args.samples, workers=args.workers)
 
 
 def argoverse2(args: argparse.Namespace) -> dict[str, float]:
+    """Measure Argoverse 2 ground truth."""
     from benchmarks.argoverse2 import measure_extraction
 
-    return measure_extraction(args.root, args.split, args.stride)
+    return measure_extraction(args.root, split=args.split, stride=args.stride)
 
 
 def memory(args: argparse.Namespace) -> dict[str, float]:
-    return measure_memory(args.root, args.version, tuple(args.copies))
+    """Measure the memory of the conversion."""
+    return measure_memory(args.root, args.version, copies=tuple(args.copies))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the command's arguments."""
+    """Add the subcommands of ``benchmarks data`` to a parser."""
     commands = parser.add_subparsers(required=True)
     command = commands.add_parser("loading", help="open and read a file of many samples")
     command.add_argument("annotations", type=Path)
@@ -83,6 +89,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure and print the figures as JSON."""
+    """Measure and print the figures as JSON.
+
+    Args:
+        args: Parsed options of ``add_arguments``.
+    """
     result = args.measure(args)
-    print(json.dumps({name: round(value, 4) for name, value in result.items()}, indent=1))
+    rounded = {name: round(value, 4) for name, value in result.items()}
+    print(json.dumps(rounded, indent=1))

@@ -1,4 +1,4 @@
-"""The race of the metrics: tools/evaluate.py beside the reference's way, memory, many sizes."""
+"""Speed and memory of tools/evaluate.py at many sizes, beside the reference's algorithms."""
 
 import argparse
 import os
@@ -6,7 +6,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,13 +30,13 @@ Record = dict[str, Any]
 
 @dataclass(frozen=True)
 class Run:
-    """One process with its children.
+    """Time and memory of a process and its children.
 
-    Args:
+    Attributes:
         wall_s: Wall-clock time in seconds.
         cpu_s: Processor time in seconds, workers included.
-        peak_mib: Largest resident memory of all its processes together, in MiB; pages that they
-            share count once for each.
+        peak_mib: Largest resident memory of all processes together in MiB; shared pages count once
+            per process.
     """
 
     wall_s: float
@@ -45,7 +45,7 @@ class Run:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the command's arguments."""
+    """Add the options of ``benchmarks eval`` to a parser."""
     parser.add_argument(
         "--frames",
         type=Path,
@@ -73,94 +73,133 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def generated_frames(
     count: int, seed: int = 0, size_m: Sequence[float] = (30.0, 60.0)
 ) -> list[Record]:
-    """Return frames like a validation set's: lines across the range and crossings, with noise.
+    """Frames like a validation set's: lines across the range and crossings, with noise.
 
     Args:
         count: Number of frames.
-        seed: Of the generator.
-        size_m: The map's size along x and y; elements are as many and so much longer.
+        seed: Seed of the generator.
+        size_m: Size of the map along x and y in metres; lengths of elements are in proportion,
+            their number is not.
+
+    Returns:
+        Frames with ``token``, ``gt`` and ``pred``.
     """
-    rng, stretch = np.random.default_rng(seed), np.array(size_m) / (30.0, 60.0)
+    rng = np.random.default_rng(seed)
+    stretch = np.array(size_m) / (30.0, 60.0)
     frames = []
     for number in range(count):
-        truth, found = [], []
+        truths = []
+        preds = []
         for label, most in ((0, 12), (1, 4), (2, 7)):
             for _ in range(rng.integers(most + 1)):
-                centre = rng.uniform([-13, -25], [13, 25])
-                if label == 1:
-                    w, h = rng.uniform(1.5, 7, 2)
-                    line = centre + np.array([[0, 0], [w, 0], [w, h], [0, h], [0, 0]])
-                else:
-                    t = np.linspace(-rng.uniform(3, 28), rng.uniform(3, 28), 20)
-                    bend = rng.normal(scale=0.004) * t**2
-                    line = np.clip(centre[0] + np.stack([bend, t], axis=1), [-15, -30], [15, 30])
-                line = line * stretch
-                truth.append({"label": label, "pts": np.round(line, 3).tolist()})
-                at = np.linspace(0, len(line) - 1, 20)
-                points = np.stack([np.interp(at, range(len(line)), c) for c in line.T], axis=1)
-                points += rng.normal(scale=rng.uniform(0, 1.0), size=2)
-                score = float(np.round(rng.uniform(0.02, 1), 6))
-                found.append({"label": label, "score": score, "pts": np.round(points, 3).tolist()})
-        frames.append({"token": f"f{number:05d}", "gt": truth, "pred": found})
+                line = _random_element(rng, label) * stretch
+                truths.append({"label": label, "pts": np.round(line, 3).tolist()})
+                points = _add_noise(line, rng)
+                score = float(np.round(rng.uniform(low=0.02, high=1), 6))
+                pts = np.round(points, 3).tolist()
+                preds.append({"label": label, "score": score, "pts": pts})
+        frames.append({"token": f"f{number:05d}", "gt": truths, "pred": preds})
     return frames
 
 
+def _random_element(rng: np.random.Generator, label: int) -> np.ndarray:
+    """Draw a crossing (label 1) or a line inside 30 x 60 m, in metres. (P, 2)"""
+    centre = rng.uniform(low=[-13, -25], high=[13, 25])
+    if label == 1:
+        w, h = rng.uniform(low=1.5, high=7, size=2)
+        return centre + np.array([[0, 0], [w, 0], [w, h], [0, h], [0, 0]])
+    start = -rng.uniform(low=3, high=28)
+    end = rng.uniform(low=3, high=28)
+    t = np.linspace(start, end, num=20)
+    bend = rng.normal(scale=0.004) * t**2
+    return np.clip(centre[0] + np.stack([bend, t], axis=1), [-15, -30], [15, 30])
+
+
+def _add_noise(line: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Resample a polyline to 20 points and shift it, in metres. (P, 2) -> (20, 2)"""
+    vertices = np.arange(len(line))
+    at = np.linspace(0, len(line) - 1, num=20)
+    x = np.interp(at, vertices, line[:, 0])
+    y = np.interp(at, vertices, line[:, 1])
+    shift_m = rng.normal(scale=rng.uniform(low=0, high=1.0), size=2)
+    return np.stack([x, y], axis=1) + shift_m
+
+
 def _vector(element: Record) -> Record:
+    """Convert an element of a frame to the format of result files."""
     vector = {
         "pts": element["pts"],
         "pts_num": len(element["pts"]),
         "cls_name": CLASSES[element["label"]],
         "type": element["label"],
     }
-    return {**vector, "confidence_level": element["score"]} if "score" in element else vector
+    if "score" in element:
+        vector["confidence_level"] = element["score"]
+    return vector
 
 
 def write_race(folder: Path, frames: list[Record], count: int) -> tuple[Path, Path]:
     """Write a result and a ground-truth file of many samples by repeating frames.
 
     Args:
-        folder: Where to write.
+        folder: Output folder.
         frames: Frames to repeat.
         count: Number of samples.
 
     Returns:
         The result file and the ground-truth file.
     """
-    paths = folder / f"results_{count}.json", folder / f"truth_{count}.json"
-    for path, part, key in zip(paths, ("pred", "gt"), ("results", "GTs"), strict=True):
-        samples = (
-            (f"{frame['token']}_{k:05d}", [_vector(e) for e in frame[part]])
-            for k, frame in ((k, frames[k % len(frames)]) for k in range(count))
-        )
-        write_results(path, samples, key=key)
-    return paths
+
+    def vectors(part: str) -> Iterator[tuple[str, list[Record]]]:
+        for k in range(count):
+            frame = frames[k % len(frames)]
+            yield f"{frame['token']}_{k:05d}", list(map(_vector, frame[part]))
+
+    results = folder / f"results_{count}.json"
+    truth = folder / f"truth_{count}.json"
+    write_results(results, vectors("pred"), key="results")
+    write_results(truth, vectors("gt"), key="GTs")
+    return results, truth
 
 
 def _resident_mib(pid: int) -> float:
-    """Return the resident memory of a process and its children; 0 for one that is gone."""
+    """Resident memory of a process and its children in MiB; 0 for a process that has ended."""
     try:
         status = Path(f"/proc/{pid}/status").read_text()
         children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
     except OSError:
         return 0.0
-    own = next((line for line in status.splitlines() if line.startswith("VmRSS")), "VmRSS: 0 kB")
-    return int(own.split()[1]) / 1024 + sum(_resident_mib(int(child)) for child in children)
+    total = sum(_resident_mib(int(child)) for child in children)
+    for line in status.splitlines():
+        if line.startswith("VmRSS"):
+            total += int(line.split()[1]) / 1024
+    return total
 
 
 def _evaluate(files: tuple[Path, Path], metrics: list[str], grid: BEVGrid, workers: int = 1) -> Run:
-    """Run the command and measure it with everything that it starts."""
-    command = [
-        sys.executable,
-        str(shipped("tools/evaluate.py")),
-        *map(str, files),
-        "--eval",
-        *metrics,
-    ]
-    (x0, x1), (y0, y1) = grid.x_range, grid.y_range
-    command += ["--range", *map(str, (x0, y0, x1, y1))]
+    """Run the command and measure it with all of its child processes.
+
+    Args:
+        files: Result file and ground-truth file.
+        metrics: Names of the metrics.
+        grid: Range of the map.
+        workers: Number of processes of the command.
+
+    Returns:
+        Time and memory.
+
+    Raises:
+        WorkError: If the command fails.
+    """
+    command = [sys.executable, str(shipped("tools/evaluate.py")), *map(str, files)]
+    command += ["--eval", *metrics]
+    x_min, x_max = grid.x_range
+    y_min, y_max = grid.y_range
+    command += ["--range", str(x_min), str(y_min), str(x_max), str(y_max)]
     start = time.perf_counter()
     process = subprocess.Popen([*command, "--workers", str(workers)], stdout=subprocess.DEVNULL)
-    peak, pid = 0.0, 0
+    peak = 0.0
+    pid = 0
     while pid == 0:
         peak = max(peak, _resident_mib(process.pid))
         time.sleep(0.02)
@@ -169,68 +208,100 @@ def _evaluate(files: tuple[Path, Path], metrics: list[str], grid: BEVGrid, worke
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
         raise WorkError(f"{' '.join(command)} ended with {process.returncode}.")
-    return Run(wall, usage.ru_utime + usage.ru_stime, peak)
+    return Run(wall_s=wall, cpu_s=usage.ru_utime + usage.ru_stime, peak_mib=peak)
 
 
 def _frame(record: Record) -> tuple[MapElements, MapElements]:
-    """Return predictions and ground truth of a frame."""
-    pred, truth = record["pred"], record["gt"]
-    return (
-        MapElements.from_polylines(
-            [e["pts"] for e in pred], [e["label"] for e in pred], [e["score"] for e in pred]
-        ),
-        MapElements.from_polylines([e["pts"] for e in truth], [e["label"] for e in truth]),
+    """Convert a frame to predictions and ground truth."""
+    preds = record["pred"]
+    truths = record["gt"]
+    pred_elements = MapElements.from_polylines(
+        polylines=[element["pts"] for element in preds],
+        labels=[element["label"] for element in preds],
+        scores=[element["score"] for element in preds],
     )
+    truth_elements = MapElements.from_polylines(
+        polylines=[element["pts"] for element in truths],
+        labels=[element["label"] for element in truths],
+    )
+    return pred_elements, truth_elements
 
 
 def _reference_table(frames: list[Record], count: int, grid: BEVGrid) -> str:
-    """Compare the reference's way with ours on a few samples, in this process, loading apart."""
+    """Compare the reference's algorithms with ours on a few samples, in this process.
+
+    Args:
+        frames: Frames to repeat.
+        count: Number of samples.
+        grid: Range of the map.
+
+    Returns:
+        Markdown table of the times without loading, and of both results.
+    """
     from benchmarks import reference_evaluation as reference  # needs pycocotools
 
     samples = [_frame(frames[k % len(frames)]) for k in range(count)]
-    chamfer, raster = ChamferConfig(CLASSES), RasterConfig(CLASSES, grid)
+    chamfer = ChamferConfig(CLASSES)
+    raster = RasterConfig(CLASSES, grid)
+
+    def chamfer_by_reference() -> float:
+        return reference.chamfer_map(samples, num_classes=3)
+
+    def raster_by_reference() -> float:
+        return reference.raster_map(samples, raster)
+
     rows = []
-    for name, evaluator, slow in (
-        ("chamfer", MapEvaluator(chamfer), lambda: reference.chamfer_map(samples, 3)),
-        ("raster", MapEvaluator(raster), lambda: reference.raster_map(samples, raster)),
+    for name, config, evaluate_by_reference in (
+        ("chamfer", chamfer, chamfer_by_reference),
+        ("raster", raster, raster_by_reference),
     ):
-        evaluator.match("warm-up", *samples[0])
+        evaluator = MapEvaluator(config)
+        first_preds, first_truths = samples[0]
+        evaluator.match("warm-up", first_preds, first_truths)
         start = time.process_time()
-        theirs = slow()
-        slow_ms = (time.process_time() - start) / count * 1e3
-        if name == "raster" and not reference.FILLS_AS_RELEASED:  # its pixels are not the released
-            theirs = reference.raster_map(samples, raster, by_opencv=False)
+        reference_map = evaluate_by_reference()
+        reference_ms = (time.process_time() - start) / count * 1e3
+        if name == "raster" and not reference.FILLS_AS_RELEASED:
+            # This OpenCV's pixels differ from the released figures'.
+            reference_map = reference.raster_map(samples, raster, by_opencv=False)
         start = time.process_time()
-        matches = [evaluator.match(f"{k:06d}", *sample) for k, sample in enumerate(samples)]
-        ours = evaluator.reports(matches)[0].metrics[f"{name}/mAP"]
-        fast_ms = (time.process_time() - start) / count * 1e3
-        rows.append(
-            [
-                f"AP_{name}",
-                f"{slow_ms:.1f}",
-                f"{fast_ms:.3f}",
-                f"{slow_ms / fast_ms:.0f} x",
-                f"{theirs:.6f}",
-                f"{ours:.6f}",
-            ]
-        )
+        matches = []
+        for k, (preds, truths) in enumerate(samples):
+            matches.append(evaluator.match(f"{k:06d}", preds, truths))
+        our_map = evaluator.reports(matches)[0].metrics[f"{name}/mAP"]
+        our_ms = (time.process_time() - start) / count * 1e3
+        row = [
+            f"AP_{name}",
+            f"{reference_ms:.1f}",
+            f"{our_ms:.3f}",
+            f"{reference_ms / our_ms:.0f} x",
+            f"{reference_map:.6f}",
+            f"{our_map:.6f}",
+        ]
+        rows.append(row)
     header = ["metric", "reference's way, ms", "ours, ms", "ratio", "its mAP", "our mAP"]
     return markdown_table(header, rows)
 
 
-def _say(text: str) -> None:
-    """Show what is measured while the rest still runs."""
+def _print_progress(text: str) -> None:
+    """Print a measurement while the others still run."""
     print(text, file=sys.stderr, flush=True)
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure, print and write the tables."""
-    given = read_json(args.frames)["frames"] if args.frames else None
-    x, y = (size / 2 for size in args.size)
+    """Measure, print and write the tables.
+
+    Args:
+        args: Parsed options of ``add_arguments``.
+    """
+    frames = read_json(args.frames)["frames"] if args.frames else None
+    if not frames:
+        frames = generated_frames(320, size_m=args.size)
+    x = args.size[0] / 2
+    y = args.size[1] / 2
     grid = BEVGrid((-x, x), (-y, y))
-    frames = given or generated_frames(320, size_m=args.size)
-    reference = _reference_table(frames, args.reference_samples, grid)
-    _say(reference)
+    reference = _reference_table(frames, args.reference_samples, grid=grid)
+    _print_progress(reference)
     parts = [
         f"Matching alone, processor time a frame, {args.reference_samples} samples:\n",
         reference,
@@ -238,28 +309,29 @@ def run(args: argparse.Namespace) -> None:
     ]
     rows = []
     with tempfile.TemporaryDirectory() as folder:
-        _evaluate(write_race(Path(folder), frames, 8), ["chamfer", "raster"], grid)  # compiles once
+        # The first run compiles the kernels.
+        few_files = write_race(Path(folder), frames, count=8)
+        _evaluate(few_files, ["chamfer", "raster"], grid=grid)
         for count in args.samples:
-            files = write_race(Path(folder), frames, count)
+            files = write_race(Path(folder), frames, count=count)
             for metrics, workers in (
                 (["chamfer"], 1),
                 (["raster"], 1),
                 (["chamfer", "raster"], 1),
                 (["chamfer", "raster"], 2),
             ):
-                cost = _evaluate(files, metrics, grid, workers)
-                _say(f"{count} samples, {metrics}, {workers} processes: {cost}")
-                rows.append(
-                    [
-                        str(count),
-                        " + ".join(metrics),
-                        str(workers),
-                        f"{cost.wall_s:.1f}",
-                        f"{cost.cpu_s:.1f}",
-                        f"{cost.cpu_s / count * 1e3:.2f}",
-                        f"{cost.peak_mib:.0f}",
-                    ]
-                )
+                cost = _evaluate(files, metrics, grid=grid, workers=workers)
+                _print_progress(f"{count} samples, {metrics}, {workers} processes: {cost}")
+                row = [
+                    str(count),
+                    " + ".join(metrics),
+                    str(workers),
+                    f"{cost.wall_s:.1f}",
+                    f"{cost.cpu_s:.1f}",
+                    f"{cost.cpu_s / count * 1e3:.2f}",
+                    f"{cost.peak_mib:.0f}",
+                ]
+                rows.append(row)
             for path in files:
                 path.unlink()
     header = ["samples", "metrics", "processes", "wall s", "CPU s", "CPU ms a frame", "peak MiB"]

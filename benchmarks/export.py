@@ -19,10 +19,13 @@ __all__ = ["add_arguments", "run"]
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure and print every way's time of every config.
+    """Measure and print the time of every config in torch and in ONNX Runtime.
+
+    Args:
+        args: Parsed options of ``add_arguments``.
 
     Raises:
-        ValueError: If another device or precision is asked for.
+        ValueError: If the device is not the CPU or the precision is not single.
     """
     if args.device != "cpu" or args.fp16:
         raise InputError("benchmarks export measures single precision and 8 bits on the CPU.")
@@ -33,22 +36,31 @@ def run(args: argparse.Namespace) -> None:
             "ONNX Runtime": in_own_process(onnx_cost, path, args, False),
             "ONNX Runtime, 8 bits": in_own_process(onnx_cost, path, args, True),
         }
-        first = costs["torch"]
+        torch_cost = costs["torch"]
         for name, cost in costs.items():
-            ratios = cost.cpu_s / first.cpu_s, cost.wall_s / first.wall_s
-            times = f"{cost.cpu_s:.3f}", f"{cost.wall_s:.3f}"
-            rows.append([Path(path).stem, name, *times, *(f"{ratio:.2f}" for ratio in ratios)])
-    names = ["model", "way", "processor s", "wall s", "ratio to torch", "of wall s"]
-    report(args, names, rows)
+            row = [
+                Path(path).stem,
+                name,
+                f"{cost.cpu_s:.3f}",
+                f"{cost.wall_s:.3f}",
+                f"{cost.cpu_s / torch_cost.cpu_s:.2f}",
+                f"{cost.wall_s / torch_cost.wall_s:.2f}",
+            ]
+            rows.append(row)
+    header = ["model", "way", "processor s", "wall s", "ratio to torch", "of wall s"]
+    report(args, header, rows=rows)
 
 
 def onnx_cost(path: str, args: argparse.Namespace, eight_bits: bool) -> Cost:
-    """Measure a config's way in ONNX Runtime; the file's own reading is not counted.
+    """Measure a config's inference in ONNX Runtime, without the time to read the file.
 
     Args:
-        path: The config.
-        args: Of the command.
+        path: Config file.
+        args: Parsed options of ``add_arguments``.
         eight_bits: Whether convolutions are in 8 bits, calibrated on the images of the batch.
+
+    Returns:
+        Time and memory of a frame.
     """
     model, inputs, samples = model_and_batch(path, args)
     arrays = calibration_arrays(samples[0].metainfo, model.bev_encoder.calibration)
@@ -60,5 +72,5 @@ def onnx_cost(path: str, args: argparse.Namespace, eight_bits: bool) -> Cost:
         export_onnx(model.eval(), file, names, (height, width))
         if eight_bits:
             quantize_onnx(file, file, [arrays])
-        exported = OnnxInferencer(file, num_threads=args.threads)
-    return measure(partial(exported.run, arrays), torch.device("cpu"), args.repeats)
+        inferencer = OnnxInferencer(file, num_threads=args.threads)
+    return measure(partial(inferencer.run, arrays), torch.device("cpu"), repeats=args.repeats)

@@ -2,8 +2,9 @@
 
 Backbone, neck and BEV encoder are frozen and run once (the pipeline must not augment), so a run
 costs a fraction of fine-tuning the whole model. Every variant starts from the head of the
-checkpoint (or, with ``--from-scratch``, from a new one), sees the same batches in the same order,
-and is tested on the same features. Its predictions, ``NAME-SEED/results.json``, are for ``shape``.
+checkpoint (or, with ``--from-scratch``, from a new one). All variants are trained on equal batches
+in equal order and tested on equal features. ``shape`` reads the predictions,
+``NAME-SEED/results.json``.
 """
 
 import argparse
@@ -19,6 +20,7 @@ from mmdet3d.registry import DATASETS, METRICS, MODELS
 from mmengine.config import Config
 from mmengine.dataset import pseudo_collate
 from mmengine.logging import MMLogger
+from torch.optim.lr_scheduler import CosineAnnealingLR, LinearLR, SequentialLR
 
 from benchmarks.measure import markdown_table
 from gsmap.checkpoints.building import building
@@ -31,12 +33,20 @@ from gsmap.utils.files import atomic_write, write_text
 from gsmap.utils.parallel import ordered_map
 
 METRIC_NAMES = ("chamfer", "raster")
+WARM_UP = 100  # iterations
 _DECIDING = ("config", "checkpoint", "data_root", "iterations", "batch", "lr", "from_scratch")
 
 
 @dataclass(frozen=True)
 class Task:
-    """One run: a variant of a config's head, a seed, and where its predictions go."""
+    """Training and test of one head.
+
+    Attributes:
+        config: Config file of the head.
+        options: Overrides of the config.
+        seed: Seed of new weights and of the order of the batches.
+        results: Result file to write.
+    """
 
     config: Path
     options: dict[str, Any]
@@ -45,7 +55,7 @@ class Task:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the command's arguments."""
+    """Add the options of ``benchmarks heads`` to a parser."""
     parser.add_argument("config", type=Path, help="config of backbone, encoder and data")
     parser.add_argument("checkpoint", help="of that config, or the name of a model")
     parser.add_argument(
@@ -66,61 +76,95 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Store the features, train and test every variant, print a table."""
+    """Store the features, train and test every variant, and print a table.
+
+    Args:
+        args: Parsed options of ``add_arguments``.
+
+    Raises:
+        ValueError: If the output folder has figures of other settings.
+    """
     variants: dict[str, str] = json.loads(args.variants.read_text())
     settings = {key: str(getattr(args, key)) for key in _DECIDING}
-    for name, text in variants.items():
-        refuse_others(args.out / f"{name}.settings.json", {**settings, "variant": text})
+    for name, variant in variants.items():
+        note_settings(args.out / f"{name}.settings.json", {**settings, "variant": variant})
     options = data_root_options(args.data_root)
     features = {part: args.out / f"{part}.pt" for part in ("train", "val")}
     for part, path in features.items():
         if not path.exists():
-            store_features(read_config(args.config, options), args.checkpoint, part, path)
-    tasks = {}
-    for name, text in variants.items():
-        config, *overrides = shlex.split(text)
-        changed = parse_options(overrides) if overrides else {}
-        for seed in range(args.seeds):
-            results = args.out / f"{name}-{seed}/results.json"
-            tasks[name, seed] = Task(Path(config), changed, seed, results)
+            cfg = read_config(args.config, options)
+            store_features(cfg, args.checkpoint, part=part, path=path)
     figures: dict[tuple[str, int], dict[str, float]] = {}
-    paths = {(name, seed): args.out / f"{name}-{seed}.json" for name, seed in tasks}
-    done = [key for key, path in paths.items() if path.exists()]
-    figures |= {key: json.loads(paths[key].read_text()) for key in done}
-    waiting = [key for key in tasks if key not in figures]
+    tasks: dict[tuple[str, int], Task] = {}
+    for name, variant in variants.items():
+        config, *overrides = shlex.split(variant)
+        for seed in range(args.seeds):
+            path = args.out / f"{name}-{seed}.json"
+            if path.exists():
+                figures[name, seed] = json.loads(path.read_text())
+                continue
+            tasks[name, seed] = Task(
+                config=Path(config),
+                options=parse_options(overrides) if overrides else {},
+                seed=seed,
+                results=args.out / f"{name}-{seed}/results.json",
+            )
     train = partial(train_and_test, args=args, features=features)
-    work = ordered_map(train, map(tasks.__getitem__, waiting), args.workers, timeout_s=None)
-    for key, found in zip(waiting, work, strict=True):
-        figures[key] = found
-        write_text(paths[key], json.dumps(found, indent=1))
-        print(f"{key[0]}, seed {key[1]}: {', '.join(cells(found))}", flush=True)
-    table = [[name, str(seed), *cells(found)] for (name, seed), found in figures.items()]
+    results = ordered_map(train, tasks.values(), args.workers, timeout_s=None)
+    for (name, seed), task_figures in zip(tasks, results, strict=True):
+        figures[name, seed] = task_figures
+        write_text(args.out / f"{name}-{seed}.json", json.dumps(task_figures, indent=1))
+        print(f"{name}, seed {seed}: {', '.join(cells(task_figures))}", flush=True)
+    rows = []
+    for (name, seed), task_figures in figures.items():
+        rows.append([name, str(seed), *cells(task_figures)])
     header = ["head", "seed", "divider", "ped_crossing", "boundary", "mean"]
     print(f"\n{args.iterations} iterations of {args.batch}, AP_chamfer / AP_raster\n")
-    print(markdown_table(header, table))
+    print(markdown_table(header, rows))
 
 
-def refuse_others(path: Path, settings: dict[str, str]) -> None:
-    """Note what a variant's figures come from, or raise an error if those there are of others."""
+def note_settings(path: Path, settings: dict[str, str]) -> None:
+    """Write the settings of a variant's figures to a file.
+
+    Args:
+        path: JSON file.
+        settings: Values of the options that the figures depend on.
+
+    Raises:
+        ValueError: If the file has other settings.
+    """
     if path.exists() and json.loads(path.read_text()) != settings:
         raise InputError(f"{path.parent} holds figures of other settings: give another --out.")
     write_text(path, json.dumps(settings, indent=1))
 
 
 def cells(figures: dict[str, float]) -> list[str]:
-    """Return both APs of every class and their mean, in percent."""
-    keys = [f"{name}/AP" for name in CLASSES] + ["mAP"]
-    return [" / ".join(f"{100 * figures[f'{m}/{key}']:.1f}" for m in METRIC_NAMES) for key in keys]
+    """Format both APs of every class and their mean, in percent."""
+    keys = [f"{name}/AP" for name in CLASSES]
+    keys.append("mAP")
+    texts = []
+    for key in keys:
+        percentages = [f"{100 * figures[f'{metric}/{key}']:.1f}" for metric in METRIC_NAMES]
+        texts.append(" / ".join(percentages))
+    return texts
 
 
 @torch.no_grad()
 def store_features(cfg: Config, checkpoint: str, part: str, path: Path) -> None:
-    """Save the BEV features (N, C, H, W), float16, and the samples of a split."""
+    """Save the BEV features (N, C, H, W) in float16 and the samples of a split.
+
+    Args:
+        cfg: Config of backbone, encoder and data.
+        checkpoint: Checkpoint of the config, or name of a model.
+        part: Split, ``train`` or ``val``.
+        path: File to write.
+    """
     with building(cfg):
         model = MODELS.build(cfg.model).eval()
     load_weights(model, checkpoint)
     dataset = DATASETS.build(cfg[f"{part}_dataloader"].dataset)
-    feats, samples = [], []
+    feats = []
+    samples = []
     for index in range(len(dataset)):
         batch = model.data_preprocessor(pseudo_collate([dataset[index]]))
         bev = model.extract_feat(batch["inputs"], batch["data_samples"])["bev_feats"]
@@ -128,15 +172,24 @@ def store_features(cfg: Config, checkpoint: str, part: str, path: Path) -> None:
         samples += batch["data_samples"]
         if index % 100 == 0:
             print(f"features of {part}: {index} of {len(dataset)}", flush=True)
-    stored = {"feats": torch.stack(feats), "samples": samples, "metainfo": dataset.metainfo}
+    data = {"feats": torch.stack(feats), "samples": samples, "metainfo": dataset.metainfo}
     with atomic_write(path, "wb") as file:
-        torch.save(stored, file)
+        torch.save(data, file)
 
 
 def train_and_test(
     task: Task, args: argparse.Namespace, features: dict[str, Path]
 ) -> dict[str, float]:
-    """Train one head on the stored features and return its figures."""
+    """Train one head on the stored features and test it.
+
+    Args:
+        task: The head.
+        args: Parsed options of ``add_arguments``.
+        features: Files of ``store_features`` by split.
+
+    Returns:
+        Figures of both metrics.
+    """
     torch.set_num_threads(1)
     torch.manual_seed(task.seed)
     cfg = read_config(task.config, task.options)
@@ -146,47 +199,52 @@ def train_and_test(
     if not args.from_scratch:
         load_weights(model, args.checkpoint)
     head = model.map_head.train()
-    rates = cfg.optim_wrapper
+    settings = cfg.optim_wrapper
     optimizer = torch.optim.AdamW(
-        head.parameters(), args.lr, weight_decay=rates.optimizer.weight_decay, fused=True
+        head.parameters(), lr=args.lr, weight_decay=settings.optimizer.weight_decay, fused=True
     )
-    schedule = torch.optim.lr_scheduler.SequentialLR(
-        optimizer,
-        [
-            torch.optim.lr_scheduler.LinearLR(optimizer, 0.1, total_iters=100),
-            torch.optim.lr_scheduler.CosineAnnealingLR(
-                optimizer, max(1, args.iterations - 100), eta_min=args.lr / 100
-            ),
-        ],
-        [100],
+    warm_up = LinearLR(optimizer, start_factor=0.1, total_iters=WARM_UP)
+    decay = CosineAnnealingLR(
+        optimizer, T_max=max(1, args.iterations - WARM_UP), eta_min=args.lr / 100
     )
+    schedule = SequentialLR(optimizer, [warm_up, decay], milestones=[WARM_UP])
     data = torch.load(features["train"], weights_only=False, mmap=True)
-    order = torch.Generator().manual_seed(task.seed)
+    generator = torch.Generator().manual_seed(task.seed)
     batches: list[torch.Tensor] = []
     for _ in range(args.iterations):
         if not batches:
-            batches = list(torch.randperm(len(data["samples"]), generator=order).split(args.batch))
-        chosen = batches.pop()
-        inputs = {"bev_feats": data["feats"][chosen].float()}
-        losses = head.loss(inputs, [data["samples"][i] for i in chosen.tolist()])
+            order = torch.randperm(len(data["samples"]), generator=generator)
+            batches = list(order.split(args.batch))
+        rows = batches.pop()
+        inputs = {"bev_feats": data["feats"][rows].float()}
+        losses = head.loss(inputs, [data["samples"][i] for i in rows.tolist()])
         optimizer.zero_grad(set_to_none=True)
         sum(value for name, value in losses.items() if "loss" in name).backward()
-        torch.nn.utils.clip_grad_norm_(head.parameters(), rates.clip_grad.max_norm)
+        torch.nn.utils.clip_grad_norm_(head.parameters(), settings.clip_grad.max_norm)
         optimizer.step()
         schedule.step()
     data = torch.load(features["val"], weights_only=False, mmap=True)
-    return test(model, data, task.results)
+    return test(model, data, results=task.results)
 
 
 @torch.no_grad()
 def test(model: Any, data: dict[str, Any], results: Path) -> dict[str, float]:
-    """Write the predictions and return every figure of both metrics."""
+    """Test a head on stored features and write its predictions.
+
+    Args:
+        model: Model with the head.
+        data: Features ``feats`` (N, C, H, W), ``samples`` and ``metainfo`` of the split.
+        results: Result file to write.
+
+    Returns:
+        Figures of both metrics.
+    """
     MMLogger.get_instance("heads", log_level="ERROR")
     model.eval()
     metric = METRICS.build({"type": "MapMetric", "eval": METRIC_NAMES, "out_file": str(results)})
     metric.dataset_meta = data["metainfo"]
     for feats, sample in zip(data["feats"], data["samples"], strict=True):
-        found = model.map_head.predict({"bev_feats": feats[None].float()}, [sample])
-        model.add_pred_to_datasample([sample], found)
+        predictions = model.map_head.predict({"bev_feats": feats[None].float()}, [sample])
+        model.add_pred_to_datasample([sample], predictions)
         metric.process(None, [sample.to_dict()])
     return metric.evaluate(len(data["samples"]))

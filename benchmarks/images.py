@@ -1,4 +1,4 @@
-"""How fast the image steps of nuScenes' pipelines are: processor time, and samples a second."""
+"""Speed of the image steps of nuScenes' pipelines: processor time, and samples a second."""
 
 import time
 from collections.abc import Sequence
@@ -20,24 +20,24 @@ from gsmap.utils.errors import InputError
 _CAMERAS = 6
 _LOAD = {"type": "LoadCameraImages"}
 _BYTES = {**_LOAD, "to_float32": False}
-_NOTED = {**_LOAD, "on_device": True}
+_ON_DEVICE = {**_LOAD, "on_device": True}
 _DISTORT = {"type": "DistortImages"}
 _SCALE = {"type": "ScaleImages", "scale": 0.5}
 _PACK = {"type": "PackMapInputs"}
 PIPELINES = {
     "train": [_BYTES, _DISTORT, _SCALE, _PACK],
-    "train, images_on_device": [_NOTED, _DISTORT, _SCALE, _PACK],
+    "train, images_on_device": [_ON_DEVICE, _DISTORT, _SCALE, _PACK],
     "test": [_LOAD, _SCALE, _PACK],
-    "test, images_on_device": [_NOTED, _SCALE, _PACK],
+    "test, images_on_device": [_ON_DEVICE, _SCALE, _PACK],
 }
 
 
 class Frames(Dataset):
-    """One frame of six images again and again, through a pipeline without ground truth.
+    """Data set that repeats one frame of six images, through a pipeline without ground truth.
 
     Args:
-        files: The image files.
-        pipeline: Name of one of ``PIPELINES``.
+        files: Image files.
+        pipeline: Key of ``PIPELINES``.
         count: Number of samples.
     """
 
@@ -51,10 +51,10 @@ class Frames(Dataset):
         return self.count
 
     def __getitem__(self, row: int) -> Any:
-        cameras = {
-            file.stem: {"img_path": str(file), "cam2img": np.eye(4), "lidar2cam": np.eye(4)}
-            for file in self.files
-        }
+        cameras = {}
+        for file in self.files:
+            camera = {"img_path": str(file), "cam2img": np.eye(4), "lidar2cam": np.eye(4)}
+            cameras[file.stem] = camera
         return self.pipeline({"images": cameras, "token": str(row), "cam_names": list(cameras)})
 
 
@@ -62,13 +62,14 @@ def measure_images(folder: Path, count: int = 10, workers: Sequence[int] = ()) -
     """Measure the image steps of nuScenes' pipelines.
 
     Args:
-        folder: Six JPEG files or more, such as a frame of nuScenes; the first six are read.
-        count: Samples of each measurement, and of each process.
-        workers: Numbers of processes that deliver training samples.
+        folder: Folder of six JPEG files or more, such as a frame of nuScenes; the first six are
+            read.
+        count: Samples of each measurement, and of each process, >= 1.
+        workers: Numbers of processes to measure with training samples.
 
     Returns:
-        By pipeline the processor time of one thread in ms a sample; by number of processes the
-        samples a second that arrive in batches of four, pinned where there is a GPU.
+        By pipeline the processor time of one thread in milliseconds per sample; by number of
+        processes the samples per second in batches of four, in pinned memory if there is a GPU.
 
     Raises:
         ValueError: If there are fewer than six images.
@@ -78,24 +79,25 @@ def measure_images(folder: Path, count: int = 10, workers: Sequence[int] = ()) -
         raise InputError(f"{folder} has {len(files)} JPEG files: give a folder of six or more.")
     cv2.setNumThreads(0)
     torch.set_num_threads(1)
-    found = {}
+    result = {}
     for name in PIPELINES:
-        frames = Frames(files[:_CAMERAS], name, count)
-        np.random.seed(0)  # noqa: NPY002  what mmdet draws from
+        frames = Frames(files[:_CAMERAS], name, count=count)
+        np.random.seed(0)  # noqa: NPY002  generator of mmdet's transforms
         frames[0]
         start = time.process_time()
         for row in range(count):
             frames[row]
-        found[f"{name}, ms a sample"] = 1e3 * (time.process_time() - start) / count
+        result[f"{name}, ms a sample"] = 1e3 * (time.process_time() - start) / count
     for number in workers:
         for name in ("train", "train, images_on_device"):
-            frames = Frames(files[:_CAMERAS], name, count * number)
-            found[f"{name}, samples/s, {number} workers"] = _samples_per_second(frames, number)
-    return found
+            frames = Frames(files[:_CAMERAS], name, count=count * number)
+            rate = _samples_per_second(frames, number)
+            result[f"{name}, samples/s, {number} workers"] = rate
+    return result
 
 
 def _samples_per_second(frames: Frames, workers: int) -> float:
-    """Return how many samples arrive in a second, once every process has delivered one batch."""
+    """Measure the samples per second, after the first batch of every worker process."""
     loader = DataLoader(
         frames,
         batch_size=4,
@@ -103,11 +105,11 @@ def _samples_per_second(frames: Frames, workers: int) -> float:
         collate_fn=pseudo_collate,
         pin_memory=torch.cuda.is_available(),
     )
-    arrived = 0
+    num_samples = 0
     start = 0.0
-    for number, batch in enumerate(loader, 1):
+    for number, batch in enumerate(loader, start=1):
         if number == workers:
             start = time.perf_counter()
         elif number > workers:
-            arrived += len(batch["data_samples"])
-    return arrived / (time.perf_counter() - start)
+            num_samples += len(batch["data_samples"])
+    return num_samples / (time.perf_counter() - start)

@@ -12,7 +12,7 @@ from gsmap.apis.map_inferencer import MapInferencer
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add which model to measure, and how."""
+    """Add the options of ``benchmarks live`` to a parser."""
     parser.add_argument("model", help="name of a trained model, or a config with random weights")
     parser.add_argument("--size", type=int, nargs=2, default=(225, 400), metavar=("H", "W"))
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
@@ -23,25 +23,36 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure and print the shortest time of a frame, of a rig that is known and of a new one."""
+    """Measure and print the shortest time of a frame, of a known rig and of a new one.
+
+    Args:
+        args: Parsed options of ``add_arguments``.
+    """
     torch.set_num_threads(args.threads)
-    graphs = args.cuda_graphs or None
-    inferencer = MapInferencer(args.model, device=args.device, amp=args.amp, cuda_graphs=graphs)
+    inferencer = MapInferencer(
+        args.model, device=args.device, amp=args.amp, cuda_graphs=args.cuda_graphs or None
+    )
     names = inferencer.cfg.test_dataloader.dataset.cameras
-    pixels = np.random.default_rng(0).integers(0, 256, (*args.size, 3), np.uint8)
-    images = dict.fromkeys(names, pixels)
     height, width = args.size
-    projection = np.eye(4)  # that of `ring_of_cameras`
-    projection[:2, :3] = [[width / 2, 0, width / 2], [0, width / 2, height / 2]]
-    cam_from_frame = np.linalg.inv(projection) @ ring_of_cameras(len(names), *args.size)
-    rig = dict.fromkeys(names, projection[:3, :3]), dict(zip(names, cam_from_frame, strict=True))
-    ways = {
-        "live(images)": partial(inferencer.live(*rig), images),
-        "predict_images(images, ...)": partial(inferencer.predict_images, images, *rig),
+    rng = np.random.default_rng(0)
+    pixels = rng.integers(0, 256, size=(height, width, 3), dtype=np.uint8)
+    images = dict.fromkeys(names, pixels)
+    img_from_cam = np.eye(4)  # intrinsics of `ring_of_cameras`
+    img_from_cam[:2, :3] = [[width / 2, 0, width / 2], [0, width / 2, height / 2]]
+    img_from_frame = ring_of_cameras(len(names), height, width=width)
+    cam_from_frame = np.linalg.inv(img_from_cam) @ img_from_frame
+    intrinsics = dict.fromkeys(names, img_from_cam[:3, :3])
+    extrinsics = dict(zip(names, cam_from_frame, strict=True))
+    live = inferencer.live(intrinsics, extrinsics)
+    calls = {
+        "live(images)": partial(live, images),
+        "predict_images(images, ...)": partial(
+            inferencer.predict_images, images, intrinsics, extrinsics
+        ),
     }
     rows = []
-    for name, way in ways.items():
-        cost = measure(way, torch.device(args.device), args.repeats)
+    for name, call in calls.items():
+        cost = measure(call, torch.device(args.device), repeats=args.repeats)
         rows.append([name, f"{1000 * cost.cpu_s:.1f}", f"{1000 * cost.wall_s:.1f}"])
     print(
         f"{args.model}, {len(names)} images of {height} x {width}, {args.device}, {args.threads} "

@@ -1,4 +1,4 @@
-"""What the raster loss asks of Gaussians that lie off their line, by its reduction."""
+"""Effect of the raster loss on Gaussians that lie off their line, by its reduction."""
 
 import argparse
 import math
@@ -21,7 +21,7 @@ ERRORS_M = (0.1, 0.5, 1.0, 2.0, 3.0)
 SCALES_M = (0.15, 0.25, 0.5, 1.0, 1.5)
 LENGTHS_M = (4.0, 10.0, 60.0)
 MISS_SIZES = ((128, 64), (200, 100), (256, 128))
-# name in the tables -> normalize and foreground_weight of `raster_loss`
+# Name in the tables, and ``normalize`` and ``foreground_weight`` of `raster_loss`.
 REDUCTIONS = {
     "both": ("both", 1.0),
     "foreground, weight 5": ("foreground", 5.0),
@@ -30,13 +30,17 @@ REDUCTIONS = {
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the command's arguments."""
+    """Add the options of ``benchmarks masks`` to a parser."""
     parser.add_argument("--seeds", type=int, default=64, help="random errors that are averaged")
     parser.add_argument("--out", type=Path, help="write the tables to this file, too")
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure, print and write the tables."""
+    """Measure, print and write the tables.
+
+    Args:
+        args: Parsed options of ``add_arguments``.
+    """
     parts = [
         "-dL / d log sigma in thousandths, along / across the line; + grows, - shrinks. "
         f"A line of 60 m, {POINTS} round Gaussians, raster {GRID.height} x {GRID.width}, "
@@ -44,26 +48,32 @@ def run(args: argparse.Namespace) -> None:
     ]
     for reduction in REDUCTIONS:
         for band_m in BANDS_M:
-            parts += [f"{reduction}, band of {band_m:g} m:\n", push_table(reduction, band_m, args)]
-    parts += ["Loss of a miss, by the length of the element:\n", miss_table()]
-    parts += ["IoU of a crossing of 10 x 4 m with the polygon of the centres that fit its mask:\n"]
-    parts += [f"outline {fitted_crossing(False):.2f}, filled {fitted_crossing(True):.2f}\n"]
+            parts.append(f"{reduction}, band of {band_m:g} m:\n")
+            parts.append(push_table(reduction, band_m, seeds=args.seeds))
+    parts.append("Loss of a miss, by the length of the element:\n")
+    parts.append(miss_table())
+    parts.append(
+        "IoU of a crossing of 10 x 4 m with the polygon of the centres that fit its mask:\n"
+    )
+    outline_iou = fitted_crossing(False)
+    filled_iou = fitted_crossing(True)
+    parts.append(f"outline {outline_iou:.2f}, filled {filled_iou:.2f}\n")
     publish("\n".join(parts), args.out)
 
 
 def straight_line(length_m: float) -> Tensor:
-    """Return a line along y through the raster's middle, in metres. (POINTS, 2)"""
+    """Line along y through the centre of the raster, in metres. (POINTS, 2)"""
     y = torch.linspace(-length_m / 2, length_m / 2, POINTS)
-    return torch.stack([torch.zeros(POINTS), y], -1)
+    return torch.stack([torch.zeros(POINTS), y], dim=-1)
 
 
 def push(
     reduction: str, band_m: float, error_m: float, scale_m: float, seeds: int = 64
 ) -> tuple[float, float]:
-    """Measure what the loss asks of the scales of round Gaussians along a line of 60 m.
+    """Measure the gradient of the loss in the scales of round Gaussians along a line of 60 m.
 
     Args:
-        reduction: One of ``REDUCTIONS``.
+        reduction: Key of ``REDUCTIONS``.
         band_m: Width of the ground-truth mask in metres.
         error_m: Standard deviation of the centres' error along x and y, in metres.
         scale_m: Standard deviation of the Gaussians in metres.
@@ -76,7 +86,7 @@ def push(
     errors = torch.randn(seeds, POINTS, 2, generator=torch.Generator().manual_seed(0))
     scales = torch.full((seeds, POINTS, 2), scale_m, requires_grad=True)
     rotations = torch.full((seeds, POINTS), math.pi / 2)
-    preds = render_gaussians(line + error_m * errors, scales, rotations, GRID)
+    preds = render_gaussians(line + error_m * errors, scales, rotations=rotations, grid=GRID)
     targets = draw_polylines(line[None], GRID, band_m).expand_as(preds)
     normalize, weight = REDUCTIONS[reduction]
     loss = raster_loss(preds, targets, foreground_weight=weight, normalize=normalize).sum()
@@ -85,42 +95,69 @@ def push(
     return along, across
 
 
-def push_table(reduction: str, band_m: float, args: argparse.Namespace) -> str:
-    """Measure one reduction and band at every error and scale."""
+def push_table(reduction: str, band_m: float, seeds: int) -> str:
+    """Measure one reduction and band at every error and scale.
+
+    Args:
+        reduction: Key of ``REDUCTIONS``.
+        band_m: Width of the ground-truth mask in metres.
+        seeds: Number of random errors.
+
+    Returns:
+        Markdown table.
+    """
+    header = ["error"]
+    header += [f"{scale_m:g} m" for scale_m in SCALES_M]
     rows = []
     for error_m in ERRORS_M:
-        pushes = (push(reduction, band_m, error_m, scale_m, args.seeds) for scale_m in SCALES_M)
-        cells = (f"{1e3 * along:+.2f} / {1e3 * across:+.2f}" for along, across in pushes)
-        rows.append([f"{error_m:g} m", *cells])
-    return markdown_table(["error", *(f"{scale_m:g} m" for scale_m in SCALES_M)], rows)
+        row = [f"{error_m:g} m"]
+        for scale_m in SCALES_M:
+            along, across = push(reduction, band_m, error_m=error_m, scale_m=scale_m, seeds=seeds)
+            row.append(f"{1e3 * along:+.2f} / {1e3 * across:+.2f}")
+        rows.append(row)
+    return markdown_table(header, rows)
 
 
 def miss(reduction: str, band_m: float, length_m: float, size: tuple[int, int]) -> float:
-    """Return the loss of an empty prediction for a line of a length."""
-    target = draw_polylines(straight_line(length_m)[None], GRID.with_size(*size), band_m)
+    """Loss of an empty prediction for a line.
+
+    Args:
+        reduction: Key of ``REDUCTIONS``.
+        band_m: Width of the ground-truth mask in metres.
+        length_m: Length of the line in metres.
+        size: Rows and columns of the raster.
+
+    Returns:
+        The loss.
+    """
+    height, width = size
+    target = draw_polylines(straight_line(length_m)[None], GRID.with_size(height, width), band_m)
     normalize, weight = REDUCTIONS[reduction]
     empty = torch.zeros_like(target)
     return raster_loss(empty, target, foreground_weight=weight, normalize=normalize).item()
 
 
 def miss_table() -> str:
-    """Measure the loss of a miss."""
-    rows = [
-        [reduction, f"{band_m:g} m", f"{height} x {width}"]
-        + [f"{miss(reduction, band_m, length_m, (height, width)):.3f}" for length_m in LENGTHS_M]
-        for reduction in REDUCTIONS
-        for band_m in BANDS_M
-        for height, width in MISS_SIZES
-    ]
-    header = ["reduction", "band", "raster", *(f"{length_m:g} m" for length_m in LENGTHS_M)]
+    """Table of the loss of a miss at every reduction, band, raster size and length."""
+    header = ["reduction", "band", "raster"]
+    header += [f"{length_m:g} m" for length_m in LENGTHS_M]
+    rows = []
+    for reduction in REDUCTIONS:
+        for band_m in BANDS_M:
+            for height, width in MISS_SIZES:
+                row = [reduction, f"{band_m:g} m", f"{height} x {width}"]
+                for length_m in LENGTHS_M:
+                    loss = miss(reduction, band_m, length_m=length_m, size=(height, width))
+                    row.append(f"{loss:.3f}")
+                rows.append(row)
     return markdown_table(header, rows)
 
 
 def fitted_crossing(filled: bool, iterations: int = 800) -> float:
-    """Fit Gaussians that start on a crossing's outline to its mask alone, by the default loss.
+    """Fit Gaussians that start on the outline of a crossing to its mask, by the default loss.
 
     Args:
-        filled: Whether the mask is filled, or a band along the outline.
+        filled: Whether the mask is filled, instead of a band along the outline.
         iterations: Steps of Adam.
 
     Returns:
@@ -134,11 +171,13 @@ def fitted_crossing(filled: bool, iterations: int = 800) -> float:
     centres = torch.tensor(starts).requires_grad_()
     log_scales = torch.full((POINTS, 2), math.log(0.6)).requires_grad_()
     rotations = torch.zeros(POINTS).requires_grad_()
-    optimizer = torch.optim.Adam([centres, log_scales, rotations], 0.02)
+    optimizer = torch.optim.Adam([centres, log_scales, rotations], lr=0.02)
     smallest_m = max(GRID.pixel_size_m) / 2
     for _ in range(iterations):
         scales = log_scales.exp().clamp(min=smallest_m)
-        rendered = render_gaussians(centres[None], scales[None], rotations[None], GRID)
+        rendered = render_gaussians(
+            centres[None], scales[None], rotations=rotations[None], grid=GRID
+        )
         optimizer.zero_grad()
         raster_loss(rendered, mask).sum().backward()
         optimizer.step()

@@ -1,4 +1,4 @@
-"""Time and peak memory of a function, on the CPU and on a GPU, and markdown tables."""
+"""Time and peak memory of a function on the CPU and on a GPU, and markdown tables."""
 
 import ctypes
 import gc
@@ -23,12 +23,12 @@ M_MMAP_THRESHOLD = -3  # of glibc's mallopt
 
 @dataclass(frozen=True)
 class Cost:
-    """What a call costs.
+    """Time and memory of a call.
 
-    Args:
+    Attributes:
         wall_s: Shortest wall-clock time of a call in seconds.
-        cpu_s: Shortest processor time of a call, all threads together, in seconds.
-        peak_bytes: Highest memory in use during a call, beyond what was in use before.
+        cpu_s: Shortest processor time of a call in seconds, all threads together.
+        peak_bytes: Highest memory in use during a call, beyond the memory in use before it.
     """
 
     wall_s: float
@@ -36,43 +36,61 @@ class Cost:
     peak_bytes: int
 
     def time_s(self, device: torch.device) -> float:
-        """Return the processor time on the CPU, where other work disturbs the clock, else wall."""
+        """Processor time on the CPU, where other processes disturb the clock, else wall time."""
         return self.cpu_s if device.type == "cpu" else self.wall_s
 
-    def scaled(self, factor: float) -> "Cost":
-        """Return the cost of ``factor`` times as much of the same work."""
-        return Cost(self.wall_s * factor, self.cpu_s * factor, int(self.peak_bytes * factor))
+    def scale(self, factor: float) -> "Cost":
+        """Cost of ``factor`` times the work, if time and memory grow in proportion."""
+        return Cost(
+            wall_s=self.wall_s * factor,
+            cpu_s=self.cpu_s * factor,
+            peak_bytes=int(self.peak_bytes * factor),
+        )
 
 
 def measure(function: Callable[[], object], device: torch.device, repeats: int = 5) -> Cost:
-    """Measure a function's peak memory once, after a first call, then its shortest times.
+    """Measure the peak memory of a function once, after a warm-up call, then its shortest times.
 
     Args:
-        function: Called without arguments; its result is dropped.
-        device: Where it works: on ``cuda`` every timing waits for the device.
-        repeats: Number of timed calls.
+        function: Function without arguments; its result is dropped.
+        device: Device of the work; on ``cuda`` every timing waits for the device.
+        repeats: Number of timed calls, >= 1.
+
+    Returns:
+        Times and peak memory of a call.
 
     Raises:
-        RuntimeError: If the system does not tell a process's peak memory (only Linux, with glibc,
-            does).
+        RuntimeError: If the system does not report the peak memory of a process (only Linux with
+            glibc does).
     """
     function()
     peak = _peak_bytes(function, device)
-    wall, cpu = float("inf"), float("inf")
+    wall_times = []
+    cpu_times = []
     for _ in range(repeats):
-        _wait_for(device)
-        wall_start, cpu_start = time.perf_counter(), time.process_time()
+        _synchronize(device)
+        wall_start = time.perf_counter()
+        cpu_start = time.process_time()
         function()
-        _wait_for(device)
-        wall = min(wall, time.perf_counter() - wall_start)
-        cpu = min(cpu, time.process_time() - cpu_start)
-    return Cost(wall, cpu, peak)
+        _synchronize(device)
+        wall_times.append(time.perf_counter() - wall_start)
+        cpu_times.append(time.process_time() - cpu_start)
+    return Cost(wall_s=min(wall_times), cpu_s=min(cpu_times), peak_bytes=peak)
 
 
 def in_own_process(function: Callable[..., Result], *arguments: object) -> Result:
-    """Call a function in a fresh process: what others left in memory does not count there."""
-    # one worker would be this process; of two, a single task starts but one
-    (result,) = ordered_map(partial(_call, function), [arguments], workers=2, timeout_s=None)
+    """Call a function in a fresh process, where earlier work has left nothing in memory.
+
+    Args:
+        function: Function that can be pickled.
+        arguments: Positional arguments of the function.
+
+    Returns:
+        Result of the function.
+    """
+    # One worker would be this process; of two workers, a single task starts only one.
+    call = partial(_call, function)
+    (result,) = ordered_map(call, [arguments], workers=2, timeout_s=None)
     return result
 
 
@@ -80,14 +98,14 @@ def _call(function: Callable[..., Result], arguments: tuple[object, ...]) -> Res
     return function(*arguments)
 
 
-def _wait_for(device: torch.device) -> None:
-    """Let a GPU finish."""
+def _synchronize(device: torch.device) -> None:
+    """Wait for the work of a GPU."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
 
 def _peak_bytes(function: Callable[[], object], device: torch.device) -> int:
-    """Call a function and return its peak memory beyond what was in use."""
+    """Call a function and return its peak memory beyond the memory in use before it."""
     gc.collect()
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
@@ -97,17 +115,18 @@ def _peak_bytes(function: Callable[[], object], device: torch.device) -> int:
     if platform.system() != "Linux":
         raise WorkError("Peak memory on the CPU is read from /proc, which only Linux has.")
     libc = ctypes.CDLL(None)
-    libc.mallopt(M_MMAP_THRESHOLD, 64 * 1024)  # tensors go back to the system when they are freed,
-    libc.malloc_trim(0)  # as memory kept for reuse would hide the next use or add to it
+    # Freed tensors go back to the system: memory kept for reuse would hide the next use of it.
+    libc.mallopt(M_MMAP_THRESHOLD, 64 * 1024)
+    libc.malloc_trim(0)
     Path("/proc/self/clear_refs").write_text("5")  # resets the peak
     before = _status_bytes("VmRSS")
     function()
-    libc.mallopt(M_MMAP_THRESHOLD, 32 * MIB)  # what glibc arrives at by itself
+    libc.mallopt(M_MMAP_THRESHOLD, 32 * MIB)  # upper limit of glibc's automatic threshold
     return max(_status_bytes("VmHWM") - before, 0)
 
 
 def _status_bytes(field: str) -> int:
-    """Read a size from this process's status."""
+    """Read a size in bytes from the status of this process."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith(field + ":"):
             return int(line.split()[1]) * 1024
@@ -115,13 +134,23 @@ def _status_bytes(field: str) -> int:
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Lay out a table in markdown."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines) + "\n"
+    """Format a table in markdown.
+
+    Args:
+        header: Names of the columns.
+        rows: Cells of each row.
+
+    Returns:
+        Lines of the table, each with a line break.
+    """
+    text = ""
+    for cells in (header, ["---"] * len(header), *rows):
+        text += "| " + " | ".join(map(str, cells)) + " |\n"
+    return text
 
 
 def publish(report: str, out: Path | None) -> None:
-    """Print a report, and write it to a file if there shall be one."""
+    """Print a report, and write it to the file ``out`` if one is given."""
     print(report)
     if out:
         out.write_text(report + "\n")

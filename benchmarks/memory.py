@@ -1,4 +1,4 @@
-"""How much memory the nuScenes conversion takes as the data set grows."""
+"""Memory of the nuScenes conversion as a function of the size of the data set."""
 
 import json
 import resource
@@ -20,15 +20,15 @@ _SWEEPS_PER_SAMPLE = 9
 
 
 def tile_tables(source: Path, version: str, target: Path, copies: int) -> int:
-    """Write a data root whose scenes are ``copies`` times those of another, without files.
+    """Write a data root whose tables repeat the scenes of another one, without sensor files.
 
-    Each key frame of LiDAR gets nine sweeps before it, as nuScenes has.
+    Each key frame of the LiDAR gets nine sweeps before it, as in nuScenes.
 
     Args:
         source: Data root to repeat.
-        version: Its version folder.
+        version: Version folder of the data root.
         target: Data root to write.
-        copies: How many times.
+        copies: Number of repetitions, >= 1.
 
     Returns:
         Number of samples.
@@ -36,31 +36,33 @@ def tile_tables(source: Path, version: str, target: Path, copies: int) -> int:
     (target / version).mkdir(parents=True)
     (target / "maps").symlink_to((source / "maps").resolve())
     tables = {path.stem: json.loads(path.read_text()) for path in (source / version).glob("*.json")}
-    scenes = tables["scene"]
     for name, references in _REFERENCES.items():
-        tables[name] = [
-            _renamed(record, references, copy) for copy in range(copies) for record in tables[name]
-        ]
+        records = []
+        for copy in range(copies):
+            for record in tables[name]:
+                records.append(_rename(record, references, copy))
+        tables[name] = records
     _add_sweeps(tables)
     for name, records in tables.items():
         (target / version / f"{name}.json").write_text(json.dumps(records))
-    names = [f"{scene['name']}_{copy}" for copy in range(copies) for scene in scenes]
-    (target / version / "splits.json").write_text(json.dumps({"train": names}))
+    scene_names = [scene["name"] for scene in tables["scene"]]
+    (target / version / "splits.json").write_text(json.dumps({"train": scene_names}))
     return len(tables["sample"])
 
 
-def _renamed(record: dict[str, Any], references: tuple[str, ...], copy: int) -> dict[str, Any]:
-    changed = dict(record, token=f"{record['token']}_{copy}")
+def _rename(record: dict[str, Any], references: tuple[str, ...], copy: int) -> dict[str, Any]:
+    """Copy a record with the number of the copy in its token, its name and its references."""
+    renamed = dict(record, token=f"{record['token']}_{copy}")
     if "name" in record:
-        changed["name"] = f"{record['name']}_{copy}"
+        renamed["name"] = f"{record['name']}_{copy}"
     for key in references:
         if record[key]:
-            changed[key] = f"{record[key]}_{copy}"
-    return changed
+            renamed[key] = f"{record[key]}_{copy}"
+    return renamed
 
 
 def _add_sweeps(tables: dict[str, list[dict[str, Any]]]) -> None:
-    """Put sweeps between the LiDAR's key frames."""
+    """Add sweeps before each key frame of the LiDAR, in place."""
     poses = {pose["token"]: pose for pose in tables["ego_pose"]}
     sweeps = []
     for record in tables["sample_data"]:
@@ -80,28 +82,38 @@ def _add_sweeps(tables: dict[str, list[dict[str, Any]]]) -> None:
 
 
 def peak_of_conversion(root: Path, version: str, out_dir: Path) -> float:
-    """Convert a data root in this process and return the peak of its memory in MB."""
+    """Convert a data root in this process.
+
+    Args:
+        root: Data root.
+        version: Version folder of the data root.
+        out_dir: Output folder.
+
+    Returns:
+        Peak of this process's memory in MB.
+    """
     convert_nuscenes(NuScenesOptions(root, version, out_dir=out_dir))
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def measure_memory(root: Path, version: str, copies: tuple[int, int]) -> dict[str, float]:
-    """Measure the conversion's peak memory at two sizes and extrapolate to nuScenes trainval.
+    """Measure the peak memory of the conversion at two sizes and extrapolate to nuScenes trainval.
 
     Args:
         root: Data root to repeat.
-        version: Its version folder.
-        copies: How many times, for the two sizes.
+        version: Version folder of the data root.
+        copies: Number of repetitions of the small and of the large size.
 
     Returns:
         Sizes, peaks in MB, growth in kB per sample, and the peak extrapolated to 34,149 samples in
         MB.
     """
-    samples, peaks = [], []
+    samples = []
+    peaks = []
     for number in copies:
         with tempfile.TemporaryDirectory() as folder:
             target = Path(folder, "root")
-            samples.append(tile_tables(root, version, target, number))
+            samples.append(tile_tables(root, version, target=target, copies=number))
             out = Path(folder, "out")
             peaks.append(in_own_process(peak_of_conversion, target, version, out))
     growth = (peaks[1] - peaks[0]) / (samples[1] - samples[0])

@@ -1,4 +1,4 @@
-"""Measure how fast MiniCity is made: images per second of one core's time, everything included.
+"""Speed of generating MiniCity: images per second of one core's time, everything included.
 
 Everything: town, ground, six cameras with JPEG, LiDAR sweeps, boxes and records. CPU time is
 measured, so other work on the machine hardly matters.
@@ -16,22 +16,32 @@ from minicity.generate import generate
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the command's arguments."""
+    """Add the options of ``benchmarks minicity`` to a parser."""
     parser.add_argument("--image-size", type=image_size, default=[(800, 450)], nargs="+")
     parser.add_argument("--scenes", type=int, default=6)
     parser.add_argument("--seed", type=int, default=0)
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Generate a data set of each size, measure and print."""
+    """Generate a data set of each image size, and print the time per image.
+
+    Args:
+        arguments: Parsed options of ``add_arguments``.
+    """
     cv2.setNumThreads(1)
-    for size in arguments.image_size:
+    for width, height in arguments.image_size:
         with tempfile.TemporaryDirectory() as folder:
             start = time.process_time()
-            generate(Path(folder) / "root", arguments.scenes, arguments.seed, size, workers=0)
+            generate(
+                root=Path(folder) / "root",
+                scenes=arguments.scenes,
+                seed=arguments.seed,
+                image_size=(width, height),
+                workers=0,
+            )
             seconds = time.process_time() - start
         images = 6 * 10 * arguments.scenes
         print(
-            f"{size[0]}x{size[1]}: {images / seconds:.1f} images/s of one core "
+            f"{width}x{height}: {images / seconds:.1f} images/s of one core "
             f"({1000 * seconds / images:.1f} ms an image, {images} images)"
         )

@@ -1,4 +1,4 @@
-"""Whole models on random inputs: what the commands that measure them share."""
+"""Whole models and random inputs for the commands that measure them."""
 
 import argparse
 import math
@@ -23,12 +23,12 @@ from gsmap.structures.grid import BEVGrid
 from gsmap.structures.rigid import rigid
 from gsmap.utils.errors import InputError
 
-# transforms of images, cameras and LiDAR, whose targets `add_auxiliary_targets` makes
-AT_RANDOM = {"MakeBEVMask", "MakePVMask", "MakeDepthMap"}
+# Transforms of images, cameras and LiDAR: `add_auxiliary_targets` makes random targets instead.
+RANDOM_TARGETS = {"MakeBEVMask", "MakePVMask", "MakeDepthMap"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add which models to measure, and how."""
+    """Add the models to measure and the options of their measurement to a parser."""
     parser.add_argument("configs", nargs="+", help="configs; ratios refer to the first")
     parser.add_argument(
         "--size",
@@ -50,30 +50,46 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def measured_each(
+def measure_each(
     task: Callable[..., Cost], arguments: Sequence[tuple[Any, ...]]
 ) -> list[tuple[str, Cost]]:
-    """Call ``task`` on every tuple of arguments, on a CPU each in a process of its own, in turn.
+    """Call a task with each tuple of arguments, one after another.
 
-    There, what an earlier model leaves behind in the allocator would count as memory of the next
-    one; a GPU's memory is counted by torch.
+    On a CPU each call has a fresh process: memory that an earlier model leaves in the allocator
+    would count as memory of the next one. Memory of a GPU is counted by torch.
+
+    Args:
+        task: Function that can be pickled.
+        arguments: Arguments of each call: the config file, the parsed options, and further ones.
 
     Returns:
-        The first argument of every call, and its result.
+        Config file and cost of every call.
     """
     on_cpu = all(args.device == "cpu" for _, args, *_ in arguments)
     call = partial(in_own_process, task) if on_cpu else task
-    return [(each[0], call(*each)) for each in arguments]
+    return [(values[0], call(*values)) for values in arguments]
 
 
 def build(path: str, args: argparse.Namespace, raster: str = "") -> Any:
-    """Build a config's model with random weights, with another raster size if one is given."""
+    """Build a config's model with random weights.
+
+    Args:
+        path: Config file.
+        args: Parsed options of ``add_arguments``.
+        raster: Rows and columns of the raster of the head's masks, such as ``200x100``; empty for
+            the config's.
+
+    Returns:
+        The model on the device of the options.
+    """
     torch.set_num_threads(args.threads)
     cfg = read_config(path, getattr(args, "cfg_options", None))
     if raster:
-        rows, columns = (int(side) for side in raster.split("x"))
-        (x0, x1), (y0, y1) = cfg.model.grid.x_range, cfg.model.grid.y_range
-        cfg.model.map_head.masks = {"pixel_m": ((x1 - x0) / columns, (y1 - y0) / rows)}
+        rows, columns = map(int, raster.split("x"))
+        x_min, x_max = cfg.model.grid.x_range
+        y_min, y_max = cfg.model.grid.y_range
+        pixel_m = ((x_max - x_min) / columns, (y_max - y_min) / rows)
+        cfg.model.map_head.masks = {"pixel_m": pixel_m}
     if cfg.model.get("img_backbone"):
         cfg.model.img_backbone.init_cfg = None
     torch.manual_seed(0)
@@ -82,101 +98,142 @@ def build(path: str, args: argparse.Namespace, raster: str = "") -> Any:
 
 
 def image_shape(path: str, args: argparse.Namespace) -> tuple[int, int, int]:
-    """Return how many cameras, rows and columns a config's network sees, padding included.
+    """Size of the network's images for a config, padding included.
+
+    Args:
+        path: Config file.
+        args: Parsed options of ``add_arguments``.
+
+    Returns:
+        Number of cameras, image rows and columns.
 
     Raises:
-        ValueError: If the config does not say how large its image files are.
+        ValueError: If the config does not state the size of its image files.
     """
     cfg = read_config(path)
     dataset = cfg.test_dataloader.dataset
+    cameras = len(dataset.cameras)
     if args.size:
-        return len(dataset.cameras), *args.size
+        height, width = args.size
+        return cameras, height, width
     if "_file_size" not in cfg:
         raise InputError(f"{path} says nothing of _file_size (width, height): give --size H W.")
     step: dict = next((step for step in dataset.pipeline if step.type == "ScaleImages"), {})
     if step.get("size"):
-        return len(dataset.cameras), step["size"][1], step["size"][0]
+        width, height = step["size"]
+        return cameras, height, width
     scale = step.get("scale", 1.0)
     unit = cfg.model.data_preprocessor.get("pad_size_divisor", 1)
-    width, height = (math.ceil(int(side * scale + 1e-6) / unit) * unit for side in cfg._file_size)
-    return len(dataset.cameras), height, width
+    width, height = [math.ceil(int(side * scale + 1e-6) / unit) * unit for side in cfg._file_size]
+    return cameras, height, width
 
 
 def mask_stride(path: str) -> int:
-    """Return how many pixels of an image a cell of a config's camera masks covers."""
+    """Edge of a cell of a config's camera masks in image pixels."""
     pipeline = read_config(path).train_dataloader.dataset.pipeline
-    default = MakePVMask.stride
-    given = (step.get("stride", default) for step in pipeline if step.type == "MakePVMask")
-    return next(given, default)
+    for step in pipeline:
+        if step.type == "MakePVMask":
+            return step.get("stride", MakePVMask.stride)
+    return MakePVMask.stride
 
 
 def model_and_batch(
     path: str, args: argparse.Namespace, batch: int = 1, raster: str = "", num_elements: int = 15
 ) -> tuple[Any, dict[str, torch.Tensor], list[Det3DDataSample]]:
-    """Build a config's model as ``build`` does, and random inputs for it.
+    """Build a config's model and random inputs for it.
 
-    They are normalised images of cameras in a ring, and straight elements as ground truth, each
-    sample of a scene of its own (`drive_on`).
+    The inputs are normalised images of cameras in a ring, and straight elements as ground truth.
+    Each sample belongs to another scene (see `drive_on`).
+
+    Args:
+        path: Config file.
+        args: Parsed options of ``add_arguments``.
+        batch: Number of samples, >= 1.
+        raster: Rows and columns of the raster of the head's masks, such as ``200x100``; empty for
+            the config's.
+        num_elements: Number of elements in each sample's ground truth.
+
+    Returns:
+        The model; the inputs, with images ``imgs`` (B, V, 3, H, W); and the samples.
     """
-    model, shape, stride = build(path, args, raster), image_shape(path, args), mask_stride(path)
+    model = build(path, args, raster=raster)
+    shape = image_shape(path, args)
+    stride = mask_stride(path)
     generator = torch.Generator().manual_seed(0)
-    cameras, *size = shape
-    images = torch.randn(batch, cameras, 3, *size, generator=generator).to(args.device)
-    eyes = np.stack([np.eye(4)] * cameras)
-    metainfo: dict[str, Any] = {"token": "random", "lidar2img": ring_of_cameras(*shape)}
-    metainfo |= {"cam2img": eyes, "lidar2cam": eyes, "img_aug_matrix": eyes, "lidar2ego": np.eye(4)}
-    metainfo |= {"timestamp_ns": 0, "lidar2global": np.eye(4)}
+    cameras, height, width = shape
+    images = torch.randn(batch, cameras, 3, height, width, generator=generator).to(args.device)
+    identities = np.stack([np.eye(4)] * cameras)
+    metainfo: dict[str, Any] = {
+        "token": "random",
+        "lidar2img": ring_of_cameras(cameras, height, width=width),
+        "cam2img": identities,
+        "lidar2cam": identities,
+        "img_aug_matrix": identities,
+        "lidar2ego": np.eye(4),
+        "timestamp_ns": 0,
+        "lidar2global": np.eye(4),
+    }
     grid = model.map_head.grid
+    num_points = getattr(model.map_head, "num_points", 2)
+    num_classes = len(model.map_head.classes)
+    steps = torch.linspace(0, 1, num_points)[:, None]
     samples = []
     for number in range(batch):
         ends = grid.metres_from_norm(torch.rand(num_elements, 2, 2, generator=generator))
-        steps = torch.linspace(0, 1, getattr(model.map_head, "num_points", 2))[:, None]
         pts = ends[:, :1] * (1 - steps) + ends[:, 1:] * steps  # (K, P, 2)
-        labels = torch.randint(len(model.map_head.classes), (num_elements,), generator=generator)
+        labels = torch.randint(num_classes, (num_elements,), generator=generator)
         sample = Det3DDataSample(metainfo={**metainfo, "scene": f"scene {number}"})
-        sample.gt_instances_3d = InstanceData(
+        instances = InstanceData(
             labels_3d=labels,
             pts=pts,
-            pts_shifts=torch.stack([pts, pts.flip(1)], 1),
+            pts_shifts=torch.stack([pts, pts.flip(1)], dim=1),
             polylines=pts,
-        ).to(args.device)
-        add_auxiliary_targets(sample, model, shape, stride, generator)
-        add_own_targets(sample, path, grid)
+        )
+        sample.gt_instances_3d = instances.to(args.device)
+        add_auxiliary_targets(sample, model, shape=shape, stride=stride, generator=generator)
+        add_config_targets(sample, path, grid=grid)
         samples.append(sample.to(args.device))
     return model, {"imgs": images}, samples
 
 
 def drive_on(samples: Sequence[Det3DDataSample]) -> None:
-    """Take samples half a second and 4 m further, so that a model with memory has one of them."""
+    """Advance samples by half a second and 4 m, in place, so that models with memory use theirs."""
+    step = rigid(np.eye(3), [0.0, 4.0, 0.0])
     for sample in samples:
-        moved = sample.lidar2global @ rigid(np.eye(3), [0.0, 4.0, 0.0])
-        later = {"timestamp_ns": sample.timestamp_ns + 500_000_000, "lidar2global": moved}
-        sample.set_metainfo(later)
+        sample.set_metainfo(
+            {
+                "timestamp_ns": sample.timestamp_ns + 500_000_000,
+                "lidar2global": sample.lidar2global @ step,
+            }
+        )
 
 
-def add_own_targets(sample: Det3DDataSample, path: str, grid: BEVGrid) -> None:
-    """Let the transforms that a config's head and losses need make targets of the elements."""
+def add_config_targets(sample: Det3DDataSample, path: str, grid: BEVGrid) -> None:
+    """Make the targets that a config's head and losses need from the elements, in place.
+
+    Args:
+        sample: Sample with elements as ground truth.
+        path: Config file.
+        grid: Grid of the head.
+    """
     cfg = read_config(path)
-    needed = needed_targets(cfg).keys() - AT_RANDOM
+    transforms = needed_targets(cfg).keys() - RANDOM_TARGETS
     instances = sample.gt_instances_3d
+    labels = instances.labels_3d.tolist()
+    polylines = instances.polylines.cpu().numpy()
     results = {
         "token": sample.token,
         "x_range": grid.x_range,
         "y_range": grid.y_range,
         "gt_instances_3d": instances,
-        "map_instances": [
-            MapInstance(label, points.numpy())
-            for label, points in zip(
-                instances.labels_3d.tolist(), instances.polylines.cpu(), strict=True
-            )
-        ],
+        "map_instances": list(map(MapInstance, labels, polylines)),
     }
     for step in cfg.train_dataloader.dataset.pipeline:
-        if step.type in needed:
+        if step.type in transforms:
             results = TRANSFORMS.build(step).transform(results)
-    for name in results:
+    for name, value in results.items():
         if name.startswith("gt_"):
-            setattr(sample, name, results[name])
+            setattr(sample, name, value)
 
 
 def add_auxiliary_targets(
@@ -186,32 +243,56 @@ def add_auxiliary_targets(
     stride: int,
     generator: torch.Generator,
 ) -> None:
-    """Add what auxiliary heads train on: masks of every class and depth, at random."""
+    """Add random targets of auxiliary heads: masks of every class, and depth, in place.
+
+    Args:
+        sample: The sample.
+        model: Model with the heads.
+        shape: Number of cameras, image rows and columns.
+        stride: Edge of a cell of the camera masks in image pixels.
+        generator: Source of the values.
+    """
     classes = len(model.map_head.classes)
     cells = model.bev_encoder.grid
-    views, *size = shape
-    features = size[0] // stride, size[1] // stride
+    views, height, width = shape
+    rows = height // stride
+    columns = width // stride
     sample.gt_seg = torch.rand(classes, cells.height, cells.width, generator=generator).round()
-    sample.gt_pv_seg = torch.rand(views, classes, *features, generator=generator).round()
-    sample.gt_depth = 1 + 33 * torch.rand(views, *size, generator=generator)
+    sample.gt_pv_seg = torch.rand(views, classes, rows, columns, generator=generator).round()
+    sample.gt_depth = 1 + 33 * torch.rand(views, height, width, generator=generator)
 
 
 def ring_of_cameras(num_cams: int, height: int, width: int) -> np.ndarray:
-    """Return projections of level cameras, outward at equal angles, 90 degrees wide. (V, 4, 4)"""
+    """Projections of level cameras that face outward at equal angles, 90 degrees wide.
+
+    Args:
+        num_cams: Number of cameras V.
+        height: Image height in pixels.
+        width: Image width in pixels.
+
+    Returns:
+        Transforms from the sensor frame (x right, y forward, z up) to pixels. (V, 4, 4)
+    """
     intrinsics = np.eye(4)
     intrinsics[:3, :3] = [[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1]]
     matrices = []
     for angle in np.arange(num_cams) * (2 * np.pi / num_cams):
         camera = np.eye(4)  # camera x right, y down, z forward; frame x right, y forward, z up
-        camera[0, :2] = np.cos(angle), np.sin(angle)
-        camera[1, :3] = 0, 0, -1
-        camera[2, :3] = -np.sin(angle), np.cos(angle), 0
+        camera[0, :2] = [np.cos(angle), np.sin(angle)]
+        camera[1, :3] = [0, 0, -1]
+        camera[2, :3] = [-np.sin(angle), np.cos(angle), 0]
         matrices.append(intrinsics @ camera)
     return np.stack(matrices)
 
 
 def report(args: argparse.Namespace, header: list[str], rows: list[list[str]]) -> None:
-    """Print the table and say how it was measured."""
+    """Print a table below the conditions of the measurement.
+
+    Args:
+        args: Parsed options of ``add_arguments``.
+        header: Names of the columns.
+        rows: Cells of each row.
+    """
     clock = "wall clock" if args.device != "cpu" else "processor time of all threads"
     kind = "fp16 autocast" if args.fp16 else "float32"
     shapes = dict.fromkeys(image_shape(path, args) for path in args.configs)

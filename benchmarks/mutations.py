@@ -1,8 +1,8 @@
-"""How many small changes of the code the tests notice: a mutation is a test's test.
+"""Share of small changes of the code that the tests detect (mutation testing).
 
 Each mutant changes one place of one module: a comparison, a sign, a number, a truth value, `min` or
-`max`, `and` or `or`, a `not`. The test files nearest to the module, those of its room that import
-it, then run on it, and if none of them fails all others of the room. It lives in the memory of a
+`max`, `and` or `or`, a `not`. The test files of the room that import the module run on the mutant,
+and if none of them fails, all other test files of the room. A mutant exists in the memory of a
 child process alone: no file changes.
 """
 
@@ -26,10 +26,13 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.shipped import shipped
 
 REPO = shipped()
-TESTS = {"mapdata": "map_data", "drivemaps": "drive_maps"}  # folders of tests by room
+TESTS = {"mapdata": "map_data", "drivemaps": "drive_maps"}  # test folder by room
 FOLDERS = ("GSMap/gsmap", "MapData/mapdata", "DriveMaps/drivemaps")
 ROOMS = ("models", "ops", "structures", "evaluation", "datasets", "mapdata", "drivemaps")
-VERDICTS = CAUGHT, SURVIVED, LATE = "caught", "not caught", "timed out"
+CAUGHT = "caught"
+SURVIVED = "not caught"
+LATE = "timed out"
+VERDICTS = (CAUGHT, SURVIVED, LATE)
 PRELOADED = ["gsmap", "pytest", "scipy.ndimage", "shapely", "mmdet3d.models", "mmdet3d.datasets"]
 OPERATORS: dict[type[ast.AST], type[ast.AST]] = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq,
@@ -41,7 +44,7 @@ NAMES |= {"argmax": "argmin", "minimum": "maximum", "maximum": "minimum"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the command's arguments."""
+    """Add the options of ``benchmarks mutations`` to a parser."""
     parser.add_argument("--rooms", nargs="+", choices=ROOMS, default=list(ROOMS), help="of code")
     parser.add_argument("--modules", nargs="+", help="only these, such as gsmap.structures.grid")
     parser.add_argument("--number", type=int, default=60, help="mutants, spread over the rooms")
@@ -52,61 +55,101 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Print each mutant and what became of it, then a row for each room."""
-    rows, rng = [], np.random.default_rng(args.seed)
+    """Print each mutant and its verdict, then a row for each room.
+
+    Args:
+        args: Parsed options of ``add_arguments``.
+
+    Raises:
+        ValueError: If the tests of a room fail without a mutation.
+    """
+    rng = np.random.default_rng(args.seed)
+    rows = []
     for number, room in enumerate(args.rooms):
-        modules = {n: f for n, f in modules_of(room).items() if n in (args.modules or [n])}
-        places = [(n, i) for n, f in modules.items() for i in range(count_places(f.read_text()))]
+        modules = {}
+        places = []
+        for name, path in modules_of(room).items():
+            if args.modules and name not in args.modules:
+                continue
+            modules[name] = path
+            for index in range(count_places(path.read_text())):
+                places.append((name, index))
         share = (args.number + number) // len(args.rooms)
-        drawn = [places[k] for k in rng.permutation(len(places))[:share]]
-        if verdict("", "", tests_of(room, None), None) != SURVIVED:
+        order = rng.permutation(len(places))
+        if verdict("", "", tests=tests_of(room, None), seconds=None) != SURVIVED:
             raise InputError(f"the tests of {room} fail without a mutation: mend them first.")
-        found = []
-        for name, index in drawn:
-            line, change, source = mutant(modules[name].read_text(), index)
-            found.append(verdict_of_room(room, name, source, args.seconds))
-            print(f"{found[-1]}: {modules[name].relative_to(REPO)}:{line} {change}", flush=True)
-        rows.append([room, str(len(found)), *(str(found.count(v)) for v in VERDICTS)])
+        verdicts = []
+        for k in order[:share]:
+            name, index = places[k]
+            path = modules[name]
+            line, change, source = mutant(path.read_text(), index)
+            mutant_verdict = verdict_of_room(room, name, source=source, seconds=args.seconds)
+            verdicts.append(mutant_verdict)
+            print(f"{mutant_verdict}: {path.relative_to(REPO)}:{line} {change}", flush=True)
+        row = [room, str(len(verdicts))]
+        row += [str(verdicts.count(kind)) for kind in VERDICTS]
+        rows.append(row)
     print(markdown_table(["room", "mutants", *VERDICTS], rows))
 
 
 def modules_of(room: str) -> dict[str, Path]:
-    """Return the modules of a room that have near tests; numba would compile its own anew."""
-    found = {}
+    """Files of the modules of a room that some test file of the room imports, by module name.
+
+    Modules of numba and Triton are left out: these compile the source of the file.
+    """
+    modules = {}
     for folder in FOLDERS:
         root = REPO / "projects" / folder
-        for path in sorted((root if root.name == room else root / room).rglob("*.py")):
+        room_folder = root if root.name == room else root / room
+        for path in sorted(room_folder.rglob("*.py")):
             parts = path.relative_to(root.parent).with_suffix("").parts
             name = ".".join(parts).removesuffix(".__init__")
-            if not {"numba", "triton"} & set(path.read_text().split()) and tests_of(room, name):
-                found[name] = path
-    return found
+            words = set(path.read_text().split())
+            if not {"numba", "triton"} & words and tests_of(room, name):
+                modules[name] = path
+    return modules
 
 
 def tests_of(room: str, module: str | None) -> list[str]:
-    """Return the test files of a room, those that import a module or all."""
-    return [
-        str(path)
-        for path in sorted((REPO / "tests" / TESTS.get(room, room)).rglob("test_*.py"))
-        if module is None or module in _imported(path.read_text())
-    ]
+    """Test files of a room.
+
+    Args:
+        room: One of ``ROOMS``.
+        module: Name of a module that the files import; None for all files.
+
+    Returns:
+        Paths in alphabetical order.
+    """
+    paths = sorted((REPO / "tests" / TESTS.get(room, room)).rglob("test_*.py"))
+    if module is None:
+        return list(map(str, paths))
+    return [str(path) for path in paths if module in _imported_names(path.read_text())]
 
 
-def _imported(source: str) -> Iterator[str]:
-    """Yield what a file imports, and what may be a module in it."""
+def _imported_names(source: str) -> Iterator[str]:
+    """Names of the modules that a file imports from, and of their imported members."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.ImportFrom) and node.module:
             yield node.module
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+            for alias in node.names:
+                yield f"{node.module}.{alias.name}"
 
 
 def count_places(source: str) -> int:
-    """Return how many mutants a module has."""
+    """Count the mutants of a module."""
     return sum(1 for _ in _places(ast.parse(source)))
 
 
 def mutant(source: str, index: int) -> tuple[int, str, str]:
-    """Return one mutant of a module: its line, the change, and the mutated source."""
+    """Make one mutant of a module.
+
+    Args:
+        source: Source of the module.
+        index: Number of the mutant, in [0, ``count_places(source)``).
+
+    Returns:
+        Line number, description of the change, and mutated source.
+    """
     tree = ast.parse(source)
     node, fields = next(islice(_places(tree), index, None))
     before = ast.unparse(node)
@@ -116,30 +159,38 @@ def mutant(source: str, index: int) -> tuple[int, str, str]:
 
 
 def _places(tree: ast.AST) -> Iterator[tuple[ast.expr, dict[str, object]]]:
-    """Yield what can change in a module but for types, decorators and texts of errors.
+    """Possible changes of a module outside of types, decorators and texts of errors.
 
-    Each is an expression and the fields that the change sets in it.
+    Yields:
+        An expression, and the fields that the change sets in it.
     """
-    skipped: set[ast.AST] = set()
+    skipped_nodes: set[ast.AST] = set()
     for node in ast.walk(tree):
-        parts = [getattr(node, name, None) for name in ("annotation", "returns")]
-        parts += getattr(node, "decorator_list", [])
-        parts += [node] if isinstance(node, ast.Raise | ast.JoinedStr) else []
-        skipped.update(inner for part in parts if part for inner in ast.walk(part))
-        if isinstance(node, ast.expr) and node not in skipped:
-            yield from ((node, fields) for fields in _changes(node))
+        skipped_parts = [getattr(node, name, None) for name in ("annotation", "returns")]
+        skipped_parts += getattr(node, "decorator_list", [])
+        if isinstance(node, ast.Raise | ast.JoinedStr):
+            skipped_parts.append(node)
+        for part in skipped_parts:
+            if part:
+                skipped_nodes.update(ast.walk(part))
+        if isinstance(node, ast.expr) and node not in skipped_nodes:
+            for fields in _changes(node):
+                yield node, fields
 
 
 def _changes(node: ast.expr) -> list[dict[str, object]]:
-    """Return the changes of an expression, each as the fields that it sets."""
+    """Changes of an expression, each as the fields that it sets."""
     match node:
         case ast.Compare(ops=ops):
-            swapped = [OPERATORS[type(op)]() for op in ops]
-            return [{"ops": [*ops[:k], op, *ops[k + 1 :]]} for k, op in enumerate(swapped)]
+            changes: list[dict[str, object]] = []
+            for k, op in enumerate(ops):
+                changed_op = OPERATORS[type(op)]()
+                changes.append({"ops": [*ops[:k], changed_op, *ops[k + 1 :]]})
+            return changes
         case ast.BinOp(op=op) | ast.BoolOp(op=op) if type(op) in OPERATORS:
             return [{"op": OPERATORS[type(op)]()}]
         case ast.UnaryOp(op=ast.Not() | ast.Invert() | ast.USub() as op, operand=operand):
-            return [{"operand": ast.UnaryOp(op, operand)}]  # twice is never
+            return [{"operand": ast.UnaryOp(op, operand)}]  # applied twice, it has no effect
         case ast.Constant(value=bool(value)):
             return [{"value": not value}]
         case ast.Constant(value=int(value) | float(value)):
@@ -152,22 +203,46 @@ def _changes(node: ast.expr) -> list[dict[str, object]]:
 
 
 def verdict_of_room(room: str, module: str, source: str, seconds: float) -> str:
-    """Return the `verdict` of the nearest tests, or of the room's others if these all pass."""
-    near = tests_of(room, module)
-    result = verdict(module, source, near, seconds)
-    others = [path for path in tests_of(room, None) if path not in near]
-    return verdict(module, source, others, seconds) if result == SURVIVED and others else result
+    """Run the tests that import a module on a mutant, and if they pass, the others of the room.
+
+    Args:
+        room: One of ``ROOMS``.
+        module: Name of the module.
+        source: Source of the mutant.
+        seconds: Time limit of the former tests, and of the latter.
+
+    Returns:
+        One of ``VERDICTS``.
+    """
+    near_tests = tests_of(room, module)
+    near_verdict = verdict(module, source, near_tests, seconds)
+    if near_verdict != SURVIVED:
+        return near_verdict
+    other_tests = [path for path in tests_of(room, None) if path not in near_tests]
+    if not other_tests:
+        return SURVIVED
+    return verdict(module, source, other_tests, seconds)
 
 
 def verdict(module: str, source: str, tests: Sequence[str], seconds: float | None) -> str:
-    """Run tests on a module with another source: ``caught``, ``not caught`` or ``timed out``."""
+    """Run tests on a module with another source.
+
+    Args:
+        module: Name of the module.
+        source: Source of the mutant.
+        tests: Paths of the test files.
+        seconds: Time limit; None for no limit.
+
+    Returns:
+        One of ``VERDICTS``.
+    """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(PRELOADED)
     child = context.Process(target=_run_tests, args=(module, source, tests))
     child.start()
     child.join(seconds)
     if child.exitcode is None:
-        with suppress(ProcessLookupError):  # it has no group of its own yet
+        with suppress(ProcessLookupError):  # the child has no process group yet
             os.killpg(child.pid or 0, signal.SIGKILL)
         child.kill()
         child.join()
@@ -185,18 +260,31 @@ def _run_tests(module: str, source: str, tests: Sequence[str]) -> None:
     import pytest
 
     options = ["-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist", "--rootdir", str(REPO)]
-    sys.exit(pytest.main([*options, "-m", "", *tests]))  # those of faults, too
+    options += ["-m", ""]  # with the tests of faults
+    sys.exit(pytest.main([*options, *tests]))
 
 
 class _Finder:
-    """Finds one module as ever, with another source."""
+    """Import finder that replaces the source of one module.
+
+    Args:
+        module: Name of the module.
+        source: Source of the mutant.
+    """
 
     def __init__(self, module: str, source: str) -> None:
-        self.module, self.source = module, source
+        self.module = module
+        self.source = source
 
     def find_spec(
         self, name: str, path: Sequence[str] | None, _: object = None
     ) -> ModuleSpec | None:
+        """Find the module, with a loader of the mutant; None for all other modules.
+
+        Args:
+            name: Name of a module.
+            path: Search path of its package.
+        """
         spec = PathFinder.find_spec(name, path) if name == self.module else None
         if spec is not None and spec.origin is not None:
             spec.loader = _Loader(name, spec.origin)
@@ -205,7 +293,9 @@ class _Finder:
 
 
 class _Loader(SourceFileLoader):
+    """Loader that compiles ``source`` in place of the file."""
+
     source: str
 
     def get_code(self, fullname: str) -> CodeType:
-        return compile(self.source, self.path, "exec")
+        return compile(self.source, self.path, mode="exec")

@@ -11,29 +11,39 @@ from gsmap.utils.errors import InputError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the command's arguments."""
+    """Add the options of ``benchmarks parameters`` to a parser."""
     parser.add_argument("config", help="config file")
     parser.add_argument("--depth", type=int, default=2, help="levels of modules to list")
 
 
 def run(args: argparse.Namespace) -> None:
-    """Count and print."""
+    """Count and print the parameters of each module.
+
+    Args:
+        args: Parsed options of ``add_arguments``.
+    """
     cfg = read_config(args.config)
     with building(cfg):
         counts = count_parameters(MODELS.build(cfg.model), args.depth)
     width = max(map(len, counts))
     print(f"{'module'.ljust(width)}  {'all':>12}  {'trainable':>12}  {'entries':>12}")
-    for name, numbers in counts.items():
-        print("  ".join([(name or "model").ljust(width), *(f"{n:>12,}" for n in numbers)]))
+    for name, (parameters, trainable, entries) in counts.items():
+        label = (name or "model").ljust(width)
+        print(f"{label}  {parameters:>12,}  {trainable:>12,}  {entries:>12,}")
     print("all and trainable: parameters; entries: numbers in a checkpoint, with buffers")
 
 
 def count_parameters(model: nn.Module, depth: int = 2) -> dict[str, tuple[int, int, int]]:
-    """Count the numbers of a model (named "") and of its modules.
+    """Count the parameters of a model (named "") and of its modules.
 
-    They are all parameters, the trainable ones, and the entries of a checkpoint: buffers such as
-    the statistics of batch norms count, and what has two names counts twice. Modules are listed to
-    ``depth`` levels; those that hold no parameter are left out.
+    Args:
+        model: The model.
+        depth: Levels of modules to list, >= 0. Modules without parameters are left out.
+
+    Returns:
+        By module, the number of parameters, of trainable parameters, and of entries in a
+        checkpoint: these include buffers such as the statistics of batch norms, and count a
+        parameter with two names twice.
 
     Raises:
         ValueError: If ``depth`` is negative.
@@ -44,8 +54,13 @@ def count_parameters(model: nn.Module, depth: int = 2) -> dict[str, tuple[int, i
     for name, module in model.named_modules():
         if name and name.count(".") >= depth:
             continue
-        sizes = [(p.numel(), p.requires_grad) for p in module.parameters()]
-        if total := sum(size for size, _ in sizes):
-            trainable = sum(size for size, grad in sizes if grad)
-            counts[name] = total, trainable, sum(v.numel() for v in module.state_dict().values())
+        total = 0
+        trainable = 0
+        for parameter in module.parameters():
+            total += parameter.numel()
+            if parameter.requires_grad:
+                trainable += parameter.numel()
+        if total:
+            entries = sum(value.numel() for value in module.state_dict().values())
+            counts[name] = (total, trainable, entries)
     return counts

@@ -17,7 +17,11 @@ __all__ = ["add_arguments", "run"]
 
 
 def run(args: argparse.Namespace) -> None:
-    """Time the parts of every config's model and print them."""
+    """Measure and print the time of every part of every config's model.
+
+    Args:
+        args: Parsed options of ``add_arguments``.
+    """
     for config in args.configs:
         parts, (cameras, height, width) = profile(config, args)
         backbone = parts["image backbone"]
@@ -28,18 +32,27 @@ def run(args: argparse.Namespace) -> None:
 
 
 @torch.no_grad()
-def profile(path: str, args: argparse.Namespace) -> tuple[dict[str, float], list[int]]:
-    """Return the seconds of every part, fastest of all repeats, and cameras, rows and columns."""
+def profile(path: str, args: argparse.Namespace) -> tuple[dict[str, float], tuple[int, int, int]]:
+    """Measure the parts of a config's model.
+
+    Args:
+        path: Config file.
+        args: Parsed options of ``add_arguments``.
+
+    Returns:
+        Shortest time of every part in seconds; and the number of cameras, image rows and columns.
+    """
     model, inputs, samples = model_and_batch(path, args)
     model.eval()
-    cameras, _, *size = inputs["imgs"][0].shape
-    samples[0].set_metainfo({"batch_input_shape": tuple(size)})
+    cameras, _, height, width = inputs["imgs"][0].shape
+    samples[0].set_metainfo({"batch_input_shape": (height, width)})
     images = inputs["imgs"][0].contiguous(memory_format=torch.channels_last)
     on_gpu = args.device != "cpu"
     clock = time.perf_counter if on_gpu else time.process_time
     times: dict[str, list[float]] = {}
 
-    def timed(part: str, function: Callable[..., Any], *inputs: Any) -> Any:
+    def time_part(part: str, function: Callable[..., Any], *inputs: Any) -> Any:
+        """Call a function, note its time, and return its result."""
         start = clock()
         result = function(*inputs)
         if on_gpu:
@@ -49,10 +62,11 @@ def profile(path: str, args: argparse.Namespace) -> tuple[dict[str, float], list
 
     for _ in range(args.repeats + 1):  # the first is a warm-up
         with torch.autocast(args.device, enabled=args.fp16):
-            features = timed("image backbone", model.folded_backbone, model.img_backbone, images)
+            feats = time_part("image backbone", model.folded_backbone, model.img_backbone, images)
             if model.img_neck is not None:
-                features = timed("image neck", model.img_neck, features)
-            features = [feature.unflatten(0, (1, -1)) for feature in features]
-            bev = timed("BEV encoder", model.bev_encoder, features, [samples[0].metainfo])
-            timed("map head", model.map_head.predict, bev, samples)
-    return {part: min(values[1:]) for part, values in times.items()}, [cameras, *size]
+                feats = time_part("image neck", model.img_neck, feats)
+            feats = [level.unflatten(0, (1, -1)) for level in feats]
+            bev = time_part("BEV encoder", model.bev_encoder, feats, [samples[0].metainfo])
+            time_part("map head", model.map_head.predict, bev, samples)
+    shortest = {part: min(values[1:]) for part, values in times.items()}
+    return shortest, (cameras, height, width)

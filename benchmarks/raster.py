@@ -1,4 +1,4 @@
-"""Time and memory of the rasterizers and of what is built on them, beside their floors."""
+"""Time and memory of the rasterizers and the losses on top of them, beside their floors."""
 
 import argparse
 import math
@@ -23,14 +23,14 @@ POINTS = 20
 TRAINING_SIZE = (200, 100)
 RATE_REPEATS = 20
 # The reference is measured on as many instances as fill a tensor of this size and scaled up: it is
-# linear in them. Smaller tensors are kept by malloc when they are freed, and blur its peak memory.
+# linear in them. Freed tensors of smaller sizes stay with malloc and blur the peak memory.
 REFERENCE_BYTES = 36 * MIB
 FLOOR_DENSITY = 1e-6  # pixels where a Gaussian is below need no exponential
 Gaussians = tuple[Tensor, Tensor, Tensor]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the command's arguments."""
+    """Add the options of ``benchmarks raster`` to a parser."""
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument(
@@ -41,7 +41,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure, print and write the tables."""
+    """Measure, print and write the tables.
+
+    Args:
+        args: Parsed options of ``add_arguments``.
+    """
     torch.set_num_threads(args.threads)
     torch.manual_seed(0)
     clock = "wall clock" if args.device != "cpu" else "processor time, all threads together"
@@ -56,14 +60,31 @@ def run(args: argparse.Namespace) -> None:
 
 
 def random_polylines(count: int, grid: BEVGrid) -> Tensor:
-    """Return winding lines about as long as map elements are, in metres. (count, 20, 2)"""
+    """Winding lines about as long as map elements.
+
+    Args:
+        count: Number of lines.
+        grid: Grid that most of the lines lie in.
+
+    Returns:
+        Vertices in metres. (count, 20, 2)
+    """
+    width_m, height_m = grid.extent_m
     steps = torch.randn(count, POINTS, 2) * 0.3 + torch.tensor([0.2, 1.5])
-    starts = torch.rand(count, 1, 2) * torch.tensor(grid.extent_m)
-    return starts + steps.cumsum(1) - torch.tensor([grid.extent_m[0] / 2, grid.extent_m[1] * 0.75])
+    starts = torch.rand(count, 1, 2) * torch.tensor([width_m, height_m])
+    return starts + steps.cumsum(1) - torch.tensor([width_m / 2, height_m * 0.75])
 
 
 def gaussians_along(polylines: Tensor, scales_m: tuple[float, float]) -> Gaussians:
-    """Put a Gaussian of fixed size and random direction on every vertex."""
+    """Place a Gaussian of fixed size and random direction on every vertex.
+
+    Args:
+        polylines: Vertices in metres. (N, P, 2)
+        scales_m: Standard deviations in metres along the axes of each Gaussian.
+
+    Returns:
+        Means (N, P, 2) and scales (N, P, 2) in metres, and rotations in radians (N, P).
+    """
     scales = torch.tensor(scales_m).expand_as(polylines).contiguous()
     return polylines, scales, torch.rand(polylines.shape[:-1]) * math.pi
 
@@ -71,31 +92,53 @@ def gaussians_along(polylines: Tensor, scales_m: tuple[float, float]) -> Gaussia
 def forward_backward(
     render: Callable[..., Tensor], inputs: tuple[Tensor, ...], upstream: Tensor
 ) -> Callable[[], object]:
-    """Return a call that renders and takes the gradient in every input."""
+    """Make a function that renders and computes the gradient of every input.
+
+    Args:
+        render: Differentiable function of the inputs.
+        inputs: Inputs, moved to the device of ``upstream``.
+        upstream: Gradient of the result, in the shape of the result.
+
+    Returns:
+        Function without arguments that returns the gradients.
+    """
     leaves = [value.to(upstream.device).requires_grad_() for value in inputs]
-    return lambda: torch.autograd.grad(render(*leaves), leaves, upstream)
+    return lambda: torch.autograd.grad(render(*leaves), leaves, grad_outputs=upstream)
 
 
 def ellipse_pixels(gaussians: Gaussians, grid: BEVGrid) -> int:
-    """Count the pixels, over all Gaussians, where one is at least ``FLOOR_DENSITY``."""
+    """Count the pixels with a density of at least ``FLOOR_DENSITY``, over all Gaussians.
+
+    Args:
+        gaussians: Means (N, P, 2) and scales (N, P, 2) in metres, and rotations in radians (N, P).
+        grid: The raster.
+
+    Returns:
+        Sum of the pixels of each Gaussian.
+    """
+    all_means, all_scales, all_rotations = gaussians
     total = 0
-    for means, scales, rotations in zip(*gaussians, strict=True):
+    for means, scales, rotations in zip(all_means, all_scales, all_rotations, strict=True):
         densities = gaussian_densities(means, scales, rotations, grid)
         total += int((densities >= FLOOR_DENSITY).sum())
     return total
 
 
 def byte_seconds(device: torch.device) -> float:
-    """Measure the time to write a byte to new memory and to read it again."""
+    """Measure the seconds to write a byte to new memory and to read it again."""
     size = 8 * MIB if device.type == "cpu" else 512 * MIB  # far beyond a GPU's cache
-    write = measure(lambda: torch.empty(size, device=device).fill_(0.5), device, RATE_REPEATS)
     data = torch.ones(size, device=device)
-    read = measure(lambda: data.sum(), device, RATE_REPEATS)
-    return (write.time_s(device) + read.time_s(device)) / (4 * size)
+
+    def write() -> Tensor:
+        return torch.empty(size, device=device).fill_(0.5)
+
+    write_s = measure(write, device, repeats=RATE_REPEATS).time_s(device)
+    read_s = measure(data.sum, device, repeats=RATE_REPEATS).time_s(device)
+    return (write_s + read_s) / (4 * size)
 
 
 def exponential_seconds(device: torch.device) -> float:
-    """Measure the time of one of the CPU kernels' exponentials; a GPU's hide behind its memory."""
+    """Measure the seconds of an exponential of the CPU kernels; 0 on a GPU, bound by its memory."""
     if device.type != "cpu":
         return 0.0
     import numba
@@ -112,84 +155,136 @@ def exponential_seconds(device: torch.device) -> float:
         return out
 
     array = -torch.rand(1 << 12).numpy()
-    cost = measure(lambda: fill_exponentials(array, 256), device, RATE_REPEATS)
+    cost = measure(lambda: fill_exponentials(array, 256), device, repeats=RATE_REPEATS)
     return cost.cpu_s / (256 * len(array))
 
 
 def rendering_table(args: argparse.Namespace) -> str:
-    """Measure the renderers at every size and scale."""
+    """Measure the renderers at every size and scale.
+
+    Args:
+        args: Parsed options of ``add_arguments``.
+
+    Returns:
+        Markdown table, with the rates that its floors come from.
+    """
     device = torch.device(args.device)
     backend = "triton" if device.type == "cuda" else "cpu"
-    per_byte_s, per_exponential_s = byte_seconds(device), exponential_seconds(device)
+    per_byte_s = byte_seconds(device)
+    per_exponential_s = exponential_seconds(device)
     rows = []
     for height, width in SIZES:
-        grid = BEVGrid((-15, 15), (-30, 30), height, width)
+        grid = BEVGrid((-15, 15), (-30, 30), height=height, width=width)
         lines = random_polylines(args.instances, grid)
         upstream = torch.randn(args.instances, height, width, device=device)
-        mapvr = measure_soft_lines(lines, grid, upstream, args.repeats)
+        mapvr = measure_soft_lines(lines, grid, upstream=upstream, repeats=args.repeats)
+        count = min(args.instances, math.ceil(REFERENCE_BYTES / (4 * POINTS * height * width)))
+        factor = args.instances / count
         for scales_m in SCALES_M:
             gaussians = gaussians_along(lines, scales_m)
-            count = min(args.instances, math.ceil(REFERENCE_BYTES / (4 * POINTS * height * width)))
-            few = gaussians[0][:count], gaussians[1][:count], gaussians[2][:count]
-            factor = args.instances / count
-            reference = measure_renderer(few, grid, upstream, "reference", 2).scaled(factor)
-            fused = measure_renderer(gaussians, grid, upstream, backend, args.repeats)
+            means, scales, rotations = gaussians
+            few = (means[:count], scales[:count], rotations[:count])
+            reference = measure_renderer(
+                few, grid, upstream=upstream, backend="reference", repeats=2
+            )
+            fused = measure_renderer(
+                gaussians, grid, upstream=upstream, backend=backend, repeats=args.repeats
+            )
             pixels = ellipse_pixels(few, grid) * factor
-            # nobody can beat: masks written and read once, two exponentials per pixel
+            # No renderer is faster: masks written and read once, two exponentials per pixel.
             floor_s = 4 * upstream.numel() * per_byte_s + 2 * pixels * per_exponential_s
-            name = f"{height} x {width}", " x ".join(f"{s:g}" for s in scales_m)
-            rows.append([*name, *rendering_row(reference, fused, floor_s, mapvr, upstream)])
+            cells = rendering_cells(
+                reference=reference.scale(factor),
+                fused=fused,
+                floor_s=floor_s,
+                mapvr=mapvr,
+                upstream=upstream,
+            )
+            rows.append([f"{height} x {width}", f"{scales_m[0]:g} x {scales_m[1]:g}", *cells])
     rates = (
         f"Floor: {per_byte_s * 1e12:.0f} ps per byte of a mask, written and read once, and "
         f"{per_exponential_s * 1e12:.0f} ps per exponential, measured in this run.\n\n"
     )
-    return rates + markdown_table(
-        (
-            "raster",
-            "sigma (m)",
-            "reference (ms)",
-            f"{backend} (ms)",
-            "times faster",
-            f"{backend} wall clock (ms)",
-            "floor (ms)",
-            "measured / floor",
-            "reference memory (MiB)",
-            f"{backend} memory (MiB)",
-            "share of reference",
-            "in masks",
-            "MapVR lines (ms)",
-        ),
-        rows,
+    header = (
+        "raster",
+        "sigma (m)",
+        "reference (ms)",
+        f"{backend} (ms)",
+        "times faster",
+        f"{backend} wall clock (ms)",
+        "floor (ms)",
+        "measured / floor",
+        "reference memory (MiB)",
+        f"{backend} memory (MiB)",
+        "share of reference",
+        "in masks",
+        "MapVR lines (ms)",
     )
+    return rates + markdown_table(header, rows)
 
 
 def measure_renderer(
     gaussians: Gaussians, grid: BEVGrid, upstream: Tensor, backend: str, repeats: int
 ) -> Cost:
-    """Measure forward and backward of one backend."""
-    call = forward_backward(
-        lambda means, scales, rotations: render_gaussians(means, scales, rotations, grid, backend),
-        gaussians,
-        upstream[: len(gaussians[0])],
-    )
-    return measure(call, upstream.device, repeats)
+    """Measure forward and backward of one backend.
+
+    Args:
+        gaussians: Means (N, P, 2) and scales (N, P, 2) in metres, and rotations in radians (N, P).
+        grid: The raster.
+        upstream: Gradients of at least N masks. (>= N, H, W)
+        backend: Backend of ``render_gaussians``.
+        repeats: Number of timed calls.
+
+    Returns:
+        Time and memory of a call.
+    """
+
+    def render(means: Tensor, scales: Tensor, rotations: Tensor) -> Tensor:
+        return render_gaussians(means, scales, rotations, grid=grid, backend=backend)
+
+    count = len(gaussians[0])
+    call = forward_backward(render, gaussians, upstream=upstream[:count])
+    return measure(call, upstream.device, repeats=repeats)
 
 
 def measure_soft_lines(lines: Tensor, grid: BEVGrid, upstream: Tensor, repeats: int) -> Cost:
-    """Measure forward and backward of MapVR's soft lines."""
-    vertices = grid.px_from_metres(lines)
-    call = forward_backward(
-        lambda leaf: soft_rasters(leaf, grid.height, grid.width), (vertices,), upstream
-    )
-    return measure(call, upstream.device, repeats)
+    """Measure forward and backward of MapVR's soft lines.
+
+    Args:
+        lines: Vertices in metres. (N, P, 2)
+        grid: The raster.
+        upstream: Gradients of the masks. (N, H, W)
+        repeats: Number of timed calls.
+
+    Returns:
+        Time and memory of a call.
+    """
+
+    def render(vertices: Tensor) -> Tensor:
+        return soft_rasters(vertices, height=grid.height, width=grid.width)
+
+    call = forward_backward(render, (grid.px_from_metres(lines),), upstream=upstream)
+    return measure(call, upstream.device, repeats=repeats)
 
 
-def rendering_row(
+def rendering_cells(
     reference: Cost, fused: Cost, floor_s: float, mapvr: Cost, upstream: Tensor
 ) -> list[str]:
-    """Format one line of the table."""
+    """Format the measurements of one row of the table.
+
+    Args:
+        reference: Cost of the reference.
+        fused: Cost of the fused kernels.
+        floor_s: Lower bound of the time in seconds.
+        mapvr: Cost of MapVR's soft lines.
+        upstream: Gradients of the masks. (N, H, W)
+
+    Returns:
+        Cells after size and scale.
+    """
     device = upstream.device
-    reference_s, fused_s = reference.time_s(device), fused.time_s(device)
+    reference_s = reference.time_s(device)
+    fused_s = fused.time_s(device)
     return [
         f"{reference_s * 1e3:.0f}",
         f"{fused_s * 1e3:.1f}",
@@ -206,48 +301,65 @@ def rendering_row(
 
 
 def training_table(args: argparse.Namespace) -> str:
-    """Measure what a training step does beside rendering, fused and as the reference."""
+    """Measure the work of a training step beside rendering, by the reference and by fused kernels.
+
+    Args:
+        args: Parsed options of ``add_arguments``.
+
+    Returns:
+        Markdown table.
+    """
     device = torch.device(args.device)
-    grid = BEVGrid((-15, 15), (-30, 30), *TRAINING_SIZE)
-    matched = args.instances // 4
-    lines = random_polylines(matched, grid).to(device)
+    height, width = TRAINING_SIZE
+    grid = BEVGrid((-15, 15), (-30, 30), height=height, width=width)
+    num_matched = args.instances // 4
+    num_truths = min(15, num_matched)
+    lines = random_polylines(num_matched, grid).to(device)
     targets = draw_polylines(lines, grid)
-    near = gaussians_along(random_polylines(matched, grid), (1.0, 0.4))
-    means, scales, rotations = (value.to(device) for value in near)
-    preds = render_gaussians(means, scales, rotations, grid)
-    upstream = torch.ones(matched, device=device)
+    means, scales, rotations = gaussians_along(random_polylines(num_matched, grid), (1.0, 0.4))
+    preds = render_gaussians(
+        means.to(device), scales.to(device), rotations=rotations.to(device), grid=grid
+    )
+    upstream = torch.ones(num_matched, device=device)
 
-    def loss(backend: str) -> Callable[[], object]:
-        return forward_backward(
-            lambda masks: raster_loss(masks, targets, backend=backend), (preds.clone(),), upstream
-        )
+    def make_drawing(backend: str) -> Callable[[], object]:
+        return lambda: draw_polylines(lines, grid, backend=backend)
 
-    few = min(15, matched)
-    works: dict[str, Callable[[str], Callable[[], object]]] = {
-        f"draw {matched} ground truths": lambda backend: (
-            lambda: draw_polylines(lines, grid, backend=backend)
-        ),
-        f"raster loss of {matched} instances, forward + backward": loss,
-        f"soft IoU, 50 predictions x {few} ground truths": lambda backend: (
-            lambda: pairwise_soft_iou(preds[:50], targets[:few], backend=backend)
-        ),
+    def make_loss(backend: str) -> Callable[[], object]:
+        def loss(masks: Tensor) -> Tensor:
+            return raster_loss(masks, targets, backend=backend)
+
+        return forward_backward(loss, (preds.clone(),), upstream=upstream)
+
+    def make_iou(backend: str) -> Callable[[], object]:
+        return lambda: pairwise_soft_iou(preds[:50], targets[:num_truths], backend=backend)
+
+    works = {
+        f"draw {num_matched} ground truths": make_drawing,
+        f"raster loss of {num_matched} instances, forward + backward": make_loss,
+        f"soft IoU, 50 predictions x {num_truths} ground truths": make_iou,
     }
     rows = []
-    for name, make in works.items():
-        reference = measure(make("reference"), device, 2)
-        auto = measure(make("auto"), device, args.repeats)
-        times = reference.time_s(device), auto.time_s(device)
-        peaks = f"{reference.peak_bytes / MIB:.0f}", f"{auto.peak_bytes / MIB:.0f}"
-        milliseconds = f"{times[0] * 1e3:.0f}", f"{times[1] * 1e3:.1f}"
-        rows.append([name, *milliseconds, f"{times[0] / times[1]:.0f}", *peaks])
-    return markdown_table(
-        (
-            "work",
-            "reference (ms)",
-            "auto (ms)",
-            "times faster",
-            "reference memory (MiB)",
-            "auto memory (MiB)",
-        ),
-        rows,
+    for name, make_work in works.items():
+        reference = measure(make_work("reference"), device, repeats=2)
+        auto = measure(make_work("auto"), device, repeats=args.repeats)
+        reference_s = reference.time_s(device)
+        auto_s = auto.time_s(device)
+        row = [
+            name,
+            f"{reference_s * 1e3:.0f}",
+            f"{auto_s * 1e3:.1f}",
+            f"{reference_s / auto_s:.0f}",
+            f"{reference.peak_bytes / MIB:.0f}",
+            f"{auto.peak_bytes / MIB:.0f}",
+        ]
+        rows.append(row)
+    header = (
+        "work",
+        "reference (ms)",
+        "auto (ms)",
+        "times faster",
+        "reference memory (MiB)",
+        "auto memory (MiB)",
     )
+    return markdown_table(header, rows)

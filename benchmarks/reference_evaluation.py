@@ -1,7 +1,7 @@
-"""The evaluations done the way the reference does them: slow on purpose, for the race alone.
+"""Both evaluations with the algorithms of the reference, slow on purpose, for comparison alone.
 
 Every line is resampled by one shapely call per point, every threshold computes all distances
-again, strips are shapely buffers in a search tree; masks are whole canvases, dilated by a grey
+again, and strips are shapely buffers in a search tree; masks are whole canvases, dilated by a grey
 morphology, compared as run-length codes.
 """
 
@@ -27,42 +27,55 @@ from gsmap.structures.elements import MapElements
 
 Frame = tuple[MapElements, MapElements]  # predictions, ground truth
 FILLS_AS_RELEASED = (4, 8) <= tuple(map(int, cv2.__version__.split(".")[:2])) <= (4, 10)
-"""Whether the installed OpenCV fills polygons as those did that the released figures are of."""
+"""Whether the installed OpenCV fills polygons like the versions behind the released figures."""
 
 
-def _resampled(line: np.ndarray) -> np.ndarray:
+def _resample(line: np.ndarray) -> np.ndarray:
+    """Resample a polyline to 100 points, in metres. (P, 2) -> (100, 2)"""
     string = shapely.LineString(line)
-    distances = np.linspace(0, string.length, 100)
+    distances = np.linspace(0, string.length, num=100)
     points = [string.interpolate(distance).coords[0] for distance in distances]
     return np.array(points)
 
 
 def _strip(line: np.ndarray) -> Any:
+    """Polygon of 4 m width around a polyline (P, 2) in metres."""
     return shapely.LineString(line).buffer(2.0, cap_style="flat", join_style="mitre")
 
 
 def _chamfer_hits(pred: list[np.ndarray], gt: list[np.ndarray], threshold: float) -> list[bool]:
-    """Match one frame and class at one threshold; predictions in descending order of score."""
-    scores = np.full((len(pred), len(gt)), 100.0)
+    """Match the predictions of one frame and class at one threshold.
+
+    Args:
+        pred: Predicted lines in descending order of score, in metres. Each (100, 2)
+        gt: Ground truths in metres. Each (100, 2)
+        threshold: Greatest Chamfer distance of a match, in metres.
+
+    Returns:
+        Whether each prediction matches a ground truth that no earlier one matches.
+    """
+    distances = np.full((len(pred), len(gt)), 100.0)
     strips = [_strip(line) for line in gt]
     tree = shapely.STRtree(strips)
     for i, line in enumerate(pred):
         strip = _strip(line)
         for k in tree.query(strip):
             if strips[k].intersects(strip):
-                distances = cdist(line, gt[k])
-                scores[i, k] = (distances.min(0).mean() + distances.min(1).mean()) / 2
-    taken, hits = set(), []
+                points = cdist(line, gt[k])
+                distances[i, k] = (points.min(axis=0).mean() + points.min(axis=1).mean()) / 2
+    matched = set()
+    hits = []
     for i in range(len(pred)):
-        best = int(scores[i].argmin()) if len(gt) else -1
-        hit = best >= 0 and scores[i, best] <= threshold and best not in taken
+        best = int(distances[i].argmin()) if len(gt) else -1
+        hit = best >= 0 and distances[i, best] <= threshold and best not in matched
         hits.append(hit)
         if hit:
-            taken.add(best)
+            matched.add(best)
     return hits
 
 
-def _ranked(elements: MapElements, label: int, minimum: float = 0.0) -> np.ndarray:
+def _rank(elements: MapElements, label: int, minimum: float = 0.0) -> np.ndarray:
+    """Indices of a class's elements of at least a score, in descending order of score. (n,)"""
     rows = np.flatnonzero((elements.labels == label) & (elements.confidence >= minimum))
     ranked: np.ndarray = rows[np.argsort(-elements.confidence[rows], kind="stable")]
     return ranked
@@ -71,96 +84,122 @@ def _ranked(elements: MapElements, label: int, minimum: float = 0.0) -> np.ndarr
 def chamfer_map(
     frames: Sequence[Frame], num_classes: int, thresholds: Sequence[float] = (0.5, 1.0, 1.5)
 ) -> float:
-    """Return the mean AP_chamfer of some frames.
+    """Mean AP_chamfer of some frames.
 
     Args:
         frames: Predictions and ground truth of each sample.
         num_classes: Number of classes.
         thresholds: Thresholds in metres.
+
+    Returns:
+        Mean over classes and thresholds, in [0, 1].
     """
     aps = []
     for label in range(num_classes):
-        rows = [_ranked(pred, label) for pred, _ in frames]
-        truths = [np.flatnonzero(gt.labels == label) for _, gt in frames]
-        preds = [
-            [_resampled(pred.polylines[i]) for i in r]
-            for (pred, _), r in zip(frames, rows, strict=True)
-        ]
-        gts = [
-            [_resampled(gt.polylines[k]) for k in t]
-            for (_, gt), t in zip(frames, truths, strict=True)
-        ]
-        scores = np.concatenate(
-            [pred.confidence[r] for (pred, _), r in zip(frames, rows, strict=True)]
-        )
-        order = np.argsort(-scores, kind="stable")
+        preds = []
+        gts = []
+        confidences = []
+        for pred, gt in frames:
+            ranked = _rank(pred, label)
+            truths = np.flatnonzero(gt.labels == label)
+            preds.append([_resample(pred.polylines[i]) for i in ranked])
+            gts.append([_resample(gt.polylines[k]) for k in truths])
+            confidences.append(pred.confidence[ranked])
+        order = np.argsort(-np.concatenate(confidences), kind="stable")
+        num_gts = sum(map(len, gts))
         for threshold in thresholds:
-            found = [_chamfer_hits(p, g, threshold) for p, g in zip(preds, gts, strict=True)]
-            hits = np.array([hit for frame in found for hit in frame], dtype=bool)
-            aps.append(area_ap(hits[order], sum(map(len, gts))))
+            hits: list[bool] = []
+            for frame_preds, frame_gts in zip(preds, gts, strict=True):
+                hits += _chamfer_hits(frame_preds, frame_gts, threshold=threshold)
+            aps.append(area_ap(np.array(hits, dtype=bool)[order], num_gts))
     return float(np.mean(aps))
 
 
-def _codes(
+def _encode_masks(
     elements: MapElements, rows: np.ndarray, polygon: bool, config: RasterConfig, by_opencv: bool
 ) -> list:
+    """Run-length codes of the dilated masks of some elements.
+
+    Args:
+        elements: Elements of a frame.
+        rows: Indices of the elements. (n,)
+        polygon: Whether to fill the elements.
+        config: Rules.
+        by_opencv: Whether OpenCV fills polygons, instead of `gsmap.evaluation`.
+
+    Returns:
+        One code per element.
+    """
+    width, height = config.size_px
     if polygon and not by_opencv:
         words = rasterize(elements.select(rows), config)
         bits = np.unpackbits(words.view(np.uint8), axis=-1, bitorder="little")
-        masks = bits[..., : config.size_px[0]]
-        return [run_length.encode(np.asfortranarray(mask)) for mask in masks]
+        return [run_length.encode(np.asfortranarray(mask)) for mask in bits[..., :width]]
     codes = []
     for i in rows:
-        canvas = np.zeros(config.size_px[::-1], np.uint8)
+        canvas = np.zeros((height, width), dtype=np.uint8)
         points = pixels_from_metres(elements.polylines[i], config).astype(np.int32)
         if polygon:
-            cv2.fillPoly(canvas, [points], (1,))
+            cv2.fillPoly(canvas, [points], color=(1,))
         else:
-            cv2.polylines(canvas, [points], False, (1,))
-        canvas = grey_dilation(canvas, (config.dilation_px, config.dilation_px))
+            cv2.polylines(canvas, [points], isClosed=False, color=(1,))
+        canvas = grey_dilation(canvas, size=(config.dilation_px, config.dilation_px))
         codes.append(run_length.encode(np.asfortranarray(canvas)))
     return codes
 
 
 def _raster_hits(ious: np.ndarray, threshold: float) -> list[bool]:
-    taken, hits = set(), []
+    """Match predictions, in descending order of score, by their IoU with ground truths (N, K)."""
+    matched = set()
+    hits = []
     for row in ious:
-        best, match = threshold, -1
+        best = threshold
+        match = -1
         for k, iou in enumerate(row):
-            if k not in taken and iou >= best:
-                best, match = iou, k
-        taken.add(match)
+            if k not in matched and iou >= best:
+                best = iou
+                match = k
+        matched.add(match)
         hits.append(match >= 0)
     return hits
 
 
 def raster_map(frames: Sequence[Frame], config: RasterConfig, by_opencv: bool = True) -> float:
-    """Return the mean AP_raster of some frames.
+    """Mean AP_raster of some frames.
 
     Args:
         frames: Predictions and ground truth of each sample.
         config: Rules.
         by_opencv: Whether the installed OpenCV fills polygons, whose versions differ along the
-            outline (``FILLS_AS_RELEASED``); else the drawing of `gsmap.evaluation` does, whose
-            pixels are those of the released figures. Lines are OpenCV's in both cases.
+            outline (``FILLS_AS_RELEASED``); otherwise `gsmap.evaluation` fills them with the pixels
+            of the released figures. OpenCV draws lines in both cases.
+
+    Returns:
+        Mean over classes and thresholds, in [0, 1]; classes without ground truth are left out.
     """
     aps = []
-    pairs = zip(config.is_polygon, config.thresholds.values(), strict=True)
-    for label, (polygon, thresholds) in enumerate(pairs):
-        scores, ious, num_gts = [], [], 0
+    rules = zip(config.is_polygon, config.thresholds.values(), strict=True)
+    for label, (polygon, thresholds) in enumerate(rules):
+        confidences = []
+        ious = []
+        num_gts = 0
         for pred, gt in frames:
-            rows = _ranked(pred, label, MIN_SCORE)[:MAX_PREDICTIONS]
+            rows = _rank(pred, label, minimum=MIN_SCORE)[:MAX_PREDICTIONS]
             truths = np.flatnonzero(gt.labels == label)
             num_gts += len(truths)
-            codes = (
-                _codes(pred, rows, polygon, config, by_opencv),
-                _codes(gt, truths, polygon, config, by_opencv),
+            pred_codes = _encode_masks(
+                pred, rows, polygon=polygon, config=config, by_opencv=by_opencv
             )
-            found = run_length.iou(*codes, [0] * len(truths))
-            scores.append(pred.confidence[rows])
-            ious.append(np.asarray(found).reshape(len(rows), len(truths)))
-        order = np.argsort(-np.concatenate(scores), kind="stable")
+            gt_codes = _encode_masks(
+                gt, truths, polygon=polygon, config=config, by_opencv=by_opencv
+            )
+            frame_ious = run_length.iou(pred_codes, gt_codes, [0] * len(truths))
+            confidences.append(pred.confidence[rows])
+            ious.append(np.asarray(frame_ious).reshape(len(rows), len(truths)))
+        order = np.argsort(-np.concatenate(confidences), kind="stable")
         for threshold in thresholds:
-            hits = [hit for frame in ious for hit in _raster_hits(frame, threshold)]
+            hits: list[bool] = []
+            for frame_ious in ious:
+                hits += _raster_hits(frame_ious, threshold)
             aps.append(interpolated_ap(np.array(hits, dtype=bool)[order], num_gts))
     return float(np.mean([ap for ap in aps if ap >= 0]))

@@ -1,4 +1,4 @@
-"""How straight predicted lines are: what neither metric sees.
+"""Straightness of predicted lines, to which neither metric is sensitive.
 
 AP_chamfer and AP_raster compare sets of points and pixels. A line whose points run back and forth
 along its ground truth scores as well as one that follows it.
@@ -22,24 +22,37 @@ from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import FloatArray, MapElements
 
 MIN_SCORE = 0.2
-FOLD_DEG = 90.0  # a vertex that turns by more leads back
+FOLD_DEG = 90.0  # least turn at a vertex where a line leads back
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the command's arguments."""
+    """Add the options of ``benchmarks shape`` to a parser."""
     parser.add_argument("truth", type=Path, help="annotation file of the split")
     parser.add_argument("results", type=Path, nargs="+", help="result files of tools/test.py")
 
 
 def run(args: argparse.Namespace) -> None:
-    """Print a row for each result file and class of lines."""
+    """Print a row for each result file and class of lines.
+
+    Args:
+        args: Parsed options of ``add_arguments``.
+    """
     rows = []
     for path in args.results:
-        for name, figures in line_shapes(path, args.truth).items():
-            length = np.median(figures[:, 0]) if len(figures) else np.nan
-            _, turn, folds = figures.mean(0) if len(figures) else [np.nan] * 3
-            cells = (f"{length:.2f}", f"{turn:.0f}", f"{100 * folds:.0f}")
-            rows.append([str(path.parent.name), name, str(len(figures)), *cells])
+        for name, shapes in line_shapes(path, args.truth).items():
+            length_ratio = turn = folds = np.nan
+            if len(shapes):
+                length_ratio = np.median(shapes[:, 0])
+                _, turn, folds = shapes.mean(axis=0)
+            row = [
+                str(path.parent.name),
+                name,
+                str(len(shapes)),
+                f"{length_ratio:.2f}",
+                f"{turn:.0f}",
+                f"{100 * folds:.0f}",
+            ]
+            rows.append(row)
     header = ["results", "class", "lines", "length / truth", "turn, degrees", "folds, %"]
     print(f"Lines that match within 1.5 m, with a score of {MIN_SCORE} or more: median of lengths,")
     print("means of turns and folds\n")
@@ -47,44 +60,62 @@ def run(args: argparse.Namespace) -> None:
 
 
 def line_shapes(results: Path, truth: Path) -> dict[str, FloatArray]:
-    """Return the shapes of the predicted lines that match, by class.
+    """Shapes of the predicted lines that match a ground truth.
 
-    A row is a prediction's length over that of its ground truth, its mean turn at a vertex in
-    degrees, and the share of its vertices that turn by more than 90 degrees. C x (n, 3)
+    Args:
+        results: Result file.
+        truth: Annotation file of the split.
+
+    Returns:
+        By class, one row per line: its length relative to its ground truth, its mean turn at a
+        vertex in degrees, and the share of vertices with a turn of more than 90 degrees. (n, 3)
     """
     config = ChamferConfig(AnnotationFile(truth).meta.classes)
-    predicted, _ = read_samples(results, RESULTS_KEY, config.classes)
-    annotated, _ = read_ground_truth(truth, config.classes)
-    names = [name for name in config.classes if name not in AREA_CLASSES]
-    shapes: dict[str, list[tuple[float, float, float]]] = {name: [] for name in names}
-    nothing = MapElements.from_polylines()
-    pairs = [
-        Sample(token, predicted.get(token, nothing), true) for token, true in annotated.items()
-    ]
-    for matches in match_samples(pairs, MapEvaluator(config)):
-        found = cast(FrameMatches, matches["chamfer"])
-        truths = annotated[found.token].polylines
-        lines = predicted[found.token].polylines if len(found.labels) else []
-        for index, label, score, matched in zip(
-            found.pred_index, found.labels, found.scores, found.matched_gt[:, -1], strict=True
+    predictions, _ = read_samples(results, RESULTS_KEY, config.classes)
+    truths, _ = read_ground_truth(truth, config.classes)
+    shapes: dict[str, list[tuple[float, float, float]]] = {}
+    for name in config.classes:
+        if name not in AREA_CLASSES:
+            shapes[name] = []
+    no_elements = MapElements.from_polylines()
+    samples = []
+    for token, elements in truths.items():
+        samples.append(Sample(token, predictions.get(token, no_elements), elements))
+    for sample_matches in match_samples(samples, MapEvaluator(config)):
+        matches = cast(FrameMatches, sample_matches["chamfer"])
+        if not len(matches.labels):
+            continue
+        truth_lines = truths[matches.token].polylines
+        pred_lines = predictions[matches.token].polylines
+        truth_indices = matches.matched_gt[:, -1]
+        for index, label, score, truth_index in zip(
+            matches.pred_index, matches.labels, matches.scores, truth_indices, strict=True
         ):
             name = config.classes[label]
-            if name in shapes and score >= MIN_SCORE and matched >= 0:
-                turn, folds = turns(lines[index])
-                shapes[name].append(
-                    (length_m(lines[index]) / length_m(truths[matched]), turn, folds)
-                )
+            if name in shapes and score >= MIN_SCORE and truth_index >= 0:
+                line = pred_lines[index]
+                length_ratio = length_m(line) / length_m(truth_lines[truth_index])
+                turn, folds = turns(line)
+                shapes[name].append((length_ratio, turn, folds))
     return {name: np.reshape(rows, (-1, 3)) for name, rows in shapes.items()}
 
 
 def length_m(line: FloatArray) -> float:
-    """Length of a polyline in metres. (P, 2 or 3)"""
-    return float(np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1).sum())
+    """Length of a polyline (P, 2) or (P, 3) in metres, in the plane."""
+    steps = np.diff(line[:, :2], axis=0)
+    return float(np.linalg.norm(steps, axis=1).sum())
 
 
 def turns(line: FloatArray) -> tuple[float, float]:
-    """Return the mean turn of a polyline in degrees, and the share of folds. (P, 2 or 3)"""
+    """Mean turn of a polyline in degrees, and the share of its vertices that are folds.
+
+    Args:
+        line: Vertices in metres. (P, 2) or (P, 3)
+
+    Returns:
+        The mean in [0, 180] and the share in [0, 1].
+    """
     edges = np.diff(line[:, :2], axis=0)
     headings = np.degrees(np.arctan2(edges[:, 1], edges[:, 0]))
-    turned = np.abs((np.diff(headings) + 180.0) % 360.0 - 180.0)
-    return float(turned.mean()), float((turned > FOLD_DEG).mean())
+    angles = np.abs((np.diff(headings) + 180.0) % 360.0 - 180.0)
+    return float(angles.mean()), float((angles > FOLD_DEG).mean())

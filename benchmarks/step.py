@@ -13,7 +13,7 @@ from gsmap.engine.launch import read_config
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the command's arguments."""
+    """Add the options of ``benchmarks step`` to a parser."""
     models.add_arguments(parser)
     parser.add_argument("--batch", type=int, default=1)
     parser.add_argument(
@@ -22,44 +22,68 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure and print a step of every config and raster size."""
-    tasks = []
+    """Measure and print a step for every config and raster size.
+
+    Args:
+        args: Parsed options of ``add_arguments``.
+    """
+    tasks: list[tuple[str, argparse.Namespace, str]] = []
     for path in args.configs:
-        sizes = args.rasters if "GSMap" in read_config(path).model.map_head.type else [""]
-        tasks += [(path, args, raster) for raster in sizes]
-    costs = [cost for _, cost in models.measured_each(step_cost, tasks)]
-    seconds = [cost.time_s(torch.device(args.device)) for cost in costs]
-    peaks = [cost.peak_bytes for cost in costs]
-    models.report(
-        args,
-        ["model", "raster", "s a step", "ratio", "peak memory (MiB)", "ratio"],
-        [
-            [
-                *(Path(path).stem, raster, f"{s:.3f}", f"{s / seconds[0]:.3f}"),
-                *(f"{peak / MIB:.0f}", f"{peak / peaks[0]:.3f}"),
-            ]
-            for (path, _, raster), s, peak in zip(tasks, seconds, peaks, strict=True)
-        ],
-    )
+        is_gsmap = "GSMap" in read_config(path).model.map_head.type
+        for raster in args.rasters if is_gsmap else [""]:
+            tasks.append((path, args, raster))
+    costs = [cost for _, cost in models.measure_each(step_cost, tasks)]
+    device = torch.device(args.device)
+    first_seconds = costs[0].time_s(device)
+    first_peak = costs[0].peak_bytes
+    rows = []
+    for (path, _, raster), cost in zip(tasks, costs, strict=True):
+        seconds = cost.time_s(device)
+        row = [
+            Path(path).stem,
+            raster,
+            f"{seconds:.3f}",
+            f"{seconds / first_seconds:.3f}",
+            f"{cost.peak_bytes / MIB:.0f}",
+            f"{cost.peak_bytes / first_peak:.3f}",
+        ]
+        rows.append(row)
+    header = ["model", "raster", "s a step", "ratio", "peak memory (MiB)", "ratio"]
+    models.report(args, header, rows=rows)
 
 
 def step_cost(path: str, args: argparse.Namespace, raster: str = "") -> Cost:
-    """Measure a config's training step, with another raster size if one is given.
+    """Measure the training step of a config.
 
     The step is mmengine's, from pixels on the host to new weights, with the config's optimizer,
-    clipping and figures.
+    gradient clipping and figures.
+
+    Args:
+        path: Config file.
+        args: Parsed options of ``add_arguments``.
+        raster: Rows and columns of the raster of GSMap's loss, such as ``200x100``; empty for the
+            config's.
+
+    Returns:
+        Time and memory of a step.
     """
-    model, inputs, samples = models.model_and_batch(path, args, args.batch, raster)
+    model, inputs, samples = models.model_and_batch(path, args, batch=args.batch, raster=raster)
     model.train()
     wrapper = build_optim_wrapper(model, read_config(path, args.cfg_options).optim_wrapper)
-    images = [(each * 50 + 120).clamp(0, 255).to("cpu", torch.uint8) for each in inputs["imgs"]]
+    images = []
+    for normalized in inputs["imgs"]:
+        pixels = (normalized * 50 + 120).clamp(0, 255)
+        images.append(pixels.to("cpu", torch.uint8))
     batch = [sample.cpu() for sample in samples]
 
     def step() -> None:
         models.drive_on(batch)
-        data = {"inputs": {"img": list(images)}, "data_samples": [each.clone() for each in batch]}
+        data = {
+            "inputs": {"img": list(images)},
+            "data_samples": [sample.clone() for sample in batch],
+        }
         figures = model.train_step(data, wrapper)
-        named = {f"train/{name}": value for name, value in figures.items()}
-        keep_figures(wrapper.message_hub, named)
+        prefixed = {f"train/{name}": value for name, value in figures.items()}
+        keep_figures(wrapper.message_hub, prefixed)
 
-    return measure(step, torch.device(args.device), args.repeats)
+    return measure(step, torch.device(args.device), repeats=args.repeats)

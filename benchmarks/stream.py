@@ -1,4 +1,4 @@
-"""What a model with memory keeps of each stream: its parts and their sizes."""
+"""Size of the state that a model with memory keeps for each stream, part by part."""
 
 import argparse
 
@@ -14,20 +14,32 @@ _IMAGES = (64, 96)  # rows and columns: the state does not depend on them
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the command's arguments."""
+    """Add the options of ``benchmarks stream`` to a parser."""
     parser.add_argument("config", help="config file of a model with memory and cameras")
     parser.add_argument("--cfg-options", nargs="+", default=[], metavar="K=V", help="overrides")
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure and print."""
+    """Measure and print the size of each part of the state.
+
+    Args:
+        args: Parsed options of ``add_arguments``.
+    """
     sizes = state_bytes(args.config, args.cfg_options)
-    for name, size in {**sizes, "state": sum(sizes.values())}.items():
+    sizes["state"] = sum(sizes.values())
+    for name, size in sizes.items():
         print(f"{name.ljust(12)}  {size / 1e6:8.3f} MB")
 
 
 def state_bytes(config: str, options: list[str]) -> dict[str, int]:
-    """Return how many bytes each part of a stream's state has, by name.
+    """Size of each part of a stream's state.
+
+    Args:
+        config: Config file.
+        options: Overrides of the config, each ``KEY=VALUE``.
+
+    Returns:
+        Bytes by name of the part.
 
     Raises:
         ValueError: If the model has no memory.
@@ -41,6 +53,8 @@ def state_bytes(config: str, options: list[str]) -> dict[str, int]:
         raise InputError(f"{config} has no memory: give --cfg-options model.temporal=...")
     exported = ExportedDetector(model)
     inputs = exported.example_inputs(len(cfg.test_dataloader.dataset.cameras), _IMAGES)
-    kept = inputs[len(inputs) - len(exported.memory) :]
-    sizes = (value.numel() * value.element_size() for value in kept)
-    return dict(zip(exported.memory, sizes, strict=True))
+    state = inputs[len(inputs) - len(exported.memory) :]
+    sizes = {}
+    for name, value in zip(exported.memory, state, strict=True):
+        sizes[name] = value.numel() * value.element_size()
+    return sizes

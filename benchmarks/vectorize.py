@@ -1,4 +1,4 @@
-"""Time of vectorising a frame's maps: of a trained HDMapNet as they are, and at the full size."""
+"""Time to vectorise the maps of a trained HDMapNet, in their size and in the paper's."""
 
 import argparse
 import time
@@ -13,11 +13,11 @@ from torch.nn.functional import interpolate
 from benchmarks.measure import markdown_table
 from gsmap.apis.map_inferencer import MapInferencer
 
-FULL_SIZE = (200, 400)  # of nuScenes in the paper
+FULL_SIZE = (200, 400)  # size of nuScenes' maps in the paper
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the command's arguments."""
+    """Add the options of ``benchmarks vectorize`` to a parser."""
     parser.add_argument("config", help="of a model whose head is HDMapNetHead")
     parser.add_argument("checkpoint")
     parser.add_argument("truth", type=Path, help="annotation file, of which the images are taken")
@@ -26,36 +26,50 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Print the processor time of a frame, after a first one that compiles."""
+    """Measure and print the processor time of a frame, without the first one, which compiles.
+
+    Args:
+        args: Parsed options of ``add_arguments``.
+    """
     torch.set_num_threads(1)
-    inferencer = MapInferencer(args.config, args.checkpoint, "cpu")
+    inferencer = MapInferencer(args.config, args.checkpoint, device="cpu")
     dataset = inferencer.dataset(args.truth, args.data_root)
-    head, lines = inferencer.model.map_head, inferencer.model.map_head.lines
-    own = head.vectorizing
-    settings = {head.map_size: own, FULL_SIZE: type(own)(degrees=own.degrees)}  # as published
-    spent: dict[tuple[int, ...], list[float]] = {size: [] for size in settings}
+    head = inferencer.model.map_head
+    vectorize_maps = head.lines
+    settings = head.vectorizing
+    published_settings = type(settings)(degrees=settings.degrees)
+    settings_by_size = {head.map_size: settings, FULL_SIZE: published_settings}
+    times_ms: dict[tuple[int, ...], list[float]] = {size: [] for size in settings_by_size}
 
-    def timed(maps: Any) -> object:
-        for size, setting in settings.items():
-            head.vectorizing = setting
-            resized = maps._make(enlarged(values, size) for values in maps)
+    def time_lines(maps: Any) -> object:
+        """Vectorise maps in every size, note the times, and return the lines of the last size."""
+        for size, size_settings in settings_by_size.items():
+            head.vectorizing = size_settings
+            resized = type(maps)._make([resize_map(values, size) for values in maps])
             start = time.process_time()
-            found = lines(resized)
-            spent[size].append(1000 * (time.process_time() - start))
-        return found
+            lines = vectorize_maps(resized)
+            times_ms[size].append(1000 * (time.process_time() - start))
+        return lines
 
-    head.lines = timed
-    for _ in inferencer.predict(dataset, range(min(args.samples + 1, len(dataset)))):
+    head.lines = time_lines
+    rows_to_predict = range(min(args.samples + 1, len(dataset)))
+    for _ in inferencer.predict(dataset, rows_to_predict):
         pass
-    rows = []
-    for (height, width), ms in spent.items():
-        figures = (np.median(ms[1:]), np.quantile(ms[1:], 0.9), max(ms[1:]))
-        cells = (f"{figure:.0f}" for figure in figures)
-        rows.append([f"{height} x {width}", len(ms) - 1, *cells])
+    table = []
+    for (height, width), frame_times in times_ms.items():
+        times = frame_times[1:]
+        row = [
+            f"{height} x {width}",
+            len(times),
+            f"{np.median(times):.0f}",
+            f"{np.quantile(times, 0.9):.0f}",
+            f"{max(times):.0f}",
+        ]
+        table.append(row)
     header = ["maps", "frames", "median, ms", "90 %, ms", "longest, ms"]
-    print(f"{args.config}, one thread\n\n{markdown_table(header, rows)}")
+    print(f"{args.config}, one thread\n\n{markdown_table(header, table)}")
 
 
-def enlarged(values: Tensor, size: tuple[int, ...]) -> Tensor:
-    """Return a map in another size. (C, H, W) -> (C, *size)"""
+def resize_map(values: Tensor, size: tuple[int, ...]) -> Tensor:
+    """Resize a map bilinearly to ``size`` (rows, columns). (C, H, W) -> (C, *size)"""
     return interpolate(values[None], size, mode="bilinear", align_corners=False)[0]

@@ -51,7 +51,7 @@ def test_waiting_takes_wall_time_and_no_processor_time():
 
 
 def test_cost_scales_with_the_work():
-    assert Cost(1.0, 2.0, 30).scaled(1.5) == Cost(1.5, 3.0, 45)
+    assert Cost(1.0, 2.0, 30).scale(1.5) == Cost(1.5, 3.0, 45)
 
 
 def test_table():
