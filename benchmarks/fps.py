@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> None:
     Args:
         args: Parsed options of ``add_arguments``.
     """
-    costs = measure_each(frame_cost, [(path, args) for path in args.configs])
+    costs = measure_each(frame_cost, [(path, args, args.cuda_graphs) for path in args.configs])
     device = torch.device(args.device)
     first = costs[0][1].time_s(device)
     rows = []
@@ -49,19 +49,20 @@ def run(args: argparse.Namespace) -> None:
     report(args, header, rows=rows)
 
 
-def frame_cost(path: str, args: argparse.Namespace) -> Cost:
+def frame_cost(path: str, args: argparse.Namespace, cuda_graphs: bool = False) -> Cost:
     """Measure a config's inference from images to decoded elements, with memory if it has any.
 
     Args:
         path: Config file.
-        args: Parsed options of ``add_arguments``.
+        args: Parsed options of ``benchmarks.model.add_arguments``.
+        cuda_graphs: Whether frames are recorded once on a GPU and replayed.
 
     Returns:
         Time and memory of a frame.
     """
     model, inputs, samples = model_and_batch(path, args)
     model.eval()
-    if args.cuda_graphs:
+    if cuda_graphs:
         return _replayed_frame_cost(model, inputs, samples=samples, args=args)
     halved = args.fp16 and args.device != "cpu"
     if halved:

@@ -5,7 +5,7 @@ from types import ModuleType
 import pytest
 import torch
 
-from benchmarks import fps, live, profile, step
+from benchmarks import export, fps, live, profile, step
 from benchmarks.model import drive_on, image_shape, mask_stride, model_and_batch
 
 REPO = Path(__file__).resolve().parents[2]
@@ -74,6 +74,16 @@ def test_frames_per_second_are_those_of_the_time(capsys):
     assert float(seconds) > 0
     assert float(peak) > 0
     assert ratio == "1.000"
+
+
+@pytest.mark.slow
+def test_an_exported_model_is_measured_beside_torch(capsys):
+    pytest.importorskip("onnxruntime")
+    run(export, str(REPO / "configs/maptr/maptr_r18_nano_110e.py"))
+    rows = cells(capsys.readouterr().out)
+    assert [row[1] for row in rows] == ["torch", "ONNX Runtime", "ONNX Runtime, 8 bits"]
+    assert all(float(row[2]) > 0 for row in rows)
+    assert rows[0][4:] == ["1.00", "1.00"]
 
 
 def test_a_frame_of_a_known_rig_is_measured_beside_one_of_a_new_rig(capsys):
