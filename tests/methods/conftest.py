@@ -1,0 +1,3 @@
+"""All names are registered, whichever test file runs first."""
+
+import gsmap.registered  # noqa: F401
