@@ -211,18 +211,23 @@ def _evaluate(files: tuple[Path, Path], metrics: list[str], grid: BEVGrid, worke
     return Run(wall_s=wall, cpu_s=usage.ru_utime + usage.ru_stime, peak_mib=peak)
 
 
+def _column(elements: list[Record], key: str) -> list[Any]:
+    """Values of a field of all elements."""
+    return [element[key] for element in elements]
+
+
 def _frame(record: Record) -> tuple[MapElements, MapElements]:
     """Convert a frame to predictions and ground truth."""
     preds = record["pred"]
     truths = record["gt"]
     pred_elements = MapElements.from_polylines(
-        polylines=[element["pts"] for element in preds],
-        labels=[element["label"] for element in preds],
-        scores=[element["score"] for element in preds],
+        polylines=_column(preds, "pts"),
+        labels=_column(preds, "label"),
+        scores=_column(preds, "score"),
     )
     truth_elements = MapElements.from_polylines(
-        polylines=[element["pts"] for element in truths],
-        labels=[element["label"] for element in truths],
+        polylines=_column(truths, "pts"),
+        labels=_column(truths, "label"),
     )
     return pred_elements, truth_elements
 

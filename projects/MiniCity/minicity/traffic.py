@@ -163,7 +163,15 @@ class Actor:
             return self.model
         x, y, yaw = self.drive.pose(time_s)
         center = np.array([x, y, self.model.size[2] / 2])
-        return replace(self.model, center=center, yaw_rad=yaw, speed=self.drive.speed)
+        return Vehicle(
+            category=self.model.category,
+            center=center,
+            yaw_rad=yaw,
+            size=self.model.size,
+            color=self.model.color,
+            identity=self.model.identity,
+            speed=self.drive.speed,
+        )
 
 
 def _random_vehicle(rng: np.random.Generator, identity: str, only_cars: bool = False) -> Vehicle:
