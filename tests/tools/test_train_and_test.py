@@ -290,11 +290,12 @@ class Dies(Hook):
 WAITS = """
 import torch.distributed as dist
 from gsmap.utils.cli import run_command
+from gsmap.utils.errors import InputError
 
 def command():
     dist.init_process_group("gloo")
     if dist.get_rank() == 1:
-        raise ValueError("sample 'a' is broken")
+        raise InputError("sample 'a' is broken")
     dist.barrier()  # rank 0 waits for ever
 
 run_command(command, heed_kill=False)

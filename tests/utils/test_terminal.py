@@ -10,6 +10,7 @@ from tqdm import tqdm
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta
 from gsmap.utils.cli import run_command
+from gsmap.utils.errors import InputError
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
 from gsmap.utils.terminal import PrintableStream, own_stream, printable
@@ -47,7 +48,7 @@ def test_whatever_a_command_prints_is_printable(capsys):
         return TITLE
 
     def failing() -> None:
-        raise ValueError(f"{TITLE} is no class")
+        raise InputError(f"{TITLE} is no class")
 
     run_command(command)
     with pytest.raises(SystemExit):
