@@ -6,6 +6,7 @@ from golden_data import unpacked
 from gsmap.evaluation.core.chamfer_ap import ChamferConfig, match_chamfer
 from gsmap.evaluation.core.matches import MatchTable
 from gsmap.evaluation.core.raster_ap import RasterConfig, match_raster, raster_report, rasterize
+from gsmap.evaluation.core.raster_kernels import class_ious
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
 
@@ -139,6 +140,21 @@ def test_average_recall_takes_the_best_predictions_of_a_sample():
     metrics = raster_report(MatchTable([match_raster(pred, gt, TINY, "a")]), TINY).metrics
     assert metrics["raster/ped_crossing/AR@1"] == 0.5
     assert metrics["raster/ped_crossing/AR@10"] == 1.0
+
+
+def test_the_iou_of_a_class_unites_its_elements_by_hand():
+    """Class 0 shares 1 of 5 pixels; class 1 has one side alone; class 2 has neither side.
+
+    predictions of class 0: 11000 and 01100, the first column first; ground truth: 00111
+    """
+    words = [[[0b0011]], [[0b0110]], [[0b1]]]
+    predictions = np.array(words, np.uint64)
+    ground_truth = np.array([[[0b11100]]], np.uint64)
+    found = class_ious(
+        predictions, ground_truth, pred_labels=np.array([0, 0, 1]), gt_labels=np.array([0]),
+        num_classes=3,
+    )  # fmt: skip
+    np.testing.assert_array_equal(found, [1 / 5, 0.0, np.nan])
 
 
 def test_half_recall_is_51_of_101():

@@ -5,7 +5,7 @@ thick and polygons filled, everything dilated 5 x 5; predictions with a score be
 than two points are dropped, and at most 100 per class and sample count.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -130,19 +130,6 @@ def rasterize(elements: MapElements, config: RasterConfig) -> kernels.WordArray:
     return kernels.draw(pixels, elements.offsets, filled, height_width, config.dilation_px // 2)
 
 
-def _class_ious(
-    pred: kernels.WordArray, gt: kernels.WordArray, labels: Sequence[IntArray], num_classes: int
-) -> FloatArray:
-    """Return the IoU of all predictions of a class with all its ground truths, or NaN. (C,)"""
-    classes = np.arange(num_classes)
-    found, true = (
-        np.stack([np.bitwise_or.reduce(masks[own == c]) for c in classes])
-        for masks, own in zip((pred, gt), labels, strict=True)
-    )
-    ious = np.diagonal(kernels.mask_ious(found, true, classes, classes))
-    return np.where(np.isin(classes, np.concatenate(labels)), ious, np.nan)
-
-
 def match_raster(
     predictions: MapElements, ground_truth: MapElements, config: RasterConfig, token: str = ""
 ) -> FrameMatches:
@@ -167,11 +154,12 @@ def match_raster(
     ious = kernels.mask_ious(pred, gt, labels, gt_labels)
     thresholds = np.array(list(config.thresholds.values()))
     matched = assign(ious, thresholds[labels])
-    matched_iou = np.pad(ious, ((0, 0), (0, 1)), constant_values=np.nan)  # column -1: no match
+    matched_iou = np.full((len(rows), len(gt_index) + 1), np.nan)  # column -1: no match
+    matched_iou[:, :-1] = ious
     quality = matched_iou[np.arange(len(rows)), matched[:, 0]]
     matched_gt = np.append(gt_index, -1)[matched]
     num_gts = np.bincount(gt_labels, minlength=num_classes)
-    class_iou = _class_ious(pred, gt, (labels, gt_labels), num_classes)
+    class_iou = kernels.class_ious(pred, gt, labels, gt_labels, num_classes)
     scores = predictions.confidence[rows]
     return FrameMatches(token, rows, labels, scores, matched_gt, quality, num_gts, class_iou)
 

@@ -192,3 +192,52 @@ def mask_ious(
                 shared = _count_shared(preds[i], gts[k])
                 ious[i, k] = shared / max(area + gt_areas[k] - shared, 1)
     return ious
+
+
+@njit(cache=True)
+def _unite(masks: WordArray, chosen: BoolArray, union: WordArray) -> int:
+    """Write the union of the chosen masks, and return how many are chosen."""
+    union[:] = 0
+    united = union.ravel()
+    number = 0
+    for i in range(len(masks)):
+        if chosen[i]:
+            number += 1
+            mask = masks[i].ravel()
+            for word in range(len(united)):
+                united[word] |= mask[word]
+    return number
+
+
+@njit(cache=True)
+def class_ious(
+    preds: WordArray,
+    gts: WordArray,
+    pred_labels: IntArray,
+    gt_labels: IntArray,
+    num_classes: int,
+) -> FloatArray:
+    """IoU of the united predictions of each class with its united ground truths.
+
+    Args:
+        preds: Masks of the predictions. (N, H, words)
+        gts: Masks of the ground truths. (K, H, words)
+        pred_labels: Classes of the predictions, in [0, C). (N,)
+        gt_labels: Classes of the ground truths, in [0, C). (K,)
+        num_classes: The number C.
+
+    Returns:
+        IoU in [0, 1]; NaN for a class with neither predictions nor ground truths. (C,)
+    """
+    ious = np.full(num_classes, np.nan)
+    pred_union = np.zeros(preds.shape[1:], np.uint64)
+    gt_union = np.zeros(gts.shape[1:], np.uint64)
+    for label in range(num_classes):
+        num_preds = _unite(preds, pred_labels == label, pred_union)
+        num_gts = _unite(gts, gt_labels == label, gt_union)
+        if num_preds + num_gts > 0:
+            shared = _count_shared(pred_union, gt_union)
+            pred_area = _count_shared(pred_union, pred_union)
+            gt_area = _count_shared(gt_union, gt_union)
+            ious[label] = shared / max(pred_area + gt_area - shared, 1)
+    return ious
