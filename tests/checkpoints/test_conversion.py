@@ -189,8 +189,11 @@ def test_the_tool_converts_files_and_refuses_to_overwrite(tmp_path, monkeypatch,
     assert sorted(tmp_path.iterdir()) == [source, target]
 
 
+PAGES = [REPO / "docs/upstream_names.md", *sorted((REPO / "docs/methods").glob("*.md"))]
+
+
 def test_every_unused_key_is_documented():
-    text = (REPO / "docs/upstream_names.md").read_text()
+    text = "\n\n".join(page.read_text() for page in PAGES)
     for key_map in key_maps():
         for key in key_map.unused:
             named = key in text or key.endswith(tuple(_suffixes(text)))
@@ -198,48 +201,54 @@ def test_every_unused_key_is_documented():
 
 
 def _suffixes(text):
-    """Return the abbreviated keys of the table's rows, as ``.norm.bias``."""
+    """Return the abbreviated keys of the tables' rows, as ``.norm.bias``."""
     return re.findall(r"`(\.[\w.]+)`", text)
 
 
 def _parts_without_use(text):
-    """Return the parts that the table of keys without counterpart names, as ``bevencode.up.*``."""
-    table = text[text.index("| upstream key | architecture |") :].split("\n\n")[0]
-    return re.findall(r"`(\w[\w.]+\.)\*`", table)
-
-
-ALL = {"maptr", "maptr-bevformer", "maptrv2", "gemap", "gemap-full", "mgmapnet"}  # of the table
-ARCHITECTURES = {  # others are one word: the name of the map
-    "all": ALL,
-    "BEV queries": {"maptr", "maptr-bevformer", "gemap"},
-    "LSS": {"maptrv2", "gemap-full", "mgmapnet"},
-    "MapTR (BEVFormer)": {"maptr-bevformer"},
-    "MapTR, GeMap (simple)": {"maptr", "gemap"},
-    "GeMap": {"gemap", "gemap-full"},
-    "not MapTRv2": ALL - {"maptrv2"},
-}
-
-
-def test_the_table_of_keys_in_the_docs_is_the_table_of_the_code():
-    text = (REPO / "docs/upstream_names.md").read_text()
-    rows = re.findall(
-        r"^\| ([^`|]+) \| `([\w.*]+)` \| (?:`([\w.*]+)`|the same) \|$", text, re.MULTILINE
+    """Return the parts that tables of keys without counterpart name, as ``bevencode.up.*``."""
+    tables = re.findall(
+        r"^\| upstream key (?:without counterpart )?\| (?!ours).*?\n\n", text, re.M | re.S
     )
-    assert len(rows) > 40
-    for architectures, upstream, ours in rows:
-        upstream, ours = (
-            re.sub(r"\bN\b", "3", key).replace("*", "9.weight")
-            for key in (upstream, ours or upstream)
-        )
-        known = [
-            m
-            for m in key_maps()
-            if m.name in ARCHITECTURES.get(architectures, {architectures.lower()})
-        ]
-        assert {key_map.to_ours(upstream) for key_map in known} == {ours}, upstream
-    shown = {(upstream.rstrip("*"), (ours or upstream).rstrip("*")) for _, upstream, ours in rows}
-    rules = {rule for key_map in key_maps() if key_map.name in ALL for rule in key_map.rules}
-    assert {tuple(part.replace("{i}", "N") for part in rule) for rule in rules} == shown
+    return re.findall(r"`(\w[\w.]+\.)\*`", "".join(tables))
+
+
+def groups_of_key_maps():
+    """Return the groups of common rows that each key map has, as the pages say them."""
+    said = {}
+    for page in PAGES:
+        for name, words in re.findall(
+            r"Checkpoints of `([\w-]+)`: the rows ([^.:]+)", page.read_text()
+        ):
+            said[name] = set(re.findall(r"\*([^*]+)\*", words))
+    return said
+
+
+def test_the_tables_of_keys_in_the_docs_are_the_tables_of_the_code():
+    groups = groups_of_key_maps()
+    maps = {key_map.name: key_map for key_map in key_maps() if key_map.name in groups}
+    assert maps.keys() == groups.keys()
+    common = re.findall(
+        r"^\| ([^`|]+) \| `([\w.*]+)` \| (?:`([\w.*]+)`|the same) \|$", PAGES[0].read_text(), re.M
+    )
+    assert len(common) > 20
+    assert set().union(*groups.values()) == {group for group, *_ in common}
+    shown = {name: set() for name in maps}
+    for group, upstream, ours in common:
+        for name in maps:
+            if group in groups[name]:
+                shown[name].add((upstream, ours or upstream))
+    for page in PAGES[1:]:
+        rows = re.findall(r"^\| `([\w.*]+)` \| `([\w.*]+)` \|$", page.read_text(), re.M)
+        for name in re.findall(r"Checkpoints of `([\w-]+)`: the rows", page.read_text()):
+            shown[name].update(rows)
+    for name, key_map in maps.items():
+        for row in shown[name]:
+            upstream, ours = (re.sub(r"\bN\b", "3", key).replace("*", "9.weight") for key in row)
+            assert key_map.to_ours(upstream) == ours, (name, upstream)
+        told = {tuple(key.rstrip("*") for key in row) for row in shown[name]}
+        rules = {tuple(part.replace("{i}", "N") for part in rule) for rule in key_map.rules}
+        assert rules == told, name
 
 
 def test_tables_that_need_no_marker_come_after_all_others():

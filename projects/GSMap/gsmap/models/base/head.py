@@ -186,12 +186,9 @@ class MapHead(DetectionHead):
                 raise InputError(
                     f"query group {group.name!r} names losses {unknown}; there are {names}."
                 )
-        for name, given in (
-            ("masks.filled_classes", self.masks.filled_classes),
-            ("masks.held_classes", self.masks.held_classes),
-            ("coder.unfold_classes", self.coder.unfold_classes),
-        ):
-            check_classes(name, given, self.classes)
+        for name, given in self.masks.class_settings.items():
+            check_classes(f"masks.{name}", given, self.classes)
+        check_classes("coder.unfold_classes", self.coder.unfold_classes, self.classes)
         if isinstance(self.loss_cls, ClassLoss):
             self.loss_cls.check(self)
         for loss in cast(Any, self.losses.values()):

@@ -1,21 +1,16 @@
 """Masks of map elements: their rasters, and how the ground truth is drawn."""
 
-import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from mmengine.structures import InstanceData
 from torch import Tensor
 
-from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.ops.polyline_raster import draw_polylines
-from gsmap.structures.gaussians import gaussians_along
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import constant
 from gsmap.utils.errors import InputError
-
-SOURCES = ("full", "points", "gaussians")
 
 
 class ElementMasks:
@@ -29,14 +24,16 @@ class ElementMasks:
         line_width_m: Width of a line in the ground-truth mask, in metres.
         filled_classes: Classes whose ground-truth mask is filled; the others are bands.
         source: ``"full"``: the ground truth is drawn at full resolution; ``"points"``: by its P
-            points in the matched order (in matching, in the annotated one); ``"gaussians"``: as
-            ``"points"``, by Gaussians along them (GSMap Eq. 6), whose mask has the line's width in
-            mass, so that a prediction can equal it.
-        held_classes: Classes whose masks move no point: their losses reach sigma and theta alone.
+            points in the matched order (in matching, in the annotated one).
+
+    Attributes:
+        sources: Values of ``source``; a subclass may add its own.
 
     Raises:
         ValueError: If ``source`` is unknown, or the pixels do not divide the map.
     """
+
+    sources: ClassVar[tuple[str, ...]] = ("full", "points")
 
     def __init__(
         self,
@@ -46,17 +43,15 @@ class ElementMasks:
         line_width_m: float = 0.75,
         filled_classes: Sequence[int] = (),
         source: str = "full",
-        held_classes: Sequence[int] = (),
     ) -> None:
-        if source not in SOURCES:
-            raise InputError(f"source must be one of {SOURCES}, got {source!r}.")
+        if source not in self.sources:
+            raise InputError(f"source must be one of {self.sources}, got {source!r}.")
         longer_m = max(grid.extent_m)
         self.grid = grid.rasterized(pixel_m or longer_m / 200)
         self.cost_grid = grid.rasterized(cost_pixel_m or longer_m / 128)
         self.line_width_m = line_width_m
         self.filled_classes = tuple(filled_classes)
         self.source = source
-        self.held_classes = tuple(held_classes)
 
     @classmethod
     def of(cls, grid: BEVGrid, masks: "ElementMasks | dict[str, Any] | None") -> "ElementMasks":
@@ -66,7 +61,12 @@ class ElementMasks:
     @property
     def of_points(self) -> bool:
         """Whether the ground truth's P points are drawn, in the matched order."""
-        return self.source in ("points", "gaussians")
+        return self.source != "full"
+
+    @property
+    def class_settings(self) -> dict[str, tuple[int, ...]]:
+        """Class indices of each setting that lists classes."""
+        return {"filled_classes": self.filled_classes}
 
     @property
     def half_pixel_m(self) -> float:
@@ -74,28 +74,21 @@ class ElementMasks:
         return max(self.grid.pixel_size_m) / 2
 
     def draw(self, polylines: Tensor, labels: Tensor, grid: BEVGrid) -> Tensor:
-        """Draw ground truths as bands, filled or by Gaussians. (K, M, 2) -> (K, H, W)"""
-        if self.source == "gaussians":
-            across_m = self.line_width_m / math.sqrt(2 * math.pi)
-            return render_gaussians(*gaussians_along(polylines[..., :2].float(), across_m), grid)
+        """Draw ground truths as bands, or filled. (K, M, 2) -> (K, H, W)"""
         filled = None
         if self.filled_classes:
             filled = torch.isin(labels, constant(labels, self.filled_classes))
         return draw_polylines(polylines[..., :2].float(), grid, self.line_width_m, filled)
 
-    def held(self, references: Tensor, labels: Tensor, coords: int) -> Tensor:
-        """Return references whose points get no gradient if their class is held.
+    def rendered_references(self, references: Tensor, labels: Tensor, coords: int) -> Tensor:
+        """References of which predicted masks are rendered; a subclass may stop gradients here.
 
         Args:
-            references: What the decoder refines, ``coords`` coordinates first. (M, P, D)
-            labels: Class indices. (M,)
+            references: References of the decoder, ``coords`` coordinates first. (M, P, D)
+            labels: Class indices of their ground truths. (M,)
             coords: Number of coordinates of a point.
         """
-        if not self.held_classes:
-            return references
-        held = torch.isin(labels, constant(labels, self.held_classes))[:, None, None]
-        points = references[..., :coords]
-        return torch.cat([torch.where(held, points.detach(), points), references[..., coords:]], -1)
+        return references
 
     def draw_batch(self, gt_instances: Sequence[InstanceData], grid: BEVGrid) -> Tensor:
         """Draw the ground truth of all samples, before its matching is known. (T, H, W)"""

@@ -276,7 +276,9 @@ class MatchedPairs:
     def pred_masks(self) -> Tensor:
         """Masks rendered from the predicted Gaussians. (M, H, W)"""
         reference, masks = self.predictions.reference, self.predictions.masks
-        references = masks.held(self.pred_references, self.gt_labels, reference.coords)
+        references = masks.rendered_references(
+            self.pred_references, self.gt_labels, reference.coords
+        )
         return reference.render(references, masks.grid)
 
     @cached_property

@@ -8,12 +8,12 @@ from torch import Tensor
 
 from gsmap.models.base.coder import Detections
 from gsmap.models.base.head import MapHead
-from gsmap.models.base.masks import ElementMasks
 from gsmap.models.base.pairs import MatchedPairs
 from gsmap.models.base.parts import DEFAULTS, PARTS, WEIGHT, brought, with_points_weight
 from gsmap.models.gsmap.cost import IoUCost
 from gsmap.models.gsmap.layer import guided
 from gsmap.models.gsmap.losses import MaskLoss, RasterLoss
+from gsmap.models.gsmap.masks import GaussianMasks
 from gsmap.models.gsmap.reference import GaussianReference
 from gsmap.models.gsmap.statistics import gaussian_statistics
 from gsmap.models.maptr.cost import OrderedPointsCost
@@ -40,7 +40,7 @@ class GSMapHead(MapHead):
         points_weight: Weight of the points in losses and in matching (the paper's lambda_v), or
             one for each class, or None to leave those of ``losses`` and ``match_costs``; ValueError
             if a weight is given and they have no points.
-        masks: Settings of `ElementMasks`.
+        masks: Settings of `GaussianMasks`.
         reference: Settings of `GaussianReference`; its smallest sigma is half a pixel of the masks
             by default.
         temperatures: Factors, > 0, of the sigmas of detections, along and across the line, of each
@@ -64,7 +64,7 @@ class GSMapHead(MapHead):
         temperatures: Sequence[Sequence[float]] | None = None,
         **kwargs: Any,
     ) -> None:
-        drawing = ElementMasks(grid, **(masks or {}))
+        drawing = GaussianMasks(grid, **(masks or {}))
         # Half a pixel of the masks: smaller Gaussians get no gradient. On rasters so coarse that
         # the usual first Gaussian comes close to that, it grows with it.
         smallest = (reference or {}).get("min_scale_m", drawing.half_pixel_m)
