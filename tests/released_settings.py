@@ -1,10 +1,12 @@
 """Training settings of the releases: one row a config, to be held against ours.
 
 Each row says where its release has them; numbers of the papers where there is no release. Equal
-settings of MapTR's family stand in ``MAPTR`` once.
+settings of a family stand here once, as ``MAPTR``; each method's rows in its own folder.
 """
 
-from dataclasses import dataclass, field, replace
+import importlib
+from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from torch import nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
 REPO = Path(__file__).resolve().parents[1]
+METHODS = REPO / "tests/methods"
 IMAGE_STEPS = {"DistortImages": "distort", "ScaleImages": "scale", "CropImages": "crop"}
 
 
@@ -62,18 +65,6 @@ class Settings:
 
 MAPTR = Settings()
 FOUR_E4 = {"img_backbone": 4e-5, "the rest": 4e-4}
-GEMAP = replace(MAPTR, decay=0.03, epochs=110, evaluated=1)
-GEMAP_FULL = replace(GEMAP, images="scale distort", frozen=-1)
-V2_99 = replace(GEMAP_FULL, batch=3, batch_norm="statistics fixed")
-STREAM = Settings(
-    rates={"img_backbone": 5e-5, "the rest": 5e-4},
-    schedule=("CosineAnnealingLR", 3e-3),
-    evaluated=4,
-    batch_norm="statistics fixed",
-    frozen=-1,
-    synchronized=True,
-    weights="resnet50_msra-5891d200.pth",
-)
 LINES = Settings(
     rates={"img_backbone": 5e-5, "the rest": 2e-4},
     clip=None,
@@ -90,13 +81,6 @@ LINES = Settings(
     weights="resnet50-0676ba61.pth",
     left_out=False,
 )
-BEMAPNET = replace(
-    LINES,
-    rates={"img_backbone": 5e-5, "img_neck": 5e-5, "the rest": 2e-4},
-    schedule=("MultiStepLR", 21, 27, 1 / 3),
-    images="scale crop",  # the release mirrors at random besides
-    frozen=1,
-)
 UPERNET = {
     "drop_path": 0.3,
     "batch_norm": "none",
@@ -110,85 +94,15 @@ EFFICIENT = {
     "weights": "efficientnet-b0-355c32eb.pth",
 }
 
-RELEASED: dict[str, Settings] = {
-    # the paper, section 4.1; its batch as its README reads it
-    "projects/GSMap/configs/gsmap_maptr_r50_24e.py": replace(MAPTR, batch=2),
-    # hustvl/MapTR, projects/configs/maptr
-    "configs/maptr/maptr_r50_24e.py": MAPTR,
-    "configs/maptr/maptr_r50_110e.py": replace(MAPTR, epochs=110),
-    "configs/maptr/maptr_r50_bevpool_24e.py": MAPTR,
-    "configs/maptr/maptr_r50_av2_6e.py": replace(
-        MAPTR, epochs=6, batch=6, images="scale distort"  # 6 epochs: papers; 24 in the release
-    ),
-    "configs/maptr/maptr_r18_nano_110e.py": replace(
-        MAPTR, rates={"img_backbone": 4e-4, "the rest": 4e-3}, clip=50, epochs=110, batch=24,
-        batch_norm="learns", frozen=-1, synchronized=True, weights="resnet18-f37072fd.pth",
-    ),
-    # hustvl/MapTR (branch maptrv2), projects/configs/maptrv2
-    "configs/maptrv2/maptrv2_r50_24e.py": replace(MAPTR, images="scale distort"),
-    "configs/maptrv2/maptrv2_r50_av2_3d_6e.py": replace(
-        MAPTR, warm_up=(200, 1 / 3), epochs=6, evaluated=1, images="scale distort"
-    ),
-    # ZhangGongjie/MapVR, projects/configs/maptr/exp_tiny_r50_*
-    "configs/mapvr/mapvr_r50_24e.py": replace(MAPTR, batch=8, evaluated=6),
-    "configs/mapvr/mapvr_r50_110e.py": replace(MAPTR, epochs=110, evaluated=10),
-    # cnzzx/GeMap, projects/configs/gemap
-    "configs/gemap/gemap_simple_r50_110e.py": GEMAP,
-    "configs/gemap/gemap_simple_r50_av2_24e.py": replace(
-        GEMAP, warm_up=(200, 1 / 3), epochs=24, images="scale distort", frozen=-1
-    ),
-    "configs/gemap/gemap_full_swint_110e.py": replace(
-        GEMAP_FULL, rates=FOUR_E4, batch=3, drop_path=0.1, batch_norm="none",
-        weights="swin_tiny_patch4_window7_224.pth",
-    ),
-    "configs/gemap/gemap_full_v299_110e.py": replace(
-        V2_99, weights="vovnet99_ese_detectron2.pth"
-    ),
-    "configs/gemap/gemap_full_v299_dd3d_110e.py": replace(
-        V2_99, batch=4, frozen=1,
-        weights="depth_pretrained_v99-3jlw0p36-20210423_010520-model_final-remapped.pth",
-    ),
-    # HXMap/MapQR, projects/configs/mapqr
-    "configs/mapqr/mapqr_r50_24e.py": replace(MAPTR, evaluated=4, images="scale distort"),
-    "configs/mapqr/mapqr_r50_av2_6e.py": replace(
-        MAPTR, warm_up=(200, 1 / 3), epochs=6, evaluated=1, images="scale distort"
-    ),
-    # Tongji-MIC-Lab/MGMapNet, projects/configs/MGA/100query_class3_110epoch.py
-    "configs/mgmapnet/mgmapnet_r50_110e.py": replace(
-        MAPTR, rates=FOUR_E4, epochs=110, batch=2, evaluated=5, images="scale distort"
-    ),
-    # xiaolul2/MGMap, projects/configs/mgmap/mgmap_cam_r50_30e.py
-    "configs/mgmap/mgmap_r50_30e.py": replace(
-        MAPTR, rates={"img_backbone": 3e-5, "the rest": 3e-4}, epochs=30, evaluated=6
-    ),
-    # yuantianyuan01/StreamMapNet, plugin/configs
-    "configs/streammapnet/streammapnet_r50_24e.py": STREAM,
-    "configs/streammapnet/streammapnet_r50_av2_30e.py": replace(STREAM, epochs=30, evaluated=5),
-    # wenjie710/PivotNet, configs
-    "configs/pivotnet/pivotnet_r50_30e.py": LINES,
-    "configs/pivotnet/pivotnet_swint_30e.py": replace(LINES, **UPERNET),
-    "configs/pivotnet/pivotnet_effb0_30e.py": replace(LINES, **EFFICIENT),
-    # er-muyue/BeMapNet, configs
-    "configs/bemapnet/bemapnet_r50_30e.py": BEMAPNET,
-    "configs/bemapnet/bemapnet_swint_30e.py": replace(BEMAPNET, **UPERNET),
-    "configs/bemapnet/bemapnet_effb0_30e.py": replace(BEMAPNET, **EFFICIENT),
-    # Mrmoore98/VectorMapNet_code, configs/vectormapnet.py
-    "configs/vectormapnet/vectormapnet_r50_130e.py": Settings(
-        rates={
-            "img_backbone": 1e-4, "img_neck": 1e-4, "bev_encoder.upsampling": 1e-4,
-            "bev_encoder.reduction": 1e-4, "the rest": 1e-3,
-        },
-        clip=0.5, warm_up=(400, 0.1), schedule=("MultiStepLR", 100, 120, 0.1), epochs=130,
-        batch=5, evaluated=1, images="scale", grid_mask=False, batch_norm="statistics fixed",
-        frozen=-1, weights="resnet50_msra-5891d200.pth",
-    ),
-    # Tsinghua-MARS-Lab/HDMapNet, train.py
-    "configs/hdmapnet/hdmapnet_effb0_30e.py": Settings(
-        rates={"the rest": 1e-3}, decay=1e-7, clip=5, warm_up=None, schedule=("StepLR", 10, 0.1),
-        epochs=30, evaluated=5,  # the release takes IoUs after each epoch, no AP
-        images="scale", grid_mask=False, left_out=False, **EFFICIENT,
-    ),
-}  # fmt: skip
+
+@cache
+def released() -> dict[str, Settings]:
+    """Settings of the releases by config, of each ``methods/<method>/released.py``."""
+    found: dict[str, Settings] = {}
+    for path in sorted(METHODS.glob("*/released.py")):
+        module = importlib.import_module(f"methods.{path.parent.name}.released")
+        found |= module.RELEASED
+    return found
 
 
 def rates_of(model: nn.Module, groups: list[dict], parts: tuple[str, ...]) -> dict[str, float]:
@@ -233,7 +147,7 @@ def settings_of(cfg: Config, model: nn.Module, groups: list[dict]) -> Settings:
         groups: Groups of its optimizer.
     """
     name = Path(cfg.filename).resolve().relative_to(REPO).as_posix()
-    parts = tuple(part for part in RELEASED[name].rates if part != "the rest")
+    parts = tuple(part for part in released()[name].rates if part != "the rest")
     first, *others = cfg.param_scheduler
     warm_up = None
     if first.type == "LinearLR":

@@ -20,7 +20,7 @@ from mmengine.config import Config
 from mmengine.registry import DefaultScope
 from mmengine.runner import CheckpointLoader
 from mmengine.runner import checkpoint as mmengine_checkpoint
-from released_settings import RELEASED, rates_of
+from released_settings import rates_of, released
 from test_configs import LEAVES, REPO, annotations, load, on_minicity, shrink_images  # noqa: F401
 from test_docs_commands import PAGES, commands
 
@@ -188,8 +188,8 @@ def test_a_command_of_the_pages_reaches_its_first_iteration(
     with pytest.raises(Reached):
         main()
     (runner,) = at_first
-    if words[1] in RELEASED and len(words) == 2:
-        rates = RELEASED[words[1]].rates
+    if words[1] in released() and len(words) == 2:
+        rates = released()[words[1]].rates
         groups = runner.optim_wrapper.optimizer.param_groups
         assert rates_of(runner.model, groups, tuple(rates)) == pytest.approx(rates)
     if runner.cfg.load_from:

@@ -6,7 +6,7 @@ import pytest
 import torch
 from mmdet3d.registry import MODELS
 from mmengine.optim import build_optim_wrapper
-from released_settings import RELEASED, REPO, settings_of
+from released_settings import REPO, released, settings_of
 from test_configs import load
 
 from gsmap.models.encoders.gkt import GeometryKernelAttention
@@ -15,7 +15,7 @@ from gsmap.structures.grid import BEVGrid
 NEEDS_VALUES = ("mmdet.SwinTransformer", "mmdet.EfficientNet", "GSMapHead")  # when it is built
 
 
-@pytest.mark.parametrize("name", RELEASED, ids=lambda name: name.rpartition("/")[2])
+@pytest.mark.parametrize("name", released(), ids=lambda name: name.rpartition("/")[2])
 def test_settings_are_those_of_the_release(name):
     """Without the values of weights: models are built on the device that has none."""
     cfg = load(REPO / name)
@@ -24,23 +24,23 @@ def test_settings_are_those_of_the_release(name):
     with torch.device(device):
         model = MODELS.build(cfg.model).train()
     groups = build_optim_wrapper(model, cfg.optim_wrapper).optimizer.param_groups
-    found, wanted = asdict(settings_of(cfg, model, groups)), asdict(RELEASED[name])
+    found, wanted = asdict(settings_of(cfg, model, groups)), asdict(released()[name])
     assert found.keys() == wanted.keys()
     for key, value in wanted.items():
         assert found[key] == pytest.approx(value), key
 
 
 def test_the_table_notices_a_change():
-    """Another rate of the neck, which BeMapNet's config had."""
-    name = "configs/bemapnet/bemapnet_r50_30e.py"
+    """Another rate of the backbone."""
+    name = "configs/maptr/maptr_r50_24e.py"
     cfg = load(REPO / name)
-    cfg.optim_wrapper.paramwise_cfg.custom_keys.pop("img_neck")
+    cfg.optim_wrapper.paramwise_cfg.custom_keys.pop("img_backbone")
     with torch.device("meta"):
         model = MODELS.build(cfg.model).train()
     groups = build_optim_wrapper(model, cfg.optim_wrapper).optimizer.param_groups
     found = settings_of(cfg, model, groups)
-    assert found.rates["img_neck"] == pytest.approx(2e-4)
-    assert replace(found, rates=RELEASED[name].rates) == RELEASED[name]
+    assert found.rates["img_backbone"] == pytest.approx(6e-4)
+    assert replace(found, rates=released()[name].rates) == released()[name]
 
 
 def test_kernels_and_positions_start_as_released():

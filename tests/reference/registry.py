@@ -9,7 +9,7 @@ from reference import report
 from reference.golden import Golden
 
 Check = Callable[[Golden, str], Iterable[report.Row]]
-_CHECKS: list[tuple[str, Check]] = []
+CHECKS: list[tuple[str, Check]] = []
 
 
 def check(*patterns: str) -> Callable[[Check], Check]:
@@ -23,7 +23,7 @@ def check(*patterns: str) -> Callable[[Check], Check]:
     """
 
     def register(function: Check) -> Check:
-        _CHECKS.extend((pattern, function) for pattern in patterns)
+        CHECKS.extend((pattern, function) for pattern in patterns)
         return function
 
     return register
@@ -46,7 +46,7 @@ def plan(golden: Golden) -> tuple[list[tuple[str, Check]], list[str]]:
     chosen = [
         (name, function)
         for name in names
-        for pattern, function in _CHECKS
+        for pattern, function in CHECKS
         if fnmatchcase(name, pattern.format(variant=golden.variant))
     ]
     covered = {name for name, _ in chosen}
