@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from height_cases import write_raised
+from method_cases import cases_of_methods
 from mmdet3d.models.layers.spconv import IS_SPCONV2_AVAILABLE
 from mmdet3d.registry import DATASETS, METRICS, MODELS
 from mmengine.config import Config, ConfigDict
@@ -34,7 +35,7 @@ CONFIGS = sorted(
 )
 LEAVES = [path for path in CONFIGS if "_base_" not in path.parts]
 # lines of no equal numbers of points
-ANY_NUMBER = ("pivotnet", "bemapnet", "vectormapnet", "hdmapnet")
+ANY_NUMBER = tuple(cases_of_methods("ANY_NUMBER"))
 NUMBERED = ("PivotHead", "VectorMapNetHead", "HDMapNetHead")  # that say how many points count
 SWAPPABLE = [
     path for path in LEAVES if path.is_relative_to(BASELINES) and path.parent.name not in ANY_NUMBER
@@ -196,7 +197,7 @@ def shrink_queries(model: ConfigDict) -> None:
     for group in model.map_head.get("query_groups", []):
         group.num = min(group.num, 12)
     decoder = model.map_head.get("decoder") or {}
-    if "num_masks" in decoder:  # MGMap's: one of each query
+    if "num_masks" in decoder:  # one of each query
         decoder.num_masks = sum(group.num for group in model.map_head.query_groups)
     remembered = (model.get("temporal") or {}).get("queries")
     if remembered:

@@ -18,6 +18,7 @@ from export_cases import (
     shake,
 )
 from fuzz.contents import exported_model
+from method_cases import cases_of_methods
 from model_cases import IMAGE_SHAPE, NUM_CAMS, build_small
 from processes import run_python
 
@@ -41,40 +42,10 @@ for _package in ("onnx", "onnxscript", "onnxruntime"):
 
 REPO = Path(__file__).resolve().parents[2]
 GSMAP = "projects/GSMap/configs/gsmap_maptr_r18_minicity.py"
-DEFORMABLE = {"type": "SpatialCrossAttention", "num_heads": 4, "num_points": 8, "num_heights": 4}
-LSS = {  # without the calibration that MapTRv2's reads
-    "type": "LSSEncoder",
-    "_delete_": True,
-    "bev_pixel_m": 1.2,
-    "embed_dims": 128,
-    "camera_aware": False,
-}
-BOXES = {
-    "num_queries": 40,
-    "in_channels": 96,
-    "embed_dims": 64,
-    "decoder": {"num_layers": 2, "num_heads": 4, "ffn_dims": 64},
-    "coder": {"max_num": 200},
-}
 # Method and encoder: config and overrides. Heads see no more of an encoder than its features, and
-# an export takes ten seconds, so that each encoder and each head comes once. MapVR's is MapTR's but
-# for its losses; the shipped GSMap has the encoder GKT.
+# an export takes ten seconds, so that each encoder and each head comes once; the shipped GSMap
+# has the encoder GKT.
 CASES = {
-    "MapTRv2": ("configs/maptrv2/maptrv2_r18_minicity.py", {}),
-    "MapVR, LSS": ("configs/mapvr/mapvr_r18_minicity.py", {"model.bev_encoder": LSS}),
-    "GeMap, BEVFormer": (
-        "configs/gemap/gemap_r18_minicity.py",
-        {"model.bev_encoder.cross_attn": {"_delete_": True, **DEFORMABLE}},
-    ),
-    "MGMapNet": ("configs/mgmapnet/mgmapnet_r18_minicity.py", {}),
-    "MapQR": ("configs/mapqr/mapqr_r18_minicity.py", {}),
-    "MGMap": ("configs/mgmap/mgmap_r18_minicity.py", {}),
-    "PivotNet": ("configs/pivotnet/pivotnet_r18_minicity.py", {}),
-    "BeMapNet": ("configs/bemapnet/bemapnet_r18_minicity.py", {}),
-    "VectorMapNet's boxes": (
-        "configs/vectormapnet/vectormapnet_r18_minicity.py",
-        {"model.map_head": {"_delete_": True, "type": "KeyPointHead", **BOXES}},
-    ),
     "GSMap, heights, unfolded and weighed": (
         GSMAP,
         {
@@ -83,20 +54,16 @@ CASES = {
             "model.map_head.coder.sigma_power": 1.0,
         },
     ),
-    "GSMap on MGMapNet": ("projects/GSMap/configs/gsmap_mgmapnet_r18_minicity.py", {}),
 }
-# heads without MapTR's coder, of other necks; every line is found
-OWN_SMALL = {
-    "PivotNet": {
-        "model.map_head.queries": ((20, 10), (25, 2), (15, 16)),
-        "model.map_head.score_threshold": None,
-    },
-    "BeMapNet": {
-        "model.map_head.queries": (20, 25, 15),
-        "model.map_head.score_threshold": None,
-    },
-    "VectorMapNet's boxes": {},
+for _method, _exports in cases_of_methods("EXPORTS").items():
+    CASES |= {f"{_method}: {case}": export for case, export in _exports.items()}
+# of heads without MapTR's coder, of other necks; every line is found
+SMALL_OF_CASE = {
+    f"{method}: {case}": settings
+    for method, cases in cases_of_methods("EXPORT_SIZES").items()
+    for case, settings in cases.items()
 }
+CLASS_FACTORS = cases_of_methods("EXPORT_CLASS_FACTOR")
 
 
 @pytest.fixture(scope="module")
@@ -117,12 +84,13 @@ def shipped(annotations, tmp_path_factory):
 @pytest.mark.parametrize("case", CASES)
 def test_every_method_and_encoder_predicts_as_in_torch(case, annotations, tmp_path):
     config, overrides = CASES[case]
-    small = OWN_SMALL.get(case, SMALL)
+    small = SMALL_OF_CASE.get(case, SMALL)
     inferencer = MapInferencer(REPO / config, None, "cpu", {**small, **overrides})
     dataset = inferencer.dataset(annotations, annotations.parent)
     shake(inferencer.model)
-    if case == "VectorMapNet's boxes":  # shaken states that no norm ends make every score 1
-        inferencer.model.map_head.cls_branch.weight.data *= 0.003
+    method = case.partition(":")[0]
+    if method in CLASS_FACTORS:
+        inferencer.model.map_head.cls_branch.weight.data *= CLASS_FACTORS[method]
     exported = export(inferencer, dataset, tmp_path / "model.onnx")
     (scores, metres), found, expected = compare(inferencer, dataset, exported)
     assert len(found) == len(expected) > 50

@@ -4,9 +4,10 @@ from types import ModuleType
 
 import pytest
 import torch
+from method_cases import cases_of_methods
 
 from benchmarks import export, fps, live, profile, step
-from benchmarks.model import drive_on, image_shape, mask_stride, model_and_batch
+from benchmarks.model import drive_on, image_shape, model_and_batch
 
 REPO = Path(__file__).resolve().parents[2]
 
@@ -41,24 +42,14 @@ def test_images_are_as_large_as_the_configs(config, shape):
     assert image_shape(path, argparse.Namespace(size=[64, 96])) == (shape[0], 64, 96)
 
 
-@pytest.mark.parametrize(("config", "stride"), [("r50_24e", 32), ("r18_minicity", 8)])
-def test_camera_masks_are_as_coarse_as_the_configs(config, stride):
-    assert mask_stride(str(REPO / f"configs/maptrv2/maptrv2_{config}.py")) == stride
+LOSSES = cases_of_methods("LOSSES")
 
 
-@pytest.mark.parametrize(
-    ("name", "field", "may_be_zero"),
-    [
-        ("pivotnet", "num_pts", set()),
-        ("mgmap", "masks", set()),
-        ("mapqr", "pts", set()),
-        ("maptrv2", "pts", set()),
-        ("hdmapnet", "pts", {"loss_pull"}),  # embeddings of an element that are alike already
-    ],
-)
-def test_heads_with_targets_of_their_own_have_losses(name, field, may_be_zero):
+@pytest.mark.parametrize("method", LOSSES)
+def test_heads_with_targets_of_their_own_have_losses(method):
+    field, may_be_zero = LOSSES[method]
     args = argparse.Namespace(threads=torch.get_num_threads(), device="cpu", size=None)
-    path = str(REPO / f"configs/{name}/{name}_r18_minicity.py")
+    path = str(REPO / f"configs/{method}/{method}_r18_minicity.py")
     model, inputs, (sample,) = model_and_batch(path, args)
     assert len(sample.gt_instances_3d[field]) >= 15
     losses = model.loss(inputs, [sample])
@@ -126,7 +117,7 @@ def test_a_model_with_memory_continues_its_streams_from_call_to_call():
     ("config", "necks", "size"),
     [
         ("maptr/maptr_r18_nano_110e", ["image neck"], ("64", "96")),
-        ("pivotnet/pivotnet_r18_minicity", [], ("192", "320")),  # the size of its positions
+        *((case, [], size) for case, size in cases_of_methods("PROFILES").values()),
     ],
 )
 def test_the_parts_of_a_forward_pass_add_up(config, necks, size, capsys):

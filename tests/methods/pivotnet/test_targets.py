@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from gsmap.datasets.annotations.record import MapInstance
+from gsmap.engine.launch import read_config
 from gsmap.models.lines.targets import directed
 from gsmap.models.pivotnet.matching import match_pivots, path_costs
 from gsmap.models.pivotnet.targets import FormatPivotTargets, significances
@@ -82,3 +83,10 @@ def test_the_front_left_corner_is_the_origin_and_back(forward):
     np.testing.assert_allclose(grid.front_from_metres(np.array([corner])), [[0, 0]])
     points = np.array([[3.0, -7.0]])
     np.testing.assert_allclose(grid.metres_from_front(grid.front_from_metres(points)), points)
+
+
+@pytest.mark.parametrize("queries", [5, [5, 5, 5], None])
+def test_settings_that_the_head_refuses_are_left_to_it(queries):
+    cfg = read_config("configs/pivotnet/pivotnet_r18_minicity.py")
+    cfg.model.map_head.queries = queries
+    read_config(cfg)

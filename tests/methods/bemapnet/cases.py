@@ -1,0 +1,17 @@
+"""Cases of general tests for this method."""
+
+EXPORTS = {"as it is": ("configs/bemapnet/bemapnet_r18_minicity.py", {})}
+
+EXPORT_SIZES = {
+    "as it is": {
+        "model.map_head.queries": (20, 25, 15),
+        "model.map_head.score_threshold": None,
+    }
+}
+
+TARGETS = (
+    {"pieces": [2, 2, 2], "degrees": [1, 2, 3]},
+    {"pieces": [2, 2, 2], "degrees": [1, 2, 3], "pixel_m": 0.46875},
+)
+
+ANY_NUMBER = True  # lines have no equal numbers of points

@@ -1,0 +1,10 @@
+"""Cases of general tests for this method."""
+
+TARGETS = (
+    {"num_directions": 72, "pixel_m": 0.6},
+    {"num_directions": 72, "pixel_m": 0.6},
+)
+
+LOSSES = ("pts", ("loss_pull",))  # embeddings of an element that are alike already
+
+ANY_NUMBER = True  # lines have no equal numbers of points
