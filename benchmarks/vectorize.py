@@ -1,4 +1,4 @@
-"""Time to vectorise the maps of a trained HDMapNet, in their size and in the paper's."""
+"""Time to vectorise the maps of a trained model, in their size and in the paper's."""
 
 import argparse
 import time

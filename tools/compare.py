@@ -10,7 +10,7 @@ Examples:
     python tools/compare.py base=CONFIG light=CONFIG,model.map_head.loss_raster.loss_weight=5.0 \
         --init maptr_r18_minicity --seeds 2 --budget 1600 --out f
     python tools/compare.py --runs MapTR=work_dirs/a MapTR=work_dirs/b GSMap=work_dirs/c --out d
-    python tools/compare.py --list --tables 'MapVR Table 5*'
+    python tools/compare.py --list --tables 'GSMap Table 5*'
 """
 
 import gsmap  # noqa: F401 - first: Ctrl-C is one line from here on, foreign settings are kept out

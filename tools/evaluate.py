@@ -39,7 +39,7 @@ from gsmap.evaluation.core.file_evaluation import (
     scenes_of,
 )
 from gsmap.evaluation.core.match_files import write_matches
-from gsmap.evaluation.core.metric import MetricSettings, metric_files
+from gsmap.evaluation.core.metric import MetricSettings, metric_class, metric_files
 from gsmap.evaluation.core.report import MetricReport, format_table, write_figures
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.grid import BEVGrid
@@ -109,7 +109,7 @@ def add_metrics(parser: argparse.ArgumentParser) -> None:
         default=list(METRIC_NAMES),
         metavar="METRIC",
         help=f"names of metrics: {', '.join(metric_files())}; chamfer_hard: AP_chamfer at 0.2, "
-        "0.5 and 1.0 m, too; vectormapnet_shrunk. Those of methods are not comparable with others",
+        "0.5 and 1.0 m, too. Those of methods, and their variants, are not comparable with others",
     )
     group.add_argument(
         "--custom-imports",
@@ -176,7 +176,7 @@ def add_rules(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--min-score",
         type=float,
-        help="of predictions that topology counts (0.4), and hdmapnet and bemapnet (0: all)",
+        help="of predictions that topology counts (0.4), and metrics of AP per sample (0: all)",
     )
 
 
@@ -312,7 +312,8 @@ def evaluator_from(args: argparse.Namespace, settings: MetricSettings) -> MapEva
         import_module(module)
     evaluator = MapEvaluator.named(args.eval, settings, args.gt_points)
     if args.min_score is not None and not any(m.takes_min_score for m in evaluator.metrics):
-        raise InputError("--min-score is of topology, hdmapnet and bemapnet: leave it out.")
+        takers = [name for name in metric_files() if metric_class(name).takes_min_score]
+        raise InputError(f"--min-score is of {', '.join(takers)}: leave it out.")
     if args.pr_curves and not any(metric.has_curves for metric in evaluator.metrics):
         raise InputError(
             "--pr-curves draws what counts predictions of all samples: name chamfer or raster."

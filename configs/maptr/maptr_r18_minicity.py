@@ -1,5 +1,5 @@
 # A small MapTR for MiniCity, trained from scratch on two CPU cores. As no pretrained backbone is at hand, an auxiliary
-# BEV mask (as in MapTRv2) teaches it to see; it adds nothing at inference.
+# BEV mask teaches it to see; it adds nothing at inference.
 _base_ = [
     '../_base_/datasets/minicity.py', '../_base_/models/maptr_r50.py', '../_base_/models/minicity.py',
     '../_base_/schedules/minicity.py', '../_base_/default_runtime.py',

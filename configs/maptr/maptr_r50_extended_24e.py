@@ -1,4 +1,4 @@
-# MapTR tiny on nuScenes with the six classes of MapVR's extended set, 24 epochs. The added
+# MapTR tiny on nuScenes with the six classes of the extended set, 24 epochs. The added
 # classes are areas, like crossings; docs/data.md makes their annotation files.
 _base_ = [
     '../_base_/datasets/nuscenes.py', '../_base_/models/maptr_r50.py',

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from export_cases import POINTS_M, SCORES, SMALL, compare, export, shake
+from method_cases import cases_of_methods
 from model_cases import IMAGE_SHAPE, NUM_CAMS, build_small
 from processes import REPO
 
@@ -17,7 +18,7 @@ for _package in ("onnx", "onnxscript", "onnxruntime"):
     pytest.importorskip(_package, reason=f"{_package} is not installed: pip install -e .[onnx]")
 
 STREAMS = {
-    "StreamMapNet": ("configs/streammapnet/streammapnet_r18_minicity.py", {}),
+    **cases_of_methods("STREAM_EXPORTS"),
     "GSMap": ("projects/GSMap/configs/gsmap_stream_r18_minicity.py", {}),
     "GSMap, small state": (
         "projects/GSMap/configs/gsmap_stream_r18_minicity.py",

@@ -1,4 +1,4 @@
-"""The timing of HDMapNet's vectorising."""
+"""The timing of vectorising."""
 
 from argparse import Namespace
 

@@ -252,7 +252,7 @@ def test_the_tables_of_keys_in_the_docs_are_the_tables_of_the_code():
 
 
 def test_tables_that_need_no_marker_come_after_all_others():
-    """They take any keys: BeMapNet's would be MapTR's."""
+    """They take any keys: those of another method would be MapTR's."""
     unmarked = [key_map.markers == KeyMap.markers for key_map in key_maps()]
     assert unmarked == sorted(unmarked)
     assert any(unmarked)

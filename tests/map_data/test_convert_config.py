@@ -207,10 +207,8 @@ def test_values_that_are_read(tmp_path):
 
 
 def test_a_config_of_another_model_is_refused(tmp_path):
-    with pytest.raises(
-        ValueError, match=r"^StreamMapNet is not supported: model\.type must be one"
-    ):
-        converted(upstream_configs.maptr(model="StreamMapNet"), tmp_path)
+    with pytest.raises(ValueError, match=r"^MapTracker is not supported: model\.type must be one"):
+        converted(upstream_configs.maptr(model="MapTracker"), tmp_path)
     with pytest.raises(ValueError, match=r"data\.train\.type must be one of .* got 'Mine'"):
         converted(upstream_configs.maptr(dataset="Mine"), tmp_path)
     bare = "model = dict(type='MapTR')\n"

@@ -44,7 +44,7 @@ def call_deformable_sample(module, one):
 
 
 def call_sample_kernels(module, one):
-    """As MapTR's encoder and MapQR's: 200 x 100 cells, six cameras, 15 x 25 pixels."""
+    """As in MapTR's encoder: 200 x 100 cells, six cameras, 15 x 25 pixels."""
     views, queries, height, width = (1, 1, 1, 1) if one else (6, 20000, 15, 25)
     seen = torch.zeros(1, views, queries, dtype=torch.bool)
     for bilinear, heads, samples in ((False, 4, 15), (True, 8, 8)):

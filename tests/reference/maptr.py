@@ -66,9 +66,9 @@ def state_rows(golden: Golden, name: str, config: str, shared: str = "-") -> Ite
     yield Row(name, "weights on the way back", changed, 0)
 
 
-@check(STATE, "mapvr_r50_state.json")
+@check(STATE)
 def check_state(golden: Golden, name: str) -> Iterator[Row]:
-    """Compare the state of MapTR, which is also MapVR's, with ours."""
+    """Compare the state of MapTR with ours."""
     yield from state_rows(golden, name, CONFIG)
 
 

@@ -144,7 +144,7 @@ convert_config: empty.py out.py | empty.py cannot be converted: None is not supp
 create_data: nuscenes --root nowhere | no data set at nowhere
 create_data: nuscenes --root . | no version 'v1.0-trainval' in .
 create_data: av2 --root . | no folder val
-create_data: av2 --root . --split-name streammapnet | no Argoverse 2 log in the folders train, val
+create_data: av2 --root . --split-name lilja-near | no Argoverse 2 log in the folders train, val
 create_data: split damaged.arrow --out own.json | damaged.arrow is not a whole annotation file
 create_data: split VAL --out own.json --min-distance 1e6 | give a smaller --min-distance
 create_data: overlap damaged.arrow VAL | damaged.arrow is not a whole annotation file

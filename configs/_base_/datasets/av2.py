@@ -39,8 +39,8 @@ val_dataloader = dict(
         **_dataset, ann_file='gsmap_av2_val.arrow', split='val', test_mode=True, pipeline=[_load, _scale, _pack]))
 test_dataloader = val_dataloader
 
-# Pipelines for leaves to choose. MapTRv2 learns from BEV and camera masks besides map elements, and from the depth of
-# the LiDAR sweep that each sample names (docs/data.md).
+# Pipelines for leaves to choose. Some methods learn from BEV and camera masks besides map elements, and from the depth
+# of the LiDAR sweep that each sample names (docs/data.md).
 _masks = [
     dict(type='MakeBEVMask', size=(100, 200), num_classes=3),
     dict(type='MakePVMask', stride=32, ground_z_m=-0.3, num_classes=3, heights=True),  # the origin is the rear axle

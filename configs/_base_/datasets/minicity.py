@@ -36,8 +36,8 @@ val_dataloader = dict(
         **_dataset, ann_file='gsmap_minicity_val.arrow', split='val', test_mode=True, pipeline=[_load, _scale, _pack]))
 test_dataloader = val_dataloader
 
-# Pipelines for leaves to choose. MapQR learns from BEV and camera masks besides map elements, MapTRv2 from LiDAR
-# depth too.
+# Pipelines for leaves to choose. Some methods learn from BEV and camera masks besides map elements, some from
+# LiDAR depth too.
 _points = dict(type='LoadLidarPoints', coord_type='LIDAR', load_dim=5, use_dim=5)
 _masks = [
     dict(type='MakeBEVMask', size=(50, 25), thickness_px=1, num_classes=3),

@@ -1,5 +1,5 @@
-# nuScenes in the frame of the vehicle (x forward, y left), six cameras of 800 x 480, drives in order: what StreamMapNet
-# takes. `python tools/create_data.py nuscenes --root data/nuscenes --frame ego --tag _ego --x-range -30 30
+# nuScenes in the frame of the vehicle (x forward, y left), six cameras of 800 x 480, drives in order, for memory
+# over frames. `python tools/create_data.py nuscenes --root data/nuscenes --frame ego --tag _ego --x-range -30 30
 # --y-range -15 15 --classes ped_crossing divider boundary` makes the annotation files.
 data_root = 'data/nuscenes/'
 _file_size = (1600, 900)  # of the image files, width and height

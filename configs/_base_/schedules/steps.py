@@ -1,4 +1,4 @@
-# As published by PivotNet: AdamW 2e-4 for 8 samples per step, a fifth of it after 70 % and 90 % of 30 epochs, neither
+# As published for heads of lines with masks: AdamW 2e-4 for 8 samples per step, a fifth of it after 70 % and 90 % of 30 epochs, neither
 # warm-up nor clipping. The release gives a weight decay of 1e-4 under a name that AdamW does not know, so it is 0.01.
 optim_wrapper = dict(
     type='MapOptimWrapper',

@@ -1,4 +1,4 @@
-# A small GSMap whose masks are compared by MapVR's dice, in the loss and in matching, for MiniCity.
+# A small GSMap whose masks are compared by a dice loss, in the loss and in matching, for MiniCity.
 _base_ = '../../../configs/maptr/maptr_r18_minicity.py'
 
 model = dict(

@@ -9,5 +9,5 @@ model = dict(
 train_dataloader = dict(dataset=dict(grid=grid, ann_file='gsmap_nuscenes_train_100x50.arrow'))
 val_dataloader = dict(dataset=dict(grid=grid, ann_file='gsmap_nuscenes_val_100x50.arrow'))
 test_dataloader = val_dataloader
-val_evaluator = dict(thresholds=[1.0, 1.5, 2.0])  # StreamMapNet's at this range
+val_evaluator = dict(thresholds=[1.0, 1.5, 2.0])  # as published at this range
 test_evaluator = dict(thresholds=[1.0, 1.5, 2.0])

@@ -13,7 +13,7 @@ PARALLEL_COSINE_GAP = 0.01  # about 8 degrees
 
 
 def long_edges(polygons: np.ndarray) -> np.ndarray:
-    """Return the two longest edges of each polygon, the longer one second (HDMapNet). (2 n,)"""
+    """Return the two longest edges of each polygon, the longer one second. (2 n,)"""
     edges = []
     for polygon in polygons:
         ring = shapely.get_coordinates(polygon.exterior)

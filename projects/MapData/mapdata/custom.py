@@ -33,7 +33,7 @@ from mapdata.local_map import POLYGON, vertices_of
 _LOGGER = logging.getLogger(__name__)
 _UNMOUNTED = (
     "record %r has no ego_from_frame: pictures will take the road to be level, %.2f m below the "
-    "sensor (ground_z_m; nuScenes' height by default), and models that lift images (MapTRv2) "
+    "sensor (ground_z_m; nuScenes' height by default), and models that lift images (LSS) "
     "cannot use it."
 )
 _UNKNOWN_ROAD = (

@@ -1,4 +1,4 @@
-"""The lane graph of a map: which lines along lanes join to one (MapTRv2)."""
+"""The lane graph of a map: which lines along lanes join to one."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain, islice

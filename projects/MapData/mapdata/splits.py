@@ -15,7 +15,6 @@ from gsmap.utils.split_lists import list_identity
 OFFICIAL = "official"
 _PARTS = ("train", "val", "test")
 _FORM = '{"train": ["scene-0001", ...], "val": [...]}, or a text file with a scene a line'
-_FAMILIES = ("streammapnet", "lilja_near", "lilja_far")  # files of published lists
 
 
 @dataclass(frozen=True)
@@ -53,9 +52,15 @@ class SplitList:
         return f"{known}, which has no more."
 
 
+def _families() -> list[str]:
+    """Names of the files of published lists, the oldest list first."""
+    names = [Path(file.name).stem for file in files("mapdata").joinpath("split_lists").iterdir()]
+    return sorted(names, reverse=True)
+
+
 def split_names(dataset: str) -> tuple[str, ...]:
     """Return the names of the published splits of a data set, ``nuscenes`` or ``av2``."""
-    return tuple(name for family in _FAMILIES for name in _family(family)[dataset]["splits"])
+    return tuple(name for family in _families() for name in _family(family)[dataset]["splits"])
 
 
 def _family(name: str) -> Any:
@@ -65,7 +70,7 @@ def _family(name: str) -> Any:
 
 def published_split(name: str, dataset: str) -> SplitList:
     """Return a published split of a data set; ValueError if there is none of this name."""
-    for family in _FAMILIES:
+    for family in _families():
         lists = _family(family)[dataset]
         if name in lists["splits"]:
             parts = lists["splits"][name].items()

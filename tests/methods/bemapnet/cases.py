@@ -1,5 +1,7 @@
 """Cases of general tests for this method."""
 
+from mmdet3d.registry import TRANSFORMS
+
 EXPORTS = {"as it is": ("configs/bemapnet/bemapnet_r18_minicity.py", {})}
 
 EXPORT_SIZES = {
@@ -15,3 +17,11 @@ TARGETS = (
 )
 
 ANY_NUMBER = True  # lines have no equal numbers of points
+
+
+def check_targets(head, steps) -> None:
+    """Targets have the degrees and pieces of the head's curves."""
+    (step,) = steps
+    targets = TRANSFORMS.build(step)
+    shapes = zip(targets.degrees, targets.pieces, strict=True)
+    assert [d * k + 1 for d, k in shapes] == [curve.weights.shape[-1] for curve in head.curves]

@@ -29,7 +29,7 @@ EMPTY = elements()
 
 
 @pytest.mark.parametrize("grid", [ALONG_Y, ALONG_X], ids=["forward y", "forward x"])
-@pytest.mark.parametrize("decoder", [HEAD["decoder"], DECOUPLED], ids=["MapTR", "MapTRv2"])
+@pytest.mark.parametrize("decoder", [HEAD["decoder"], DECOUPLED], ids=["joint", "decoupled"])
 def test_with_the_weights_of_another_head_its_points_and_scores_are_exactly_the_same(decoder, grid):
     settings = {"decoder": decoder, "grid": grid}
     other, gsmap_head = build_head(MAPTR, **settings).eval(), build_head(GSMAP, **settings).eval()

@@ -29,7 +29,7 @@ def double_layer(**settings) -> GaussianDecoderLayer:
     return layer
 
 
-@pytest.mark.parametrize("attention", [SELF, DECOUPLED], ids=["MapTR", "MapTRv2"])
+@pytest.mark.parametrize("attention", [SELF, DECOUPLED], ids=["joint", "decoupled"])
 def test_the_path_from_gaussians_through_the_layer_to_gaussians_has_its_true_gradient(attention):
     layer = double_layer(**attention)
     query, position = torch.randn(2, 1, 3, 8, dtype=torch.float64)

@@ -6,7 +6,7 @@ import torch
 from mmengine.structures import InstanceData
 from predictions import pairs_of
 from reference.golden import Golden
-from reference.maptr import head_loss_rows
+from reference.maptr import head_loss_rows, state_rows
 from reference.registry import check
 from reference.report import Row, largest_difference, largest_relative, relative_norm
 
@@ -24,6 +24,12 @@ LOSSES = {
 # How the suffix of a raster's name says it was rendered: whether as a polygon. Boundaries of
 # polygons and hard masks serve nothing in MapVR's training and have no counterpart here.
 KINDS = {"lane_boundary_s2": False, "as_lane_s2": False, "mask_s4": True}
+
+
+@check(STATE)
+def check_state(golden: Golden, name: str) -> Iterator[Row]:
+    """Compare the state, which is that of MapTR, with ours."""
+    yield from state_rows(golden, name, "maptr/maptr_r50_24e.py")
 
 
 @check("mapvr_rasters_{variant}.npz")

@@ -1,5 +1,7 @@
 """Cases of general tests for this method."""
 
+from mmdet3d.registry import TRANSFORMS
+
 EXPORTS = {"as it is": ("configs/pivotnet/pivotnet_r18_minicity.py", {})}
 
 EXPORT_SIZES = {
@@ -19,3 +21,10 @@ LOSSES = ("num_pts", ())  # field of the ground truth; losses that may be zero
 PROFILES = ("pivotnet/pivotnet_r18_minicity", ("192", "320"))  # the size of its positions
 
 ANY_NUMBER = True  # lines have no equal numbers of points
+
+
+def check_targets(head, steps) -> None:
+    """Targets have the points of the head's queries."""
+    (step,) = steps
+    numbers = tuple(points for _, points in head.decoder.queries)
+    assert TRANSFORMS.build(step).num_points == numbers

@@ -124,7 +124,7 @@ def test_any_detector_gives_boxes():
 
 
 def test_a_detector_by_segmentation_gives_boxes_too():
-    """HDMapNet's lines, whose head has neither references nor queries."""
+    """Lines of a head that has neither references nor queries."""
     built = head({"type": "HDMapNetHead", "embed_dims": 8, "decoder": {"base_channels": 4}}).eval()
     built.detector.lines = lambda maps: InstanceData(
         pts=torch.tensor([[[0.0, 0.0], [9.0, 3.0], [9.0, 3.0]]]),

@@ -85,6 +85,6 @@ def test_a_layer_takes_its_attentions_as_parts():
     out = layer(*inputs, torch.rand(1, 6, 2), torch.randn(1, 8, 5, 4))
     out.square().sum().backward()
     assert type(layer.self_attn).__name__ == "DecoupledSelfAttention"
-    norms = [*layer.norms, layer.self_attn.norm]  # four, as MapTRv2 has
+    norms = [*layer.norms, layer.self_attn.norm]  # four, of both attentions
     assert all(norm.weight.grad.abs().sum() > 0 for norm in norms)
     assert layer.cross_attn.num_points == 2

@@ -1,4 +1,4 @@
-"""One-to-one and one-to-many queries (MapTRv2), on both heads."""
+"""One-to-one and one-to-many queries, on both heads."""
 
 import pytest
 import torch

@@ -78,8 +78,8 @@ class ExportedDetector(nn.Module):
 
         Returns:
             Scores (M,), labels (M,), points in metres (M, P, 2 or 3), and with Gaussians scales in
-            metres (M, P, 2) and rotations in radians (M, P), with PivotNet the number of points
-            that count (M,); best first. With memory also what this frame leaves.
+            metres (M, P, 2) and rotations in radians (M, P), for elements of any number of points
+            how many count (M,); best first. With memory also what this frame leaves.
         """
         elements, left = self.step(images, dict(zip(self.input_names[1:], inputs, strict=True)))
         return (*elements, *left.values())

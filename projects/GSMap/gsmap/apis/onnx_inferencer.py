@@ -135,7 +135,7 @@ class OnnxInferencer:
             images: One image of each of ``cameras``, in their order: BGR as OpenCV reads them,
                 values 0 to 255, scaled to ``image_size``. V x (H, W, 3)
             meta: ``lidar2img`` (V, 4, 4): from metres in the annotation frame to (u * d, v * d, d,
-                1) in pixels of these images. Depth-aware models (MapTRv2) also read ``lidar2cam``,
+                1) in pixels of these images. Camera-aware LSS encoders also read ``lidar2cam``,
                 ``cam2img`` of the original images, ``img_aug_matrix`` (V, 4, 4) from those to
                 these, and ``lidar2ego`` (4, 4), by default that of the training. GKT and BEVFormer
                 read

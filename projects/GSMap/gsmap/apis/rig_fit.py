@@ -37,12 +37,12 @@ AZIMUTHS_DEG = {
 }  # fmt: skip
 
 
-_GENERATED = "map_head.generator.label."  # VectorMapNet's, which fits its detector or none
+_GENERATED = "map_head.generator.label."  # of a head that fits its detector or none
 # Weights with a row for each class, and how many rows are before these.
 _CLASS_ROWS = {
     "map_head.cls_branches.": 0, "map_head.cls_branch.": 0, "map_head.detector.cls_branches.": 0,
     "map_head.detector.cls_branch.": 0, _GENERATED: 0,
-    "map_head.decoder.maps.0.3.": 1,  # HDMapNet's: the background
+    "map_head.decoder.maps.0.3.": 1,  # the background
 }  # fmt: skip
 _LOOK_AT = 100  # samples among which one with all cameras is looked for
 

@@ -67,7 +67,7 @@ class _Scene:
 
 @DATA_SAMPLERS.register_module()
 class StreamTrainSampler(Sampler[int]):
-    """Hand each place of the batch the samples of one scene after another, in order (StreamMapNet).
+    """Hand each place of the batch the samples of one scene after another, in order.
 
     Over all ranks there are ``slots`` x ranks streams. Stream j takes scenes j, j + streams, ... of
     endless random permutations, and its next one when a piece of a scene is used up, so the streams

@@ -17,7 +17,7 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.files import SUFFIX as PARTIAL
 from gsmap.utils.inputs import heed_input
 
-# The order of MapTR and MapTRv2: camera embeddings of their checkpoints depend on it.
+# The order of MapTR's family: camera embeddings of its checkpoints depend on it.
 RING_CAMERAS = (
     "ring_front_center", "ring_front_right", "ring_front_left", "ring_rear_right", "ring_rear_left",
     "ring_side_right", "ring_side_left",

@@ -46,7 +46,7 @@ def map_targets(
         rng: Draws the orders of rings with more than P - 1 vertices; None spreads them evenly.
         orders_of: ``vertices``: a ring starts at each vertex, in its own direction (MapTR);
             ``points``: at each of its P points, in both directions, and a line whose ends almost
-            meet is a ring too (StreamMapNet).
+            meet is a ring too.
 
     Returns:
         ``labels_3d`` (K,) int64, ``pts`` (K, P, dim), ``pts_shifts`` (K, S, P, dim), ``boxes`` (K,

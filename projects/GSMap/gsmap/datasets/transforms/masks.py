@@ -36,7 +36,7 @@ def cells_of(instance: MapInstance, results: dict[str, Any], size: tuple[int, in
 class MakeBEVMask(BaseTransform):
     """Add ``gt_seg``: elements drawn in one channel, or in that of their class. (channels, H, W)
 
-    Pixel coordinates are truncated to integers, as in MapTRv2.
+    Pixel coordinates are truncated to integers, as released.
 
     Args:
         size: Rows H and columns W over the ground truth's range.
@@ -69,7 +69,7 @@ class MakeBEVMask(BaseTransform):
 @TRANSFORMS.register_module()
 @dataclass(eq=False)
 class MakeInstanceMasks(BaseTransform):
-    """Add ``masks`` (K, H, W) to ``gt_instances_3d``: each element's own cells in BEV (MGMap).
+    """Add ``masks`` (K, H, W) to ``gt_instances_3d``: each element's own cells in BEV.
 
     Of elements of one class the later one has the cells of both; near an element of a later class
     all give way. Cells are truncated as in `MakeBEVMask`.

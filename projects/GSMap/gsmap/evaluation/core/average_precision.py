@@ -26,7 +26,7 @@ def area_ap(hits: BoolArray, num_gts: int) -> float:
 
 
 def interpolated_ap(hits: BoolArray, num_gts: int) -> float:
-    """Return the mean of the precision envelope at 101 recalls (COCO, as MapVR computes it).
+    """Return the mean of the precision envelope at 101 recalls (COCO).
 
     ``hits`` (N,) are in descending order of score; without ground truths the result is -1.
     """
@@ -43,8 +43,9 @@ def interpolated_ap(hits: BoolArray, num_gts: int) -> float:
 def ten_point_ap(hits: BoolArray, num_gts: int) -> float:
     """Return the mean of the precision envelope at the recalls 0.1, 0.2, ... 1.
 
-    ``hits`` (N,) are in the order in which predictions count; ``num_gts`` is > 0. (HDMapNet's
-    evaluator compares recalls in float32, in which 7 of 10 are less than 0.7; here they are equal.)
+    ``hits`` (N,) are in the order in which predictions count; ``num_gts`` is > 0. (A
+    released evaluator compares recalls in float32, in which 7 of 10 are less than 0.7; here they
+    are equal.)
     """
     _, precision = precision_recall(hits, num_gts)
     envelope = np.maximum.accumulate(precision[::-1])[::-1]

@@ -3,7 +3,7 @@
 Rules (equal to MapTR's evaluator): every line is resampled to 100 points; a prediction looks only
 at its nearest ground truth and matches if the distance is within the threshold and no prediction
 with a higher score has taken it; pairs whose 4 m wide strips do not touch never match. With
-heights, distances are in space, as in MapTRv2's; lines are resampled and strips touch in the plane.
+heights, distances are in space; lines are resampled and strips touch in the plane.
 """
 
 import math

@@ -210,7 +210,7 @@ def metric_class(name: str) -> type[Metric]:
 def metric_files() -> dict[str, str]:
     """Return the modules of the metrics that come with GSMap, by the names of their files.
 
-    Those of a method are in its folder: ``models/hdmapnet/metric.py``.
+    Those of a method are in its folder: ``models/<method>/metric.py``.
     """
     own = {path.stem: "metrics" for path in (PACKAGE / "evaluation/metrics").glob("[a-z]*.py")}
     methods = sorted(path.parent.name for path in (PACKAGE / "models").glob("*/metric.py"))

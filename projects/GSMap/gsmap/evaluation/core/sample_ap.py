@@ -1,4 +1,4 @@
-"""AP per sample, as of HDMapNet and BeMapNet: lines drawn as masks, then the mean over samples.
+"""AP per sample of older methods: lines drawn as masks, then the mean over samples.
 
 Rules (those of both released evaluators): the lines of a class and sample are drawn into one mask
 of 0.15 m pixels in the order of the file, so a later line hides what it crosses. The distance of

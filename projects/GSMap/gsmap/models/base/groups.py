@@ -12,8 +12,8 @@ class QueryGroup:
     Args:
         num: Instance queries.
         name: Suffix of its losses; empty for the group that predicts.
-        repeats: How often each ground truth may be matched (k in MapTRv2).
-        weight: Weight of its losses (lambda in MapTRv2).
+        repeats: How often each ground truth may be matched.
+        weight: Weight of its losses.
         losses: Names of the losses that it has; None means all.
 
     Raises:

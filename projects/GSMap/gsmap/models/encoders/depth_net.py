@@ -1,4 +1,4 @@
-"""Camera-aware depth net of MapTRv2, after BEVDepth (arXiv 2206.10092)."""
+"""Camera-aware depth net, after BEVDepth (arXiv 2206.10092)."""
 
 from collections import OrderedDict
 
@@ -13,7 +13,7 @@ CAMERA_VECTOR_SIZE = 22
 def _conv_bn_relu(
     in_channels: int, out_channels: int, kernel_size: int, dilation: int = 1
 ) -> nn.Sequential:
-    """Build a size-keeping convolution with BatchNorm and ReLU, under MapTRv2's parameter names."""
+    """Build a size-keeping convolution with BatchNorm and ReLU, under the released names."""
     padding = dilation * (kernel_size // 2)
     conv = nn.Conv2d(
         in_channels, out_channels, kernel_size, padding=padding, dilation=dilation, bias=False
@@ -23,14 +23,14 @@ def _conv_bn_relu(
 
 
 def _camera_mlp(channels: int) -> nn.Sequential:
-    """Build the embedding of a camera's parameter vector, under MapTRv2's parameter names."""
+    """Build the embedding of a camera's parameter vector, under the released parameter names."""
     first = nn.Linear(CAMERA_VECTOR_SIZE, channels)
     second = nn.Linear(channels, channels)
     return nn.Sequential(OrderedDict(fc1=first, relu=nn.ReLU(), fc2=second))
 
 
 def camera_vector(cam2img: Tensor, img_aug_matrix: Tensor, ego_from_cam: Tensor) -> Tensor:
-    """Parameters of a camera as the input vector of the depth net of MapTRv2.
+    """Parameters of a camera as the input vector of the depth net.
 
     The 22 numbers are fx, fy, cx, cy; a00, a01, tx, a10, a11, ty of the augmentation; and the upper
     three rows of the pose.

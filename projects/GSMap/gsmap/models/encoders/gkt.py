@@ -39,7 +39,7 @@ class GeometryKernelAttention(nn.Module):
         num_heads: Number of heads; head m attends to pillar height m.
         kernel_size: Rows and columns of the kernel. An even kernel, which needs ``bilinear``, lies
             half a pixel to the left and up.
-        bilinear: Sample between pixels (MapQR) instead of at the nearest one; zero outside the map.
+        bilinear: Sample between pixels instead of at the nearest one; zero outside the map.
         released_cells: Use the visible cells of the first sample of the batch for all samples, as
             in the released code. The result of a sample then depends on its batch.
         equal_weights: Start from equal weights over the kernel, as GKT's code intends. In MapTR and

@@ -1,4 +1,4 @@
-"""BEV encoder that lifts image features along predicted depth (Lift, Splat, Shoot; MapTRv2)."""
+"""BEV encoder that lifts image features along predicted depth (Lift, Splat, Shoot)."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
@@ -31,7 +31,7 @@ class LSSEncoder(CameraEncoder):
         bev_pixel_m: Side of a cell of the output in metres, or its sizes along x and y.
         embed_dims: Channels C of image and BEV features.
         depth_range: ``(low, high, step)`` of the depth bins in metres.
-        camera_aware: Use the depth net with camera parameters (MapTRv2). Otherwise one convolution,
+        camera_aware: Use the depth net with camera parameters. Otherwise one convolution,
             as in the BEVPool variant of MapTR.
         aspp_channels: Channels of each branch of the pyramid of the camera-aware depth head.
 
@@ -81,7 +81,7 @@ class LSSEncoder(CameraEncoder):
         self.downsample = blocks
 
     def init_weights(self) -> None:
-        """Initialise matrices and kernels from Xavier's uniform distribution, as in MapTRv2."""
+        """Initialise matrices and kernels from Xavier's uniform distribution."""
         super().init_weights()
         init_matrices(self)
 

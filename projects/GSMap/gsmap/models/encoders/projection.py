@@ -112,7 +112,7 @@ def frustum_points(
 ) -> Tensor:
     """Points of every feature pixel at every depth, in the annotation frame.
 
-    Feature pixels are spaced evenly from the first to the last pixel of the image, as in MapTRv2.
+    Feature pixels are spaced evenly from the first to the last pixel of the image, as released.
     They are not the centres of the feature cells.
 
     Args:

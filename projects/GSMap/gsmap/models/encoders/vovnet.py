@@ -1,4 +1,4 @@
-"""VoVNetV2, an image backbone (arXiv 1911.06667): the V2-99 of the largest GeMap models.
+"""VoVNetV2, an image backbone (arXiv 1911.06667): with V2-99 as its largest size.
 
 Module names, including their slashes, equal those of the original, so its checkpoints load.
 """

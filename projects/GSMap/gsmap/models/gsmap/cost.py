@@ -19,7 +19,7 @@ class IoUCost(MapCost):
 
     Args:
         weight: Weight of the cost.
-        kind: ``"iou"`` for 1 - sum min / sum max, ``"dice"`` for MapVR's dice loss.
+        kind: ``"iou"`` for 1 - sum min / sum max, ``"dice"`` for one less their dice coefficient.
 
     Raises:
         ValueError: If ``kind`` is unknown.

@@ -113,7 +113,7 @@ class MaskOverlapLoss(MaskLoss):
 
     Args:
         loss_weight: Weight of the loss.
-        kind: ``"dice"``, as MapVR (`dice_loss`), or ``"iou"``: 1 - sum min / sum max.
+        kind: ``"dice"`` (`dice_loss`), or ``"iou"``: 1 - sum min / sum max.
         full_iou: As in `MaskLoss`.
         flags: As in `MapLoss`.
 

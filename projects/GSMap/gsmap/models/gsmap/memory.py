@@ -1,6 +1,6 @@
 """Gaussians as memory: moved with their covariance, refined, then fused with what was remembered.
 
-This is ours: StreamMapNet hands on points.
+This is ours: the published memory of queries hands on points.
 """
 
 import math

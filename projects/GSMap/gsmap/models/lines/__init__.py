@@ -1,1 +1,1 @@
-"""Lines of classes that have queries of their own, with masks: what PivotNet and BeMapNet share."""
+"""Heads of lines with masks, whose classes have queries of their own: shared by two methods."""

@@ -54,7 +54,7 @@ class PointReference(nn.Module, RefinedReference):
         coords: 2, or 3 for points with height.
         z_range: Lowest and highest z in metres, for points with height.
         points_per_state: Number of points n that one query initialises and one state refines. With
-            more than one, the networks are larger, as in MapQR.
+            more than one, the networks are larger.
 
     Raises:
         ValueError: If ``coords`` is not 2 or 3, or 3 without a valid ``z_range``.
@@ -140,7 +140,7 @@ class PointReference(nn.Module, RefinedReference):
     def norm(self, points_m: Tensor) -> Tensor:
         """Normalise points in metres to [0, 1]; the inverse of :meth:`metres`.
 
-        A height outside ``z_range`` is clamped to it, as in MapTRv2.
+        A height outside ``z_range`` is clamped to it.
 
         Args:
             points_m: Points in metres. (..., >= coords)

@@ -160,7 +160,7 @@ class PerPointSampling(SamplingAttention):
 
 @MODELS.register_module()
 class MultiPointAttention(PerPointSampling):
-    """Attention of instance queries alone around all of their points (StreamMapNet).
+    """Attention of instance queries alone around all of their points, as `LinePointAttention`.
 
     A linear layer computes the point queries from the instance query. This is the baseline of
     MGMapNet's tables.
