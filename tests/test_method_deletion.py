@@ -51,9 +51,9 @@ def gone_with(name: str) -> set[str]:
 
 
 def places(name: str) -> list[Path]:
-    """Return a method's folders and its page, from the repository's root."""
+    """Return a method's folders and its pages, from the repository's root."""
     folders = [MODELS / name, Path("configs") / name, Path("tests/methods") / name]
-    return [*folders, Path(f"docs/methods/{name}.md")]
+    return [*folders, Path(f"docs/methods/{name}.md"), Path(f"docs/methods/names/{name}.md")]
 
 
 @cache

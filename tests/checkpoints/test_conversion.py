@@ -189,7 +189,7 @@ def test_the_tool_converts_files_and_refuses_to_overwrite(tmp_path, monkeypatch,
     assert sorted(tmp_path.iterdir()) == [source, target]
 
 
-PAGES = [REPO / "docs/upstream_names.md", *sorted((REPO / "docs/methods").glob("*.md"))]
+PAGES = [REPO / "docs/upstream_names.md", *sorted((REPO / "docs/methods/names").glob("*.md"))]
 
 
 def test_every_unused_key_is_documented():
