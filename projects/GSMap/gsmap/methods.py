@@ -2,7 +2,7 @@
 
 A method is whole in ``gsmap/models/<name>``: its parts, its targets, the table of its state keys
 (``keys.py``) and its paper's numbers (``paper.json``). Beside it are only ``configs/<name>``,
-``tests/methods/<name>`` and ``docs/methods/<name>.md``.
+``tests/methods/<name>``, ``docs/methods/<name>.md`` and ``docs/methods/names/<name>.md``.
 """
 
 from dataclasses import dataclass
