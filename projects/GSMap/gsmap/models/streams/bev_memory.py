@@ -16,7 +16,7 @@ from gsmap.utils.errors import InputError
 
 @MODELS.register_module()
 class BEVMemory(nn.Module, AddsWeights):
-    r"""Fuse current BEV features x with the warped memory h of the previous frame (Yuan et al. 2024).
+    r"""Fuse BEV features x with the warped memory h of the previous frame (Yuan et al. 2024).
 
     The output is the LayerNorm of :math:`(1 - z) h + z q` with :math:`z = \sigma(W_z [h, x])`,
     :math:`r = \sigma(W_r [h, x])` and :math:`q = W_q [r h, x]`, where W are 1 x 1 convolutions.

@@ -21,7 +21,7 @@ _POSE = 12  # entries of the first three rows of a transform
 
 @MODELS.register_module()
 class QueryMemory(BaseModule, AddsWeights):
-    """Propagation of the best queries of each frame to the next one, for any head (Yuan et al. 2024).
+    """Propagation of the best queries of a frame to the next, for any head (Yuan et al. 2024).
 
     A small network conditions the states of the queries on the ego motion, and their references are
     transformed. After the first decoder layer of the next frame they replace its weakest queries.
