@@ -278,7 +278,7 @@ class Propagation(FlowHook):
         return memory
 
     def loss(self, head: FlowHead) -> Tensor:
-        """Transformation loss (StreamMapNet): smooth L1 to the transformed previous targets.
+        """Transformation loss (Yuan et al. 2024): smooth L1 to the transformed previous targets.
 
         It is 0 with a gradient of 0 if no stream continues.
         """
