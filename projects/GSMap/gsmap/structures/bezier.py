@@ -1,4 +1,4 @@
-"""Piecewise Bezier curves: lines as few control points (BeMapNet, Qiao et al., CVPR 2023).
+"""Piecewise Bezier curves: lines as few control points (Qiao et al., CVPR 2023).
 
 A curve of k pieces of degree d has ``k * d + 1`` control points: joint, inner points, joint, ...
 """
@@ -94,7 +94,7 @@ def fit_piece(points: Points, degree: int) -> Float:
 
 
 def mean_deviation(line: Float, curve: Float, ignored_m: float = 0.05) -> float:
-    """Compute the mean distance of a line and a curve, as in BeMapNet.
+    """Compute the mean distance of a line and a curve, as in the release.
 
     Args:
         line: Vertices of the line in metres, resampled to 100 points. (n, D)
@@ -234,7 +234,7 @@ def fit_pieces(
     """Fit a line with few pieces, each as long as the error allows.
 
     Joints are vertices of the line (`fit_joints`). A piece between neighbouring vertices is exact,
-    so there is always a fit. BeMapNet uses ``deviation=mean_deviation``.
+    so there is always a fit. The release uses ``deviation=mean_deviation``.
 
     Args:
         points: Vertices in metres. (n >= 2, D)

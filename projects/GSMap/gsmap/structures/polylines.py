@@ -33,7 +33,7 @@ def is_closed(points: Points) -> bool:
 def arc_lengths(points: Points) -> NDArray[np.float64]:
     """Compute the distance along a polyline from its first point to each point, in the plane.
 
-    Heights do not count, as in shapely, which MapTRv2 uses to resample 3D lines: a line with z and
+    Heights do not count, as in shapely, with which releases resample lines: a line with z and
     its projection to the plane are resampled at equal (x, y).
 
     Args:
@@ -196,7 +196,7 @@ def equivalent_orders(
 
 
 def sampled_orders(points: Points, closed: bool) -> NDArray[np.float64]:
-    """Compute the point orders of a resampled line as in StreamMapNet.
+    """Compute the point orders of a resampled line, with both directions at each point.
 
     An open line has two orders: forward and reversed. A closed line has two orders for each of its
     P - 1 different points, which start there: forward and reversed. It is not resampled again.

@@ -18,7 +18,7 @@ from gsmap.utils.errors import InputError
 def cell_indices(points_m: Tensor, grid: BEVGrid, z_range: tuple[float, float]) -> Tensor:
     """Find the grid cell of each point.
 
-    Indices are truncated towards zero, as in MapTRv2: points up to one cell below the lower edge
+    Indices are truncated towards zero, as released: points up to one cell below the lower edge
     count into index 0.
 
     Args:
@@ -80,7 +80,7 @@ def bev_pool_conv3x3(
     """Pool lifted features and convolve the cells: ``conv2d(bev_pool(...), weight, padding=1)``.
 
     Both steps are linear, so the nine matrices (O, C) of the filter can be applied to the few
-    context vectors instead of the many cells. At MapTRv2's size (2,250 pixels, 80,000 cells) this
+    context vectors instead of the many cells. At a published size (2,250 pixels, 80,000 cells) this
     is 35 times less arithmetic.
 
     Args:

@@ -1,4 +1,4 @@
-"""Rasters of polylines and polygons: MapVR's soft rasters, and masks of ground truth."""
+"""Rasters of polylines and polygons: soft rasters, and masks of ground truth."""
 
 import torch
 from torch import Tensor
@@ -9,7 +9,7 @@ from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32
 from gsmap.utils.errors import InputError
 
-LANE_GAP_PX = 0.01  # shift of a line's way back in MapVR, which closes the line to a polygon
+LANE_GAP_PX = 0.01  # shift of a line's way back as released, which closes the line to a polygon
 DISTANCES = ("squared", "plain")
 _draw = fused_operator(
     "polyline_raster.draw_polylines",
@@ -94,8 +94,8 @@ def soft_rasters(
     r"""Render lines as :math:`\exp(-D / \tau)`, polygons as :math:`\sigma(\pm D / \tau)`.
 
     D is the distance of a pixel to the nearest edge, or its square. The sign is + inside of a
-    polygon (MapVR Eqs. 2-3). A line is rendered as the thin closed polygon of the line and its way
-    back. The last vertex of a polygon is joined to the first one.
+    polygon (Zhang et al., Eqs. 2-3). A line is rendered as the thin closed polygon of the line and
+    its way back. The last vertex of a polygon is joined to the first one.
 
     Args:
         vertices: Vertices in pixels (x = column, y = row); pixel (row, col) is sampled at
@@ -105,7 +105,7 @@ def soft_rasters(
         is_polygon: Whether an element is a filled polygon, bool; None for lines only. (n,)
         line_softness: :math:`\tau` of lines, > 0, in the unit of D.
         polygon_softness: :math:`\tau` of polygons, > 0, in the unit of D.
-        distance: ``"squared"`` for D in square pixels, as in MapVR's released rasterizer, or
+        distance: ``"squared"`` for D in square pixels, as in the released rasterizer, or
             ``"plain"`` for D in pixels, as in its equations.
         backend: Backend, see `choose_backend`.
 
@@ -128,7 +128,7 @@ def soft_rasters(
     plain = distance == "plain"
     with torch.autocast(vertices.device.type, enabled=False):
         vertices = at_least_float32(vertices)
-        # Differs from MapVR Eqs. (2-3) by default: D is squared, as in its released rasterizer.
+        # Differs from Eqs. (2-3) by default: D is squared, as in its released rasterizer.
         back = vertices.flip(1) + LANE_GAP_PX
         stay = vertices[:, -1:].expand_as(vertices)  # pads a polygon with its last vertex
         second_half = torch.where(flags[:, None, None], stay, back)

@@ -21,7 +21,7 @@ from gsmap.ops.polyline_raster.reference import DISTANCE_EPS, LENGTH_EPS
 
 FAR = np.float32(np.inf)
 REACH = -math.log(1e-8)  # in units of softness; farther pixels are 0 or 1
-INTEGER_FRAME = (-0.5, -0.5, 1.0, 1.0)  # MapVR samples pixel (row, col) at (col, row)
+INTEGER_FRAME = (-0.5, -0.5, 1.0, 1.0)  # the release samples pixel (row, col) at (col, row)
 
 
 @njit(nogil=True, cache=True, fastmath=FASTMATH, error_model="numpy")

@@ -9,7 +9,7 @@ from torch import Tensor
 BLOCK_VALUES = 1 << 22  # number of distances in memory at a time
 GPU_BLOCK_VALUES = 1 << 25  # with fewer, launches take longer than arithmetic
 DISTANCE_EPS = 1e-6  # smallest distance of a pixel from an edge, in pixels
-LENGTH_EPS = 1e-5  # added to the squared length of an edge, as in MapVR; an edge may be a point
+LENGTH_EPS = 1e-5  # added to the squared length of an edge, as released; an edge may be a point
 
 
 def _edge_distances(pixels: Tensor, starts: Tensor, ends: Tensor, eps: float = 0.0) -> Tensor:
