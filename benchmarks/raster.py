@@ -177,7 +177,7 @@ def rendering_table(args: argparse.Namespace) -> str:
         grid = BEVGrid((-15, 15), (-30, 30), height=height, width=width)
         lines = random_polylines(args.instances, grid)
         upstream = torch.randn(args.instances, height, width, device=device)
-        mapvr = measure_soft_lines(lines, grid, upstream=upstream, repeats=args.repeats)
+        soft_lines = measure_soft_lines(lines, grid, upstream=upstream, repeats=args.repeats)
         count = min(args.instances, math.ceil(REFERENCE_BYTES / (4 * POINTS * height * width)))
         factor = args.instances / count
         for scales_m in SCALES_M:
@@ -197,7 +197,7 @@ def rendering_table(args: argparse.Namespace) -> str:
                 reference=reference.scale(factor),
                 fused=fused,
                 floor_s=floor_s,
-                mapvr=mapvr,
+                soft_lines=soft_lines,
                 upstream=upstream,
             )
             rows.append([f"{height} x {width}", f"{scales_m[0]:g} x {scales_m[1]:g}", *cells])
@@ -218,7 +218,7 @@ def rendering_table(args: argparse.Namespace) -> str:
         f"{backend} memory (MiB)",
         "share of reference",
         "in masks",
-        "MapVR lines (ms)",
+        "soft lines (ms)",
     )
     return rates + markdown_table(header, rows)
 
@@ -248,7 +248,7 @@ def measure_renderer(
 
 
 def measure_soft_lines(lines: Tensor, grid: BEVGrid, upstream: Tensor, repeats: int) -> Cost:
-    """Measure forward and backward of MapVR's soft lines.
+    """Measure forward and backward of soft lines.
 
     Args:
         lines: Vertices in metres. (N, P, 2)
@@ -268,7 +268,7 @@ def measure_soft_lines(lines: Tensor, grid: BEVGrid, upstream: Tensor, repeats: 
 
 
 def rendering_cells(
-    reference: Cost, fused: Cost, floor_s: float, mapvr: Cost, upstream: Tensor
+    reference: Cost, fused: Cost, floor_s: float, soft_lines: Cost, upstream: Tensor
 ) -> list[str]:
     """Format the measurements of one row of the table.
 
@@ -276,7 +276,7 @@ def rendering_cells(
         reference: Cost of the reference.
         fused: Cost of the fused kernels.
         floor_s: Lower bound of the time in seconds.
-        mapvr: Cost of MapVR's soft lines.
+        soft_lines: Cost of soft lines.
         upstream: Gradients of the masks. (N, H, W)
 
     Returns:
@@ -296,7 +296,7 @@ def rendering_cells(
         f"{fused.peak_bytes / MIB:.0f}",
         f"{fused.peak_bytes / reference.peak_bytes:.4f}",
         f"{fused.peak_bytes / (4 * upstream.numel()):.2f}",
-        f"{mapvr.time_s(device) * 1e3:.1f}",
+        f"{soft_lines.time_s(device) * 1e3:.1f}",
     ]
 
 
