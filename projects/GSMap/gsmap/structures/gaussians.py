@@ -22,7 +22,7 @@ AT_FLOOR = 1.1  # a Gaussian is at the lower bound if both sigmas are below this
 class Gaussians(NamedTuple):
     """Ordered 2D Gaussians G = (mu, sigma, theta) (GSMap Eq. 1).
 
-    Args:
+    Attributes:
         means: Centres mu in metres. (..., 2)
         scales: Standard deviations sigma along the axes of each Gaussian, in metres. (..., 2)
         rotations: Angle theta of the first axis from +x, in radians, anticlockwise. (...)

@@ -13,7 +13,7 @@ _SHORT = 1e-9  # square metres; a shorter segment has no direction
 class LinePlaces(NamedTuple):
     """Nearest places on lines to points, for K pairs of an element and a line.
 
-    Args:
+    Attributes:
         distances: Distance of each point from its place, in metres. (K, P)
         segments: Index of the segment of the place. (K, P)
         shares: Position of the place on its segment, in [0, 1]. (K, P)
