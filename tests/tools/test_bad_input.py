@@ -109,7 +109,7 @@ evaluate: VAL nothing.json | holds ground truth: name the result file before it
 evaluate: nothing.json VAL | 2 samples have no results
 evaluate: nothing.json damaged.arrow | damaged.arrow is not a whole annotation file
 evaluate: nothing.json VAL --classes a | has the classes
-evaluate: nothing.json VAL --thresholds nan | thresholds must be > 0 m
+evaluate: nothing.json VAL --thresholds nan | --thresholds must be a number, got nan
 evaluate: nothing.json VAL --polygon-classes divder | no class 'divder'; did you mean 'divider'?
 evaluate: nothing.json VAL --range 3 3 1 1 | x_range must be (low, high)
 evaluate: nothing.json VAL --out . | Is a directory

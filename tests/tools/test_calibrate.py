@@ -141,7 +141,8 @@ def test_an_interval_of_no_or_too_many_sigmas_is_refused_at_once(sigmas, monkeyp
     monkeypatch.setattr("sys.argv", ["calibrate.py", *"abcde", "--sigmas", sigmas])
     with pytest.raises(SystemExit):
         calibrate()
-    assert "--sigmas must be more than 0 and at most 3" in capsys.readouterr().err
+    expected = "a number, got nan" if sigmas == "nan" else "more than 0 and at most 3"
+    assert f"--sigmas must be {expected}" in capsys.readouterr().err
 
 
 def test_a_model_without_gaussians_is_not_calibrated(files, tmp_path, monkeypatch):
