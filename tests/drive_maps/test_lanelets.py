@@ -77,6 +77,16 @@ def test_a_fork_has_two_lanelets_that_follow(tmp_path) -> None:
     assert lanelets[3].leftBound[0].y < 3.5 < lanelets[3].rightBound[0].y  # it runs west
 
 
+def test_vertices_that_repeat_change_nothing() -> None:
+    straight, leaving, back = fork()
+    repeated = [np.repeat(straight, 2, axis=0), leaving[[0, 0, *range(1, 12)]], back]
+    lanes = lane_graph([*repeated, np.zeros((3, 2))], [])
+    expected = lane_graph([straight, leaving, back], [])
+    np.testing.assert_array_equal(lanes.left, expected.left)
+    for lane, other in zip(lanes.lanelets, expected.lanelets, strict=True):
+        np.testing.assert_array_equal(lane.right, other.right)
+
+
 def test_bounds_lie_on_the_borders_beside_a_lane(tmp_path) -> None:
     divider = np.array([[-5.0, 1.5], [105.0, 1.5]])
     kerb = np.array([[-5.0, -2.4], [105.0, -2.4]])

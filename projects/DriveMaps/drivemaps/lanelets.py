@@ -88,14 +88,15 @@ def lane_graph(centerlines: Iterable[FloatArray], borders: Sequence[FloatArray])
     """Make lanelets of centre lines.
 
     A line is split where another one begins or ends on it, and of lines that lie on each other one
-    is taken. A bound runs parallel to its centre
-    line, at the median distance of the borders beside it, or at 1.75 m where there are none.
+    is taken. A bound runs parallel to its centre line, at the median distance of the borders beside
+    it, or at 1.75 m where there are none.
 
     Args:
         centerlines: Lines in the direction of travel, in metres. each (n >= 2, 2)
         borders: Dividers and boundaries, in metres. each (n, 2)
     """
-    lines = _split([np.asarray(line)[:, :2] for line in centerlines])
+    distinct = [_without_repeats(np.asarray(line)[:, :2]) for line in centerlines]
+    lines = _split([line for line in distinct if len(line) > 1])
     if not lines:
         return LaneGraph([], np.empty((0, 2)), np.empty((0, 2)))
     ends = np.array([line[index] for line in lines for index in (0, -1)])  # (2 lanes, 2)
@@ -139,6 +140,12 @@ def _to_left(directions: FloatArray) -> FloatArray:
     return np.stack([-directions[..., 1], directions[..., 0]], axis=-1)
 
 
+def _without_repeats(line: FloatArray) -> FloatArray:
+    """Line without vertices that equal the one before, which have no direction. (n, 2)"""
+    differs = (np.diff(line, axis=0) != 0).any(axis=1)
+    return line[np.append(True, differs)]
+
+
 def _directions(line: FloatArray) -> FloatArray:
     """Unit direction of a line at each vertex. (n, 2)"""
     steps = np.diff(line, axis=0)
@@ -175,25 +182,31 @@ def _directed(lines: Sequence[FloatArray], pieces: Sequence[FloatArray]) -> list
 
 
 def _split(lines: Sequence[FloatArray]) -> list[FloatArray]:
-    """Split lines where another one begins or ends on them in their direction. each (n, 2)"""
-    kept = [line for line in lines if shapely.LineString(line).length > _SHORTEST_M]
+    """Split lines where another one begins or ends on them in its direction. each (n, 2)"""
+    long_lines = []
+    ends = []
+    headings = []
+    for line in lines:
+        if shapely.LineString(line).length <= _SHORTEST_M:
+            continue
+        directions = _directions(line)
+        long_lines.append(line)
+        ends += [line[0], line[-1]]
+        headings += [directions[0], directions[-1]]
+    tree = shapely.STRtree(shapely.points(ends) if ends else [])
     parts = []
-    for number, line in enumerate(kept):
+    for number, line in enumerate(long_lines):
         shape = shapely.LineString(line)
         cuts = [0.0, shape.length]
-        for other_number, other in enumerate(kept):
-            if other_number == number:
+        for end in sorted(tree.query(shape, predicate="dwithin", distance=_JOIN_M).tolist()):
+            if end // 2 == number:
                 continue
-            headings = _directions(other)
-            for index in (0, -1):
-                cut = shape.project(shapely.Point(other[index]))
-                around = np.clip([cut - 0.5, cut + 0.5], 0.0, shape.length)
-                ahead = shapely.get_coordinates(shapely.line_interpolate_point(shape, around))
-                near = shape.distance(shapely.Point(other[index])) <= _JOIN_M
-                alike = (ahead[1] - ahead[0]) @ headings[index] > _ALIKE
-                inside = min(cut - c if c <= cut else c - cut for c in cuts) > _SHORTEST_M
-                if near and alike and inside:
-                    cuts.append(cut)
+            cut = shape.project(shapely.Point(ends[end]))
+            around = np.clip([cut - 0.5, cut + 0.5], 0.0, shape.length)
+            before, after = shapely.get_coordinates(shapely.line_interpolate_point(shape, around))
+            follows = (after - before) @ headings[end] > _ALIKE
+            if follows and min(abs(cut - other) for other in cuts) > _SHORTEST_M:
+                cuts.append(cut)
         cuts.sort()
         for low, high in pairwise(cuts):
             part = shapely.ops.substring(shape, low, high)
