@@ -1,8 +1,8 @@
-"""Frames on a GPU without launches one by one: a model as one static function, as a CUDA graph.
+"""Frames on a GPU as replayed CUDA graphs.
 
-A frame of these models is some thousand small operations, and a GPU would wait for the host to
-launch each. Where no size depends on values, all launches of a frame are recorded once for each
-size of images and replayed afterwards.
+A frame of these models consists of hundreds of small operations, and the GPU waits for the host to
+launch each of them. If no tensor size depends on values, all launches of a frame are recorded once
+for each image size and replayed for later frames.
 """
 
 import threading
@@ -87,35 +87,41 @@ class StaticFrame(nn.Module):
         model = self.model
         images = model.data_preprocessor.normalise(images)
         feats = model.extract_img_feats(images)
-        given = dict(zip(self.names, calibration, strict=True))
-        shape = (images.shape[-2], images.shape[-1])
-        outputs = model.bev_encoder.encode(model.bev_encoder.levels(feats), given, shape)
-        last = model.map_head(outputs)[-1]
-        rows = [
-            self._elements(scores, references)
-            for scores, references in zip(last.scores, last.references, strict=True)
-        ]
-        return torch.stack(rows)
+        outputs = model.bev_encoder.encode(
+            model.bev_encoder.levels(feats),
+            calibration=dict(zip(self.names, calibration, strict=True)),
+            img_shape=(images.shape[-2], images.shape[-1]),
+        )
+        last_layer = model.map_head(outputs)[-1]
+        samples = []
+        for scores, references in zip(last_layer.scores, last_layer.references, strict=True):
+            samples.append(self._elements(scores, references))
+        return torch.stack(samples)
 
     def _elements(self, scores: Tensor, references: Any) -> Tensor:
-        """Return the best elements of one sample, their fields side by side. (M, F)"""
+        """Best elements of one sample, their fields side by side. (M, F)"""
         head = self.model.map_head
         decoded = head.reference.decode(references)
         best = head.coder.best(head.coder.weighed(scores, decoded))
         fields = {"scores_3d": best.scores, "labels_3d": best.labels}
         fields |= head.detected(decoded, best)
-        self.layout = {name: (value.shape[1:], value.dtype) for name, value in fields.items()}
-        columns = [value.flatten(1).float() for value in _as_columns(fields.values())]
+        layout = {}
+        columns = []
+        for name, value in fields.items():
+            layout[name] = (value.shape[1:], value.dtype)
+            columns.append(value.unsqueeze(-1).flatten(1).float())
+        self.layout = layout
         return torch.cat(columns, 1)
 
     def unpack(self, elements: Tensor) -> dict[str, Tensor]:
-        """Return the fields of a sample's elements, on the host. (M, F) -> (M, ...) each"""
-        sizes = [shape.numel() for shape, _ in self.layout.values()]
-        parts = elements.split(sizes, 1)
-        return {
-            name: part.reshape(len(part), *shape).to(dtype)
-            for part, (name, (shape, dtype)) in zip(parts, self.layout.items(), strict=True)
-        }
+        """Split the elements of a sample into their fields. (M, F) -> (M, ...) each"""
+        fields = {}
+        start = 0
+        for name, (shape, dtype) in self.layout.items():
+            end = start + shape.numel()
+            fields[name] = elements[:, start:end].reshape((len(elements), *shape)).to(dtype)
+            start = end
+        return fields
 
 
 @dataclass
@@ -147,21 +153,25 @@ class FastFrames:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def serves(self, batch: dict[str, Any]) -> bool:
-        """Return whether a batch has images of one size, as the function needs them."""
+        """Whether a batch consists of images of one size, which the function requires."""
         images = batch["inputs"].get("img")
-        shapes = {tuple(each.shape) for each in images or ()}
+        shapes = {tuple(image.shape) for image in images or ()}
         return len(shapes) == 1 and set(batch["inputs"]) == {"img"}
 
     def __call__(self, batch: dict[str, Any]) -> "list[Det3DDataSample]":
-        """Return a collated batch's samples with ``pred_instances_3d``, on the CPU.
+        """Predict the samples of a collated batch.
 
         Args:
-            batch: ``inputs`` with ``img``, one tensor (V, 3, H, W) a sample, and ``data_samples``.
+            batch: ``inputs`` with ``img``, one tensor (V, 3, H, W) per sample, and
+                ``data_samples``.
+
+        Returns:
+            The samples with ``pred_instances_3d``, on the CPU.
 
         Raises:
             RuntimeError: If a frame of this size cannot be captured.
-            ValueError: If a sample lacks what the encoder reads, or the number of cameras is
-                another than the model's.
+            ValueError: If a sample lacks a field that the encoder reads, or has another number of
+                cameras than the model.
         """
         samples = batch["data_samples"]
         images = batch["inputs"]["img"]
@@ -172,20 +182,27 @@ class FastFrames:
         else:
             images = torch.stack(list(images))
         self._add_shapes(batch, (images.shape[-2], images.shape[-1]))
-        names = self.frame.names
-        arrays = [calibration_arrays(sample.metainfo, names) for sample in samples]
-        stacks = [torch.from_numpy(np.stack([each[name] for each in arrays])) for name in names]
-        inputs = [images, *stacks]
+        inputs = [images, *self._stack_calibration(samples)]
         with (
             self._lock,
             torch.no_grad(),
             matrix_products(self.frame.model.half_backbone is not None),
         ):
-            elements = self._run(inputs)
-        return [
-            self._with_predictions(sample, found)
-            for sample, found in zip(samples, elements, strict=True)
-        ]
+            batch_elements = self._run(inputs)
+        predicted = []
+        for sample, elements in zip(samples, batch_elements, strict=True):
+            predicted.append(self._with_predictions(sample, elements))
+        return predicted
+
+    def _stack_calibration(self, samples: "Sequence[Det3DDataSample]") -> list[Tensor]:
+        """Calibration arrays of a batch in the order of the frame's ``names``. (B, ...) each"""
+        names = self.frame.names
+        arrays = [calibration_arrays(sample.metainfo, names) for sample in samples]
+        stacks = []
+        for name in names:
+            stack = np.stack([sample_arrays[name] for sample_arrays in arrays])
+            stacks.append(torch.from_numpy(stack))
+        return stacks
 
     def _add_shapes(self, batch: dict[str, Any], size: tuple[int, int]) -> None:
         """Add the sizes of the padded images to the samples, as the data preprocessor does."""
@@ -196,10 +213,11 @@ class FastFrames:
             sample.set_metainfo({"batch_input_shape": shape, "pad_shape": pad_shape})
 
     def _run(self, inputs: Sequence[Tensor]) -> Tensor:
-        """Return the elements of a batch, on the host. (B, M, F)"""
+        """Elements of a batch, on the host. (B, M, F)"""
         if not self.capture:
-            return self.frame(*(x.to(self.device) for x in inputs)).cpu()
-        key = tuple((x.shape, x.dtype) for x in inputs)
+            on_device = [tensor.to(self.device) for tensor in inputs]
+            return self.frame(*on_device).cpu()
+        key = tuple((tensor.shape, tensor.dtype) for tensor in inputs)
         while True:
             captured = self._graphs.get(key)
             if captured is None:
@@ -207,7 +225,7 @@ class FastFrames:
             for buffer, value in zip(captured.inputs, inputs, strict=True):
                 buffer.copy_(value, non_blocking=True)
             captured.graph.replay()
-            # while the GPU works: are these still the weights whose addresses were recorded?
+            # While the GPU works: the graph is valid only for the weights that it recorded.
             if tensor_versions(self.frame.model) == captured.versions:
                 self._graphs.move_to_end(key)
                 return captured.output.cpu()
@@ -217,12 +235,12 @@ class FastFrames:
         """Record a frame of the inputs' sizes."""
         while len(self._graphs) >= _MOST_GRAPHS:
             self._graphs.popitem(last=False)
-        buffers = [x.to(self.device) for x in inputs]
+        buffers = [tensor.to(self.device) for tensor in inputs]
         with torch.cuda.device(self.device):
             stream = torch.cuda.Stream()
             stream.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(stream):
-                for _ in range(_WARM_UP):  # errors of the input itself are raised here, as they are
+                for _ in range(_WARM_UP):  # errors of the input are raised here, unchanged
                     self.frame(*buffers)
             torch.cuda.current_stream().wait_stream(stream)
             graph = torch.cuda.CUDAGraph()
@@ -239,28 +257,22 @@ class FastFrames:
         return self._graphs[key]
 
     def _with_predictions(self, sample: "Det3DDataSample", elements: Tensor) -> "Det3DDataSample":
-        """Return a sample with those of its elements that lie on the map. (M, F)"""
+        """Add the elements (M, F) that lie on the map to a sample."""
         head = self.frame.model.map_head
         fields = self.frame.unpack(elements)
         on_map = head.coder.keep_mask(fields["scores_3d"], fields["pts"])
         scores = fields.pop("scores_3d")[on_map]
         labels = fields.pop("labels_3d")[on_map]
-        chosen = {name: value[on_map] for name, value in fields.items()}
-        chosen = head.coder.unfolded(chosen, labels)
-        chosen.update(scores_3d=scores, labels_3d=labels)
-        predicted = InstanceData(metainfo=dict(head.reference.metainfo), **chosen)
+        visible = {name: value[on_map] for name, value in fields.items()}
+        visible = head.coder.unfolded(visible, labels)
+        visible.update(scores_3d=scores, labels_3d=labels)
+        predicted = InstanceData(metainfo=dict(head.reference.metainfo), **visible)
         return self.frame.model.add_pred_to_datasample([sample], [predicted])[0]
-
-
-def _as_columns(values: Any) -> Iterator[Tensor]:
-    """Yield fields of elements as matrices. (M, ...) each"""
-    for value in values:
-        yield value[:, None] if value.dim() == 1 else value
 
 
 @contextmanager
 def matrix_products(in_tf32: bool) -> Iterator[None]:
-    """Let float32 matrix products on a GPU use TF32, or leave them as they are."""
+    """Context in which float32 matrix products on a GPU use TF32, if asked for."""
     before = torch.get_float32_matmul_precision()
     if in_tf32:
         torch.set_float32_matmul_precision("high")
