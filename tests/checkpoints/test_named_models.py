@@ -127,7 +127,7 @@ def test_a_file_of_the_working_folder_does_not_stand_for_a_named_model(tmp_path,
 
 def test_a_file_without_a_known_digest_is_called_unverified_once(tmp_path, monkeypatch):
     named_models()
-    registry._say_unverified.cache_clear()
+    registry._warn_unverified.cache_clear()
     monkeypatch.setattr(registry, "shipped", tmp_path.joinpath)
     (tmp_path / "models").mkdir()
     said = []

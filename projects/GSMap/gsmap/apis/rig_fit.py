@@ -1,4 +1,4 @@
-"""A model that was trained on one rig, range and list of classes, on others."""
+"""Adaptation of trained models to other cameras, ranges, BEV cells and classes."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,7 +13,7 @@ from mmengine.logging import print_log
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
-from gsmap.checkpoints.convert import listed, ours_from_upstream
+from gsmap.checkpoints.convert import ours_from_upstream, summarize_names
 from gsmap.checkpoints.key_map import is_upstream
 from gsmap.checkpoints.named_models import named_models
 from gsmap.checkpoints.settings import plain
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
 
-# Where the cameras of nuScenes and Argoverse 2 look: degrees to the left of straight ahead.
+# Viewing directions of the cameras of nuScenes and Argoverse 2: degrees to the left of ahead.
 AZIMUTHS_DEG = {
     "CAM_FRONT": 0, "CAM_FRONT_LEFT": 55, "CAM_FRONT_RIGHT": -55, "CAM_BACK_LEFT": 109,
     "CAM_BACK_RIGHT": -111, "CAM_BACK": 180, "ring_front_center": 0, "ring_front_left": 45,
@@ -37,63 +37,80 @@ AZIMUTHS_DEG = {
 }  # fmt: skip
 
 
-_GENERATED = "map_head.generator.label."  # of a head that fits its detector or none
-# Weights with a row for each class, and how many rows are before these.
+_GENERATOR_LABELS = "map_head.generator.label."  # changed only with weights of its detector
+# Prefixes of weights with a row for each class, and the number of rows before these.
 _CLASS_ROWS = {
     "map_head.cls_branches.": 0, "map_head.cls_branch.": 0, "map_head.detector.cls_branches.": 0,
-    "map_head.detector.cls_branch.": 0, _GENERATED: 0,
+    "map_head.detector.cls_branch.": 0, _GENERATOR_LABELS: 0,
     "map_head.decoder.maps.0.3.": 1,  # the background
 }  # fmt: skip
-_LOOK_AT = 100  # samples among which one with all cameras is looked for
+_MAX_SAMPLES = 100  # number of samples that are searched for one with all cameras
 
 
 def camera_rows(dataset: "VectorizedMapDataset", trained: Sequence[str]) -> list[int]:
-    """Say which of a model's cameras each of a data set's is, or looks most like.
+    """Assign a camera of the model to each camera of a data set.
+
+    Equal names are assigned to each other. If a name is unknown to the model, all cameras are
+    assigned by their viewing direction (`similar_cameras`).
 
     Args:
         dataset: The data set.
-        trained: Names of the model's cameras; the result has an index into these for each camera.
+        trained: Names of the model's cameras.
+
+    Returns:
+        An index into ``trained`` for each camera of the data set.
 
     Raises:
-        ValueError: If names differ, and it is not known where the model's cameras look.
+        ValueError: If the names differ, and the viewing directions of the model's cameras are
+            unknown.
     """
-    names = dataset.cameras or [camera.name for camera in dataset.sample(0).cameras]
+    names = _camera_names(dataset)
     if set(names) <= set(trained):
         return [list(trained).index(name) for name in names]
-    first = (dataset.sample(i) for i in range(min(len(dataset), _LOOK_AT)))
-    sample = max(first, key=lambda sample: len(sample.cameras))
-    return similar_cameras(sample, dataset.metainfo["frame"], names, trained)
+    num_samples = min(len(dataset), _MAX_SAMPLES)
+    samples = map(dataset.sample, range(num_samples))
+    fullest_sample = max(samples, key=lambda sample: len(sample.cameras))
+    frame = dataset.metainfo["frame"]
+    return similar_cameras(fullest_sample, frame=frame, names=names, trained=trained)
+
+
+def _camera_names(dataset: "VectorizedMapDataset") -> Sequence[str]:
+    """Names of the cameras of a data set; by default the cameras of its first sample."""
+    return dataset.cameras or [camera.name for camera in dataset.sample(0).cameras]
 
 
 def similar_cameras(
     sample: MapSample, frame: str, names: Sequence[str], trained: Sequence[str]
 ) -> list[int]:
-    """Say which of a model's cameras looks most as each camera of a sample does.
+    """Find the camera of the model with the nearest viewing direction for each camera of a sample.
 
     Args:
-        sample: A sample.
-        frame: Its annotation frame.
-        names: Its cameras; one that it lacks counts as looking ahead.
-        trained: The model's cameras; the result has an index into these for each name.
+        sample: Sample with the poses of the cameras.
+        frame: Annotation frame of the sample: ``"lidar"`` or ``"ego"``.
+        names: Names of the sample's cameras. An absent camera is taken to look ahead.
+        trained: Names of the model's cameras.
+
+    Returns:
+        An index into ``trained`` for each name.
 
     Raises:
-        ValueError: If it is not known where the model's cameras look.
+        ValueError: If the viewing directions of the model's cameras are unknown.
     """
-    unknown = [name for name in trained if name not in AZIMUTHS_DEG]
-    if unknown:
+    if not set(trained) <= AZIMUTHS_DEG.keys():
         raise InputError(
             f"the model is for the cameras {list(trained)}, the input has {list(names)}: name them "
             "as the model does."
         )
-    looks = np.radians([AZIMUTHS_DEG[name] for name in trained])
+    trained_azimuths = np.radians([AZIMUTHS_DEG[name] for name in trained])
     cameras = {camera.name: camera for camera in sample.cameras}
-    found = []
+    rows: list[int] = []
     for name in names:
         azimuth = 0.0
         if name in cameras:
             azimuth = viewing_azimuth(cameras[name].cam_from_frame, FRAME_VIEWS[frame])
-        found.append(int(np.argmax(np.cos(looks - azimuth))))
-    return found
+        similarity = np.cos(trained_azimuths - azimuth)
+        rows.append(int(np.argmax(similarity)))
+    return rows
 
 
 def fit_start(
@@ -102,164 +119,233 @@ def fit_start(
     dataset: "VectorizedMapDataset",
     origin: Mapping[str, Any],
 ) -> list[str]:
-    """Fit a checkpoint to a model for other cameras, range, cells and classes.
+    """Fit a checkpoint to a model for other cameras, range, BEV cells and classes.
 
     Args:
-        state: The checkpoint's weights; they change in place.
-        model: The model, with initial weights.
-        dataset: What it is trained on.
-        origin: What the checkpoint was trained on: ``cameras``, ``classes``, ``frame``, ``x_range``
-            and ``y_range``, as far as they are known.
+        state: Weights of the checkpoint; changed in place.
+        model: Model with its initial weights.
+        dataset: Data set of the new training.
+        origin: Facts about the training of the checkpoint, as far as known: ``cameras``,
+            ``classes``, ``frame``, ``x_range`` and ``y_range``.
 
     Returns:
-        A line for each change, and for what training has to learn anew.
+        A line for each change of a weight, and for each difference that training must adapt to.
     """
-    own = model.state_dict()
-    lines = _fit_cameras(state, own, dataset, origin.get("cameras"))
-    lines += _fit_cells(state, own)
-    lines += _fit_queries(state, own, model)
-    lines += _fit_classes(state, own, origin.get("classes"), dataset.metainfo["classes"])
-    here = dataset.metainfo
-    for name, note in (
-        ("x_range", "the queries of the map are stretched to it"),
-        ("y_range", "the queries of the map are stretched to it"),
-        ("frame", "training learns anew where ahead is; samples in the old one would save that"),
-    ):
-        if name in origin and plain(origin[name]) != plain(here[name]):
-            lines.append(f"{name} was {origin[name]}, is {here[name]}: {note}.")
+    initial = model.state_dict()
+    metainfo = dataset.metainfo
+    lines = _fit_cameras(state, initial, dataset=dataset, trained=origin.get("cameras"))
+    lines += _fit_cells(state, initial)
+    lines += _fit_queries(state, initial, model=model)
+    lines += _fit_classes(state, initial, trained=origin.get("classes"), names=metainfo["classes"])
+    notes = {
+        "x_range": "the queries of the map are stretched to it",
+        "y_range": "the queries of the map are stretched to it",
+        "frame": "training learns anew where ahead is; samples in the old one would save that",
+    }
+    for name, note in notes.items():
+        if name in origin and plain(origin[name]) != plain(metainfo[name]):
+            lines.append(f"{name} was {origin[name]}, is {metainfo[name]}: {note}.")
     return lines
 
 
 def _fit_cameras(
     state: dict[str, Tensor],
-    own: Mapping[str, Tensor],
+    initial: Mapping[str, Tensor],
     dataset: "VectorizedMapDataset",
     trained: Sequence[str] | None,
 ) -> list[str]:
-    """Give each camera the embedding of its own, or of the one that looks most like it."""
+    """Fit the camera embeddings to the cameras of a data set.
+
+    Args:
+        state: Weights of the checkpoint; changed in place.
+        initial: Initial weights of the model.
+        dataset: Data set of the new training.
+        trained: Names of the checkpoint's cameras; None if unknown.
+
+    Returns:
+        A line about the change, if there is one.
+    """
     key = "bev_encoder.cams_embeds"
-    if key not in state or key not in own:
+    if key not in state or key not in initial:
         return []
-    embeds, wanted = state[key], len(own[key])
+    embeds = state[key]  # (V_old, C)
+    num_cameras = len(initial[key])
     if trained is None or len(trained) != len(embeds):
-        if len(embeds) == wanted:
+        if len(embeds) == num_cameras:
             return []
         trained = ()
-    names = dataset.cameras or [camera.name for camera in dataset.sample(0).cameras]
-    if not set(names) <= set(trained) and (not trained or set(trained) - AZIMUTHS_DEG.keys()):
-        state[key] = embeds.mean(0, keepdim=True).repeat(wanted, 1)
+    names = _camera_names(dataset)
+    names_are_known = set(names) <= set(trained)
+    directions_are_known = bool(trained) and set(trained) <= AZIMUTHS_DEG.keys()
+    if not names_are_known and not directions_are_known:
+        state[key] = embeds.mean(0, keepdim=True).repeat(num_cameras, 1)  # (V, C)
         return ["its cameras are not known: each camera starts from the mean of their embeddings."]
     rows = camera_rows(dataset, trained)
-    state[key] = embeds[rows]
-    pairs = [(n, trained[row]) for n, row in zip(names, rows, strict=True) if n != trained[row]]
-    if not pairs:
+    state[key] = embeds[rows]  # (V, C)
+    replacements: list[str] = []
+    for name, row in zip(names, rows, strict=True):
+        if name != trained[row]:
+            replacements.append(f"{name} as {trained[row]}")
+    if not replacements:
         return []
-    return [f"embeddings of cameras: {', '.join(f'{new} as {old}' for new, old in pairs)}."]
+    return [f"embeddings of cameras: {', '.join(replacements)}."]
 
 
-def _fit_cells(state: dict[str, Tensor], own: Mapping[str, Tensor]) -> list[str]:
-    """Interpolate the queries of the BEV cells and their positional encodings."""
-    cells, *sides = (
-        f"bev_encoder.{name}.weight"
-        for name in (
-            "bev_embedding", "positional_encoding.row_embed", "positional_encoding.col_embed",
-        )
-    )  # fmt: skip
-    if not {cells, *sides} <= state.keys() & own.keys():
+def _fit_cells(state: dict[str, Tensor], initial: Mapping[str, Tensor]) -> list[str]:
+    """Interpolate the queries of the BEV cells and their positional encodings.
+
+    Args:
+        state: Weights of the checkpoint; changed in place.
+        initial: Initial weights of the model.
+
+    Returns:
+        A line about the change, if there is one.
+    """
+    cells = "bev_encoder.bev_embedding.weight"
+    rows = "bev_encoder.positional_encoding.row_embed.weight"
+    columns = "bev_encoder.positional_encoding.col_embed.weight"
+    if not {cells, rows, columns} <= state.keys() & initial.keys():
         return []
-    old, new = ([len(weights[side]) for side in sides] for weights in (state, own))
-    if old == new or len(state[cells]) != old[0] * old[1]:
+    old_size = [len(state[rows]), len(state[columns])]
+    new_size = [len(initial[rows]), len(initial[columns])]
+    if old_size == new_size or len(state[cells]) != old_size[0] * old_size[1]:
         return []
-    image = state[cells].float().unflatten(0, old).permute(2, 0, 1)[None]  # (1, C, H, W)
-    state[cells] = interpolate(image, new, mode="bilinear")[0].permute(1, 2, 0).flatten(0, 1)
-    for side, count in zip(sides, new, strict=True):
-        state[side] = interpolate(state[side].float().T[None], count, mode="linear")[0].T
-    return [f"queries of {old[0]} x {old[1]} BEV cells interpolated to {new[0]} x {new[1]}."]
+    image = state[cells].float().unflatten(0, old_size).permute(2, 0, 1)[None]  # (1, C, H, W)
+    image = interpolate(image, new_size, mode="bilinear")
+    state[cells] = image[0].permute(1, 2, 0).flatten(0, 1)  # (H * W, C)
+    for side, count in zip((rows, columns), new_size, strict=True):
+        line = state[side].float().T[None]  # (1, C, H or W)
+        state[side] = interpolate(line, count, mode="linear")[0].T  # (H or W, C)
+    old_text = f"{old_size[0]} x {old_size[1]}"
+    return [f"queries of {old_text} BEV cells interpolated to {new_size[0]} x {new_size[1]}."]
 
 
 def _fit_queries(
-    state: dict[str, Tensor], own: Mapping[str, Tensor], model: nn.Module
+    state: dict[str, Tensor], initial: Mapping[str, Tensor], model: nn.Module
 ) -> list[str]:
-    """Keep the queries of elements; those that a model with one group has beyond begin as new."""
-    key, groups = "map_head.instance_embedding.weight", _query_groups(model)
-    if key not in state or key not in own or len(groups) != 1:
-        return []
-    old, new = len(state[key]), len(own[key])
-    if old >= new:
-        return []
-    state[key] = torch.cat([state[key], own[key][old:].detach().to(state[key])])
-    return [f"{old} queries keep their weights, {new - old} begin as new."]
+    """Add initial queries to a checkpoint's, if a model with one query group has more of them.
 
+    Args:
+        state: Weights of the checkpoint; changed in place.
+        initial: Initial weights of the model.
+        model: The model.
 
-def _query_groups(model: nn.Module) -> Sequence[Any]:
-    """Return a head's groups of queries, none where it has no such."""
-    return getattr(getattr(model, "map_head", None), "query_groups", ())
+    Returns:
+        A line about the change, if there is one.
+    """
+    key = "map_head.instance_embedding.weight"
+    head = getattr(model, "map_head", None)
+    query_groups = getattr(head, "query_groups", ())
+    if key not in state or key not in initial or len(query_groups) != 1:
+        return []
+    old_count = len(state[key])
+    new_count = len(initial[key])
+    if old_count >= new_count:
+        return []
+    added = initial[key][old_count:].detach().to(state[key])
+    state[key] = torch.cat([state[key], added])  # (N, C)
+    return [f"{old_count} queries keep their weights, {new_count - old_count} begin as new."]
 
 
 def _fit_classes(
     state: dict[str, Tensor],
-    own: Mapping[str, Tensor],
+    initial: Mapping[str, Tensor],
     trained: Sequence[str] | None,
     names: Sequence[str],
 ) -> list[str]:
-    """Let classes of the same name keep their weights; others begin as new."""
+    """Reorder the rows of classes by name; rows of classes without weights are initialised.
+
+    Args:
+        state: Weights of the checkpoint; changed in place.
+        initial: Initial weights of the model.
+        trained: Classes of the checkpoint; None if unknown.
+        names: Classes of the model.
+
+    Returns:
+        A line about the change, if there is one.
+    """
     if trained is None or list(trained) == list(names):
         return []
-    found = {}  # key -> rows before those of the classes
-    for prefix, first in _CLASS_ROWS.items():
-        sizes = first + len(trained), first + len(names)
-        for key in own.keys() & state.keys():
-            if key.startswith(prefix) and (len(state[key]), len(own[key])) == sizes:
-                found[key] = first
-    if all(key.startswith(_GENERATED) for key in found):
+    first_rows: dict[str, int] = {}  # by key
+    for prefix, first_row in _CLASS_ROWS.items():
+        for key in initial.keys() & state.keys():
+            if not key.startswith(prefix):
+                continue
+            has_old_rows = len(state[key]) == first_row + len(trained)
+            has_new_rows = len(initial[key]) == first_row + len(names)
+            if has_old_rows and has_new_rows:
+                first_rows[key] = first_row
+    if all(key.startswith(_GENERATOR_LABELS) for key in first_rows):
         return [
             f"classes were {', '.join(trained)}, are {', '.join(names)}: this head's weights of "
             "classes are taken as they are, where their sizes fit."
         ]
-    kept = {name: list(trained).index(name) for name in names if name in trained}
-    for key, first in found.items():
-        old, state[key] = state[key], own[key].detach().clone().to(state[key])
-        state[key][:first] = old[:first]
-        for row, name in enumerate(names, first):
-            if name in kept:
-                state[key][row] = old[first + kept[name]]
-    fresh = [name for name in names if name not in kept]
-    return [f"classes keep their weights: {listed(list(kept))}; begin as new: {listed(fresh)}."]
+    old_rows = {name: list(trained).index(name) for name in names if name in trained}
+    for key, first_row in first_rows.items():
+        old_weights = state[key]
+        weights = initial[key].detach().clone().to(old_weights)
+        weights[:first_row] = old_weights[:first_row]
+        for row, name in enumerate(names, start=first_row):
+            if name in old_rows:
+                weights[row] = old_weights[first_row + old_rows[name]]
+        state[key] = weights
+    with_weights = summarize_names(list(old_rows))
+    without_weights = summarize_names([name for name in names if name not in old_rows])
+    return [f"classes keep their weights: {with_weights}; begin as new: {without_weights}."]
 
 
 @HOOKS.register_module()
 class RigFitHook(Hook):
-    """Fits the checkpoint that a training starts from to its cameras, range, cells and classes.
+    """Hook that fits the initial checkpoint of a training to cameras, range, cells and classes.
 
-    A log line says what is changed. Resumed trainings and tests take checkpoints as they are.
+    Each change is logged. Checkpoints of resumed trainings and of tests are not changed.
     """
 
     def after_load_checkpoint(self, runner: "Runner", checkpoint: dict[str, Any]) -> None:
-        """Change the weights before the model takes them."""
+        """Change the weights of a checkpoint before the model loads them.
+
+        Args:
+            runner: Runner of the training.
+            checkpoint: Contents of the checkpoint; changed in place.
+        """
         if runner._resume or isinstance(runner._train_loop, dict | None):
             return
         dataset = innermost(runner.train_dataloader.dataset)
         state = checkpoint.get("state_dict", checkpoint)
-        fitted = {key.removeprefix("module."): value for key, value in state.items()}
-        if is_upstream(fitted):
-            fitted = ours_from_upstream(fitted)
+        weights = {key.removeprefix("module."): value for key, value in state.items()}
+        if is_upstream(weights):
+            weights = ours_from_upstream(weights)
         model = getattr(runner.model, "module", runner.model)
-        origin = _origin(runner._load_from, checkpoint)
-        for line in fit_start(fitted, model, dataset, origin):
-            print_log(f"{runner._load_from}: {line}", "current")
+        origin = _training_facts(runner._load_from, checkpoint)
+        for line in fit_start(weights, model=model, dataset=dataset, origin=origin):
+            print_log(f"{runner._load_from}: {line}", logger="current")
         state.clear()
-        state.update(fitted)
+        state.update(weights)
 
 
-def _origin(path: Any, checkpoint: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a checkpoint was trained on: as it says itself, or as the registry does."""
-    said: Any = (checkpoint.get("meta") or {}).get("dataset_meta") or {}
+def _training_facts(path: Any, checkpoint: Mapping[str, Any]) -> dict[str, Any]:
+    """Facts about the training of a checkpoint, for `fit_start`.
+
+    They are read from the checkpoint's metadata, or for a named model without metadata from the
+    model's config. Facts of a wrong type are left out.
+
+    Args:
+        path: File of the checkpoint.
+        checkpoint: Contents of the file.
+    """
+    metadata: Any = (checkpoint.get("meta") or {}).get("dataset_meta") or {}
     for model in named_models().values():
-        if not said and Path(str(path)) == model.file:
-            said = dict(Config.fromfile(shipped(model.config)).train_dataloader.dataset)
-            said |= said["grid"]
-    if not isinstance(said, Mapping):
+        if not metadata and Path(str(path)) == model.file:
+            metadata = dict(Config.fromfile(shipped(model.config)).train_dataloader.dataset)
+            metadata |= metadata["grid"]
+    if not isinstance(metadata, Mapping):
         return {}
-    kinds = {"cameras": str, "classes": str, "frame": str, "x_range": float, "y_range": float}
-    known = {name: said[name] for name in kinds if isinstance(said.get(name), list | tuple | str)}
-    return {n: v for n, v in known.items() if all(isinstance(value, kinds[n]) for value in v)}
+    item_types = {"cameras": str, "classes": str, "frame": str, "x_range": float, "y_range": float}
+    facts: dict[str, Any] = {}
+    for name, item_type in item_types.items():
+        value = metadata.get(name)
+        if not isinstance(value, list | tuple | str):
+            continue
+        if all(isinstance(item, item_type) for item in value):
+            facts[name] = value
+    return facts

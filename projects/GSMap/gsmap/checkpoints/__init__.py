@@ -1,1 +1,1 @@
-"""Checkpoints of the earlier systems: their names, conversion both ways, strict loading."""
+"""Checkpoints: loading with checks, conversion from and to earlier systems, and named models."""

@@ -1,4 +1,4 @@
-"""Errors of configs: a config that cannot be read, and settings from which no part can be built."""
+"""Errors of configs: configs that cannot be read, and settings that do not fit their classes."""
 
 import re
 import traceback
@@ -15,23 +15,23 @@ from gsmap.utils.errors import GsmapError, InputError
 from gsmap.utils.faults import in_words, nearest, registered
 from gsmap.utils.shipped import shipped
 
-_BUILDER = build_from_cfg.__code__  # all registries end in it, also those that classes use inside
-_RUNNER = "mmengine.runner.runner"  # module of a runner, which is slow to import
+_BUILDER = build_from_cfg.__code__  # every registry calls it, also registries inside of classes
+_RUNNER = "mmengine.runner.runner"  # compared by name, since importing the runner is slow
 _CONFIGS = "mmengine.config"
-_UNFIT = (
+_SETTINGS_ERRORS = (
     ValueError, TypeError, LookupError, RuntimeError, AttributeError, AssertionError,
     ArithmeticError, ImportError,
 )  # fmt: skip
-_UNEXPECTED = re.compile(r"([\w.]+)\(\) got an unexpected keyword argument '(\w+)'")
-_ABSENT = re.compile(r"(\S+) is not in the .+? registry")
+_UNEXPECTED_ARGUMENT = re.compile(r"([\w.]+)\(\) got an unexpected keyword argument '(\w+)'")
+_ABSENT_TYPE = re.compile(r"(\S+) is not in the .+? registry")
 
 
 class _Part(NamedTuple):
-    """A part of a config that is being built.
+    """Part of a config under construction.
 
     Attributes:
-        registry: Registry that builds it; None for a part that the runner itself makes.
-        kind: Its class, or the name of it.
+        registry: Registry that builds the part; None for a part that the runner builds itself.
+        kind: Class of the part, or its name.
     """
 
     registry: Registry | None
@@ -44,63 +44,65 @@ class _Part(NamedTuple):
 
 
 @contextmanager
-def reading_config(what: object) -> Iterator[None]:
-    """Name the config in every exception that it raises while it is read: a config is Python.
+def reading_config(source: object) -> Iterator[None]:
+    """Add the config's name to every exception that is raised while the config is read.
 
     Args:
-        what: Path of the config, or words for the part of it that is read.
+        source: Path of the config, or a description of the part that is read.
 
     Raises:
-        ValueError: If the block raises an exception.
+        ValueError: If the block raises an exception. A config is Python code, so every class of
+            exception is possible.
     """
     try:
         yield
     except Exception as error:
-        file = str(Path(str(what)).absolute())
+        file = str(Path(str(source)).absolute())
         place = ""
         for frame in traceback.extract_tb(error.__traceback__):
             if frame.filename == file:
-                place = f", line {frame.lineno},"  # the innermost one counts
+                place = f", line {frame.lineno},"  # the last match is the innermost call
         reason: BaseException = error
         if isinstance(error, ImportError) and error.__context__ is not None:
-            reason = error.__context__  # mmengine's own does not say why an import failed
-        if "load gsmap config" in str(reason):  # the scopes that it knows are fixed
+            reason = error.__context__  # mmengine's ImportError omits the cause
+        if "load gsmap config" in str(reason):  # mmengine has a fixed list of scopes
             reason = ValueError(
                 f"'gsmap::' is not read in _base_; write a path below {shipped('configs')} instead"
             )
         raise InputError(
-            f"{what}{place} cannot be used: {type(reason).__name__}: {reason}."
+            f"{source}{place} cannot be used: {type(reason).__name__}: {reason}."
         ) from error
 
 
 @contextmanager
 def building(cfg: Config, kind: type | None = None) -> Iterator[None]:
-    """Name the config and its parts in errors that come up while parts are built of settings.
+    """Add the names of the config and of its parts to errors that are raised in building them.
 
-    Which parts were being built is read from the traceback, so that parts inside of parts are
-    named as well, also where mmengine and mmdet3d build them.
+    The parts under construction are read from the traceback. This covers nested parts, and parts
+    that mmengine or mmdet3d build.
 
     Args:
         cfg: The config.
-        kind: Class that the block makes of settings without a registry.
+        kind: Class that the block builds from settings without a registry.
 
     Raises:
-        ValueError: In place of an exception that the settings cause. Errors of ours keep their
-            class, and errors of the machine stay as they are.
+        ValueError: In place of an exception that the settings cause. A `GsmapError` keeps its
+            class. Errors of the machine, for example of memory, are not changed.
     """
     where = f"{cfg.filename}: " if cfg.filename else ""
     try:
         yield
     except GsmapError as error:
         text = str(error)
-        if "/" in text or not _parts_under_way(error):  # a text with a path names its place
+        names_a_path = "/" in text
+        if names_a_path or not _parts_under_construction(error):
             raise
         raise type(error)(f"{where}{text}") from error
-    except _UNFIT as error:
-        parts = _parts_under_way(error)
+    except _SETTINGS_ERRORS as error:
+        parts = _parts_under_construction(error)
         if kind is not None:
             parts.append(_Part(registry=None, kind=kind))
-        fault = None if in_words(error) else _fault_in_settings(error, parts)
+        fault = None if in_words(error) else _describe_fault(error, parts=parts)
         if fault is None:
             raise
         raise InputError(f"{where}{fault}") from error
@@ -108,12 +110,15 @@ def building(cfg: Config, kind: type | None = None) -> Iterator[None]:
 
 def _frames(error: BaseException) -> list[FrameType]:
     """Frames of a traceback, the innermost first."""
-    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
-    return frames[::-1]
+    frames: list[FrameType] = []
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        frames.append(frame)
+    frames.reverse()
+    return frames
 
 
-def _parts_under_way(error: BaseException) -> list[_Part]:
-    """Parts that were being built where an error came up, the innermost first."""
+def _parts_under_construction(error: BaseException) -> list[_Part]:
+    """Parts that were under construction when an error was raised, the innermost first."""
     parts: list[_Part] = []
     for frame in _frames(error):
         name = frame.f_code.co_name
@@ -122,18 +127,21 @@ def _parts_under_way(error: BaseException) -> list[_Part]:
             registry = frame.f_locals["registry"]
             kind = settings.get("type") if isinstance(settings, dict) else None
             kind = registry.get(kind) if isinstance(kind, str) else kind
-            parts.append(_Part(registry, kind))
+            parts.append(_Part(registry=registry, kind=kind))
         elif frame.f_globals.get("__name__") == _RUNNER and name.startswith(("build_", "__init__")):
             parts.append(_Part(registry=None, kind=None))
     return parts
 
 
-def _fault_in_settings(error: BaseException, parts: list[_Part]) -> str | None:
-    """Return the fault in the settings that an error is due to; None if it is a bug.
+def _describe_fault(error: BaseException, parts: list[_Part]) -> str | None:
+    """Describe the fault in the settings that caused an error.
 
     Args:
-        error: An exception of Python or of a library.
-        parts: Parts that were being built, the innermost first.
+        error: Exception of Python or of a library.
+        parts: Parts under construction, the innermost first.
+
+    Returns:
+        The description; None if the error is a bug.
     """
     text = str(error.args[0] if isinstance(error, KeyError) and error.args else error)
     scope = _frames(error)[0].f_globals
@@ -142,47 +150,51 @@ def _fault_in_settings(error: BaseException, parts: list[_Part]) -> str | None:
         return f"a setting is missing: {text}."
     if not parts:
         return None
-    kinds = [part for part in parts if part.kind is not None]
-    unknown = _UNEXPECTED.search(text)
-    if unknown is not None:
-        return _unknown_setting(unknown[1], unknown[2], kinds, scope)
-    absent = _ABSENT.match(text)
+    typed_parts = [part for part in parts if part.kind is not None]
+    unexpected = _UNEXPECTED_ARGUMENT.search(text)
+    if unexpected is not None:
+        return _describe_unknown_setting(
+            owner=unexpected[1], name=unexpected[2], parts=typed_parts, scope=scope
+        )
+    absent = _ABSENT_TYPE.match(text)
     if absent is not None and parts[0].registry is not None:
         registry = parts[0].registry
-        close = nearest(absent[1], registered(registry))
+        close = nearest(absent[1], names=registered(registry))
         return f"there is no {registry.name} of type {absent[1]!r}{close or '.'}"
-    named = " of ".join(part.name for part in kinds) or "the run"
-    if type(error) is ValueError:  # a check of a class that is not ours
-        return f"{named} cannot be made from these settings: {text}"
+    subject = " of ".join(part.name for part in typed_parts) or "the run"
+    if type(error) is ValueError:  # raised by the checks of a library's class
+        return f"{subject} cannot be made from these settings: {text}"
     return (
-        f"{named} cannot be made from these settings: {type(error).__name__}: {text} "
+        f"{subject} cannot be made from these settings: {type(error).__name__}: {text} "
         "(GSMAP_TRACEBACK=1 shows where)."
     )
 
 
-def _unknown_setting(owner: str, name: str, parts: list[_Part], scope: dict[str, Any]) -> str:
-    """Name a setting that a class or a function does not have, and the nearest that it has.
+def _describe_unknown_setting(
+    owner: str, name: str, parts: list[_Part], scope: dict[str, Any]
+) -> str:
+    """Describe a setting that a class or a function does not accept, with the nearest valid name.
 
     Args:
         owner: Name of the class with its method, or of the function.
-        name: The setting.
-        parts: Parts that were being built, the innermost first.
-        scope: Names of the module where the call stands.
+        name: Name of the setting.
+        parts: Parts under construction, the innermost first.
+        scope: Global names of the module that contains the call.
     """
-    place, _, method = owner.rpartition(".")
-    called = place or owner
-    candidates = [part.kind for part in parts]
-    candidates.append(scope.get(called))
-    known: list[str] = []
-    for kind in candidates:
-        family = getattr(kind, "__mro__", (kind,))
-        if called in [getattr(member, "__name__", None) for member in family]:
-            known = _settings_of(family, method)
+    class_name, _, method = owner.rpartition(".")
+    target = class_name or owner
+    parts = [*parts, _Part(registry=None, kind=scope.get(target))]
+    valid_names: list[str] = []
+    for part in parts:
+        family = getattr(part.kind, "__mro__", (part.kind,))
+        if any(getattr(member, "__name__", None) == target for member in family):
+            valid_names = _argument_names(family, method=method)
             break
-    return f"{owner.removesuffix('.__init__')} has no setting {name!r}{nearest(name, known) or '.'}"
+    close = nearest(name, names=valid_names)
+    return f"{owner.removesuffix('.__init__')} has no setting {name!r}{close or '.'}"
 
 
-def _settings_of(family: tuple[Any, ...], method: str) -> list[str]:
+def _argument_names(family: tuple[Any, ...], method: str) -> list[str]:
     """Names of the arguments of a method in a class and its bases, or of a function.
 
     Args:

@@ -1,4 +1,4 @@
-"""Conversion of state dicts between the format of the earlier systems and ours."""
+"""Conversion of state dicts between the formats of the earlier systems and of this project."""
 
 from collections.abc import Mapping, Sequence
 
@@ -8,57 +8,99 @@ from torch import Tensor
 from gsmap.checkpoints.key_map import find_key_map, is_upstream
 from gsmap.utils.errors import InputError
 
-_TRAINING = "map_head.aux_heads."  # begins what serves training alone
+_TRAINING_ONLY = "map_head.aux_heads."  # prefix of weights that only training uses
 
 
-def listed(keys: Sequence[str], shown: int = 3) -> str:
-    """Name the first keys and count the rest."""
-    rest = f" and {len(keys) - shown} more" if len(keys) > shown else ""
-    return ", ".join(keys[:shown]) + rest or "nothing"
+def summarize_names(names: Sequence[str], max_names: int = 3) -> str:
+    """Join the first names for a message, and count the rest.
+
+    Args:
+        names: State keys, or other names.
+        max_names: Number of names to write out.
+    """
+    rest = f" and {len(names) - max_names} more" if len(names) > max_names else ""
+    return ", ".join(names[:max_names]) + rest or "nothing"
 
 
 def ours_from_upstream(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Rename an upstream state to our keys; those that the table calls unused are left out.
+    """Rename the keys of an upstream state to the keys of this project.
+
+    Keys that the key map marks as unused are left out.
+
+    Args:
+        state: Weights by upstream key.
 
     Raises:
-        ValueError: If a key is not in the table that the keys tell.
+        ValueError: If the key map of the state's architecture does not contain a key.
     """
     key_map = find_key_map(state)
-    names = {key: key_map.to_ours(key) for key in state}
-    unknown = [key for key, name in names.items() if name is None and not key_map.is_unused(key)]
+    renamed: dict[str, Tensor] = {}
+    unknown: list[str] = []
+    for key, value in state.items():
+        name = key_map.to_ours(key)
+        if name is not None:
+            renamed[name] = value
+        elif not key_map.is_unused(key):
+            unknown.append(key)
     if unknown:
-        raise InputError(f"keys that no {key_map.name} model has: {listed(unknown)}.")
-    return {name: state[key] for key, name in names.items() if name is not None}
+        raise InputError(f"keys that no {key_map.name} model has: {summarize_names(unknown)}.")
+    return renamed
 
 
 def upstream_from_ours(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Rename our state to upstream's keys and add the ones that only upstream has.
+    """Rename the keys of a state to upstream's keys, and add the weights that only upstream has.
 
-    Auxiliary heads, which serve training alone, are left out where upstream has none.
+    Weights of auxiliary heads are left out if the upstream architecture does not contain them.
+    Only training uses these.
+
+    Args:
+        state: Weights by the keys of this project.
 
     Raises:
-        ValueError: If another key is not in the table that the keys tell.
+        ValueError: If the key map of the state's architecture does not contain another key.
     """
     key_map = find_key_map(state)
-    names = {key: key_map.to_upstream(key) for key in state}
-    unknown = [key for key, name in names.items() if name is None and not key.startswith(_TRAINING)]
+    renamed: dict[str, Tensor] = {}
+    unknown: list[str] = []
+    for key, value in state.items():
+        name = key_map.to_upstream(key)
+        if name is not None:
+            renamed[name] = value
+        elif not key.startswith(_TRAINING_ONLY):
+            unknown.append(key)
     if unknown:
         raise InputError(
-            f"keys that upstream's {key_map.name} does not have: {listed(unknown)}. Without "
-            "them the model would find something else: it stays in our format."
+            f"keys that upstream's {key_map.name} does not have: {summarize_names(unknown)}. "
+            "Without them the model would find something else: it stays in our format."
         )
-    renamed = {name: state[key] for key, name in names.items() if name is not None}
-    unused = ((key, value) for key, value in key_map.unused.items() if value is not None)
-    return renamed | {k: v.clone(memory_format=torch.contiguous_format) for k, v in unused}
+    for key, constant in key_map.unused.items():
+        if constant is not None:
+            renamed[key] = constant.clone(memory_format=torch.contiguous_format)
+    return renamed
 
 
 def convert_state(state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
-    """Turn either format into the other, and say in words which way."""
+    """Convert a state from either format to the other.
+
+    Args:
+        state: Weights in the format of an earlier system or of this project.
+
+    Returns:
+        The converted state, and a description of the conversion for a log.
+
+    Raises:
+        ValueError: If a key belongs to no known architecture.
+    """
     key_map = find_key_map(state)
     if is_upstream(state):
         return ours_from_upstream(state), f"{key_map.name}: upstream to gsmap"
-    done = f"{key_map.name}: gsmap to upstream"
-    left_out = sum(key.startswith(_TRAINING) and key_map.to_upstream(key) is None for key in state)
-    if left_out:
-        done += f" without the {left_out} weights of auxiliary heads, which serve training alone"
-    return upstream_from_ours(state), done
+    description = f"{key_map.name}: gsmap to upstream"
+    num_left_out = 0
+    for key in state:
+        if key.startswith(_TRAINING_ONLY) and key_map.to_upstream(key) is None:
+            num_left_out += 1
+    if num_left_out:
+        description += (
+            f" without the {num_left_out} weights of auxiliary heads, which serve training alone"
+        )
+    return upstream_from_ours(state), description

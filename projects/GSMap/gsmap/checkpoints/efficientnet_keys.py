@@ -1,53 +1,71 @@
-"""Rules between the keys of the EfficientNet-B0 that releases use and those of mmdet's."""
-
-from itertools import accumulate
+"""Key rules of EfficientNet-B0: the names of ``efficientnet_pytorch`` and of mmdet."""
 
 from torch import Tensor
 
 from gsmap.checkpoints.key_rules import Rules, rules_of, zeros
 
-_STAGES = (1, 2, 2, 6, 5)  # blocks of each of our backbone's stages; the release counts through
-_LEAVES = ("weight", "bias", "running_mean", "running_var")
+_BLOCKS_PER_STAGE = (1, 2, 2, 6, 5)  # upstream numbers the blocks of all stages consecutively
+_NORM_PARAMETERS = ("weight", "bias", "running_mean", "running_var")
 
 
 def efficientnet_rules(theirs: str, ours: str) -> Rules:
-    """Return the rules of the image backbone.
+    """Rules for the keys of the image backbone.
 
     Args:
-        theirs: What keys of the package begin with.
-        ours: What our keys begin with.
+        theirs: Prefix of the keys of ``efficientnet_pytorch``.
+        ours: Prefix of the keys of this project.
+
+    Returns:
+        Pairs of key prefixes: upstream's and the one of this project.
     """
-    rules = rules_of(theirs, f"{ours}layers.0.", "_conv_stem.=conv. _bn0.=bn.")
-    for stage, (number, end) in enumerate(zip(_STAGES, accumulate(_STAGES), strict=True), 1):
-        for block in range(number):
+    rules = rules_of(upstream=theirs, ours=f"{ours}layers.0.", names="_conv_stem.=conv. _bn0.=bn.")
+    upstream_block = 0
+    for stage, num_blocks in enumerate(_BLOCKS_PER_STAGE, start=1):
+        for block in range(num_blocks):
             rules += rules_of(
-                f"{theirs}_blocks.{end - number + block}._",
-                f"{ours}layers.{stage}.{block}.",
-                "expand_conv.=expand_conv.conv. bn0.=expand_conv.bn. "
-                "depthwise_conv.=depthwise_conv.conv. bn1.=depthwise_conv.bn. "
-                "se_reduce.=se.conv1.conv. se_expand.=se.conv2.conv. "
-                "project_conv.=linear_conv.conv. bn2.=linear_conv.bn.",
+                upstream=f"{theirs}_blocks.{upstream_block}._",
+                ours=f"{ours}layers.{stage}.{block}.",
+                names=(
+                    "expand_conv.=expand_conv.conv. bn0.=expand_conv.bn. "
+                    "depthwise_conv.=depthwise_conv.conv. bn1.=depthwise_conv.bn. "
+                    "se_reduce.=se.conv1.conv. se_expand.=se.conv2.conv. "
+                    "project_conv.=linear_conv.conv. bn2.=linear_conv.bn."
+                ),
             )
+            upstream_block += 1
     return rules
 
 
 def norm_shapes(prefix: str, channels: int) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of a batch normalisation, by key."""
-    return {**{prefix + leaf: (channels,) for leaf in _LEAVES}, f"{prefix}num_batches_tracked": ()}
+    """Shapes of the state of a batch normalisation.
+
+    Args:
+        prefix: Prefix of the keys, with its dot.
+        channels: Number of channels.
+
+    Returns:
+        The shapes by key.
+    """
+    shapes: dict[str, tuple[int, ...]] = {}
+    for parameter in _NORM_PARAMETERS:
+        shapes[prefix + parameter] = (channels,)
+    shapes[f"{prefix}num_batches_tracked"] = ()
+    return shapes
 
 
 def unused_classifier(theirs: str) -> dict[str, Tensor]:
-    """Return the values of the trunk's classifier, which no map needs.
+    """Placeholder weights of the backbone's classifier, which no map model uses.
 
     Args:
-        theirs: What keys of the package begin with.
+        theirs: Prefix of the keys of ``efficientnet_pytorch``.
+
+    Returns:
+        Zeros by upstream key.
     """
-    return zeros(
-        theirs,
-        {
-            "_conv_head.weight": (1280, 320, 1, 1),
-            **norm_shapes("_bn1.", 1280),
-            "_fc.weight": (1000, 1280),
-            "_fc.bias": (1000,),
-        },
-    )
+    shapes: dict[str, tuple[int, ...]] = {
+        "_conv_head.weight": (1280, 320, 1, 1),
+        **norm_shapes("_bn1.", channels=1280),
+        "_fc.weight": (1000, 1280),
+        "_fc.bias": (1000,),
+    }
+    return zeros(theirs, shapes=shapes)

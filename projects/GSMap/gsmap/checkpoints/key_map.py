@@ -1,4 +1,4 @@
-"""The tables between the state keys of releases and ours, of all methods."""
+"""Key maps of all methods, between the state keys of releases and of this project."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -13,32 +13,43 @@ from gsmap.utils.errors import InputError
 
 @cache
 def key_maps() -> tuple[KeyMap, ...]:
-    """Return the tables of all methods, the most special first; the last are known by no marker.
+    """Key maps of all methods, the most special first; maps without markers are last.
 
-    Each is in ``KEY_MAPS`` of ``gsmap/models/<method>/keys.py``, which a method without a release
-    of its own has not.
+    ``gsmap/models/<method>/keys.py`` has the maps of a method in ``KEY_MAPS``. A method without
+    such a file has no release.
     """
-    found: tuple[KeyMap, ...] = ()
-    users = Counter(name for method in METHODS for name in method.built_on)
-    # what others are built on comes after them; of the others a later one is more special
-    for method in sorted(reversed(METHODS), key=lambda method: users[method.name]):
-        name = f"gsmap.models.{method.name}.keys"
-        if find_spec(name) is not None:
-            found += import_module(name).KEY_MAPS
-    return tuple(sorted(found, key=lambda key_map: key_map.markers == KeyMap.markers))
+    num_users: Counter[str] = Counter()
+    for method in METHODS:
+        num_users.update(method.built_on)
+    # A method comes after the methods that build on it. Between unrelated methods, the later one
+    # in METHODS is more special; sorting keeps the reversed order of equal counts.
+    methods = sorted(reversed(METHODS), key=lambda method: num_users[method.name])
+    maps: list[KeyMap] = []
+    for method in methods:
+        module = f"gsmap.models.{method.name}.keys"
+        if find_spec(module) is not None:
+            maps += import_module(module).KEY_MAPS
+    return tuple(sorted(maps, key=lambda key_map: key_map.markers == KeyMap.markers))
 
 
 def is_upstream(keys: Iterable[str]) -> bool:
-    """Return whether state keys are in the format of the earlier systems."""
+    """Whether state keys have the format of the earlier systems."""
     signs = tuple({key_map.sign for key_map in key_maps()})
     return any(key.startswith(signs) for key in keys)
 
 
 def find_key_map(keys: Iterable[str]) -> KeyMap:
-    """Return the map of the architecture that state keys, upstream's or ours, belong to."""
+    """Find the key map of the architecture of a state.
+
+    Args:
+        keys: State keys, of upstream or of this project.
+
+    Raises:
+        ValueError: If there are no keys.
+    """
     keys = list(keys)
     upstream = is_upstream(keys)
     for key_map in key_maps():
-        if key_map.is_marked(keys, upstream):
+        if key_map.is_marked(keys, upstream=upstream):
             return key_map
     raise InputError("the checkpoint holds no weights.")

@@ -1,4 +1,4 @@
-"""Rules between the state keys of an earlier system and ours, read in both directions."""
+"""Rules between the state keys of an earlier system and of this project, for both directions."""
 
 import re
 from collections.abc import Collection, Mapping
@@ -13,19 +13,19 @@ Rules = tuple[tuple[str, str], ...]
 
 @dataclass(frozen=True)
 class KeyMap:
-    """How the keys of one upstream architecture correspond to ours.
+    """Correspondence between the keys of an upstream architecture and of this project.
 
     Attributes:
         name: Name of the architecture.
-        rules: Pairs of key prefixes (upstream's, ours); ``{i}`` stands for a number, the same on
-            both sides, in order. The first that fits wins.
-        unused: Upstream keys without a counterpart, whatever the rules say, and what upstream
-            expects there, for conversion back; None where only some of its models hold the key.
-        markers: Pairs of key prefixes (upstream's, ours) that, all present, tell this architecture
-            from those of the methods that it is built on.
+        rules: Pairs of key prefixes (upstream's, ours). ``{i}`` stands for a number; the numbers
+            of both sides are equal, in order. The first rule that matches is applied.
+        unused: Upstream keys without a counterpart, which take precedence over ``rules``, and the
+            values that conversion back writes; None for a key that only some upstream models have.
+        markers: Pairs of key prefixes (upstream's, ours). If all of them are present, the keys
+            belong to this architecture, not to a method that it is built on.
         idle: Pattern of further upstream keys without a counterpart, which conversion back leaves
             out.
-        sign: What some keys of its release begin with, and none of ours.
+        sign: Prefix of some keys of the release, which no key of this project has.
     """
 
     name: str
@@ -36,32 +36,43 @@ class KeyMap:
     sign: str = "pts_bbox_head."
 
     def is_marked(self, keys: Collection[str], upstream: bool) -> bool:
-        """Return whether keys, upstream's or ours, tell this architecture."""
-        patterns = [_pattern(pair[0 if upstream else 1]) for pair in self.markers]
-        return all(any(pattern.match(key) for key in keys) for pattern in patterns)
+        """Whether state keys contain all markers of this architecture.
+
+        Args:
+            keys: State keys.
+            upstream: Whether the keys have upstream's format.
+        """
+        for upstream_marker, our_marker in self.markers:
+            pattern = _pattern(upstream_marker if upstream else our_marker)
+            if not any(pattern.match(key) for key in keys):
+                return False
+        return True
 
     def is_unused(self, key: str) -> bool:
-        """Return whether an upstream key has no counterpart."""
+        """Whether an upstream key has no counterpart."""
         return key in self.unused or re.match(self.idle, key) is not None
 
     def to_ours(self, key: str) -> str | None:
-        """Return our name of an upstream key, or None if there is none."""
-        return None if self.is_unused(key) else _rename(key, self.rules)
+        """Key of this project for an upstream key, or None if it has no counterpart."""
+        return None if self.is_unused(key) else _rename(key, rules=self.rules)
 
     def to_upstream(self, key: str) -> str | None:
-        """Return upstream's name of one of our keys, or None if there is none."""
-        return _rename(key, tuple((ours, upstream) for upstream, ours in self.rules))
+        """Upstream key for a key of this project, or None if it has no counterpart."""
+        reversed_rules = tuple((ours, upstream) for upstream, ours in self.rules)
+        return _rename(key, rules=reversed_rules)
 
 
 def _pattern(template: str) -> re.Pattern[str]:
     """Compile a key prefix in which ``{i}`` stands for a number."""
-    return re.compile(r"(\d+)".join(re.escape(part) for part in template.split(_NUMBER)))
+    literals = map(re.escape, template.split(_NUMBER))
+    return re.compile(r"(\d+)".join(literals))
 
 
 def _rename(key: str, rules: Rules) -> str | None:
-    """Replace the prefix of ``key`` by the first rule that fits."""
+    """Replace the prefix of a key by the first rule that matches."""
     for source, target in rules:
-        if match := _pattern(source).match(key):
+        match = _pattern(source).match(key)
+        if match is not None:
             for number in match.groups():
                 target = target.replace(_NUMBER, number, 1)
             return target + key[match.end() :]
@@ -69,17 +80,25 @@ def _rename(key: str, rules: Rules) -> str | None:
 
 
 def rules_of(upstream: str, ours: str, names: str) -> Rules:
-    """Return rules for several names.
+    """Rules for several names below a pair of prefixes.
 
     Args:
-        upstream: What upstream's keys begin with.
-        ours: What our keys begin with.
-        names: What follows, with blanks between: ``theirs=ours``, or one for both.
+        upstream: Prefix of upstream's keys.
+        ours: Prefix of the keys of this project.
+        names: Rest of the keys, separated by blanks: ``theirs=ours``, or one name for both.
     """
-    pairs = (name.partition("=") for name in names.split())
-    return tuple((upstream + theirs, ours + (own or theirs)) for theirs, _, own in pairs)
+    rules: list[tuple[str, str]] = []
+    for name in names.split():
+        their_name, _, our_name = name.partition("=")
+        rules.append((upstream + their_name, ours + (our_name or their_name)))
+    return tuple(rules)
 
 
 def zeros(prefix: str, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Tensor]:
-    """Return zeros for parameters without effect on any output; they take no memory."""
+    """Zeros for parameters without effect on any output. They take no memory.
+
+    Args:
+        prefix: Prefix of the keys.
+        shapes: Shapes by the rest of the key.
+    """
     return {prefix + key: torch.zeros(()).expand(shape) for key, shape in shapes.items()}

@@ -1,7 +1,7 @@
-"""Trained models by name: those that ship in ``models/``, and the official ones of other systems.
+"""Trained models by name: models that ship in ``models/``, and official models of other systems.
 
-``models/registry.json`` lists them; a model's weights are ``models/NAME.pth``. The official ones do
-not ship: saved there under their name, they load like the others.
+``models/registry.json`` lists them. The weights of a model are in ``models/NAME.pth``. Weights of
+official models do not ship; once saved under this name, they load like the others.
 """
 
 import difflib
@@ -24,14 +24,15 @@ class NamedModel:
     """A trained model of the registry.
 
     Attributes:
-        name: Its name.
-        config: Our config, as `shipped` takes it.
-        sha256: Digest of the weights' file; None where it is not known.
-        source: Who trained it.
+        name: Name of the model.
+        config: Config of this project, as `shipped` takes it.
+        sha256: Digest of the weights' file; None if it is unknown.
+        source: Authors of the training.
         licence: Licence of the weights.
-        address: Where its file is fetched; None for those that ship.
-        figures: Published results on its validation split in percent, by our metrics' names.
-        image_size: Width and height that images were scaled to in training, in pixels.
+        address: Download address of the weights; None for models that ship.
+        figures: Published results on the model's validation split, in percent, by the names of
+            this project's metrics.
+        image_size: Width and height of the training images after scaling, in pixels.
         can_bus: Whether the training samples had vehicle signals.
     """
 
@@ -47,51 +48,63 @@ class NamedModel:
 
     @property
     def file(self) -> Path:
-        """File of its weights."""
+        """File of the weights."""
         return shipped(f"models/{self.name}.pth")
 
 
 @cache
 def named_models() -> dict[str, NamedModel]:
-    """Return the registry by name."""
-    rows = read_json(shipped("models/registry.json"))
-    return {row["name"]: NamedModel(**row) for row in rows}
+    """Models of the registry by name."""
+    models: dict[str, NamedModel] = {}
+    for row in read_json(shipped("models/registry.json")):
+        models[row["name"]] = NamedModel(**row)
+    return models
 
 
 def list_models() -> list[str]:
-    """Return the names of the models whose weights are there: those that ship, and fetched ones."""
+    """Names of the models whose weights are available: shipped models and fetched ones."""
     return [name for name, model in named_models().items() if model.file.is_file()]
 
 
 @cache
 def named_configs() -> dict[str, Path]:
-    """Return the configs that ship, by the names of their files, without those to inherit from."""
-    patterns = ("configs/*.py", "configs/[!_]*/*.py", "projects/GSMap/configs/*.py")
-    return {path.stem: path for pattern in patterns for path in sorted(shipped().glob(pattern))}
+    """Files of the shipped configs by stem, without base configs."""
+    configs: dict[str, Path] = {}
+    for pattern in ("configs/*.py", "configs/[!_]*/*.py", "projects/GSMap/configs/*.py"):
+        for path in sorted(shipped().glob(pattern)):
+            configs[path.stem] = path
+    return configs
 
 
 def find_config(config: str | Path) -> Path:
-    """Return a config's file, given that, its path in the repository, its name, or a model's name.
+    """Find the file of a config.
+
+    Args:
+        config: Path of the file, path in the repository, name of the config, or name of a model.
 
     Raises:
-        FileNotFoundError: If it is none of these; the message has the nearest name.
+        FileNotFoundError: If there is no such config; the message contains the nearest name.
     """
     for path in (Path(config), shipped(str(config)), named_configs().get(str(config))):
         if path is not None and path.is_file():
             return path
     remedy = f"; configs are in configs/ and projects/GSMap/configs/ of {shipped()}"
-    return shipped(_named(config, "config file", remedy, named_configs()).config)
+    model = _find_model(config, kind="config file", remedy=remedy, other_names=named_configs())
+    return shipped(model.config)
 
 
 def find_checkpoint(checkpoint: str | Path) -> Path:
-    """Return a checkpoint's file; asked for by name, it is checked against its digest.
+    """Find the file of a checkpoint. The file of a named model is compared with its digest.
 
-    A warning says so where the registry has no digest. A name means the registry's model, whatever
-    the working folder holds; ``./NAME`` is a file there.
+    A name refers to the model of the registry even if the working folder contains a file of this
+    name; ``./NAME`` refers to the file. A warning is logged if the registry has no digest.
+
+    Args:
+        checkpoint: Path of the file, or name of a model.
 
     Raises:
-        FileNotFoundError: If it is neither, or the named model's file is not there.
-        ValueError: If the named model's file is not the registry's.
+        FileNotFoundError: If there is no such file or model, or the model's file is absent.
+        ValueError: If the digest of the model's file differs from the registry's.
     """
     if Path(checkpoint).is_file():
         if str(checkpoint) not in named_models():
@@ -101,14 +114,14 @@ def find_checkpoint(checkpoint: str | Path) -> Path:
             f"is ./{checkpoint}.",
             level=logging.WARNING,
         )
-    model = _named(checkpoint, "checkpoint")
+    model = _find_model(checkpoint, kind="checkpoint")
     if not model.file.is_file():
         remedy = f"fetch it from {model.address}" if model.address else "check it out again"
         raise FileNotFoundError(
             f"There is no {model.file}, the weights of {model.name}: {remedy} and save it there."
         )
     if not model.sha256:
-        _say_unverified(model.name)
+        _warn_unverified(model.name)
     elif digest(model.file) != model.sha256:
         raise InputError(
             f"{model.file} is damaged or another file: its sha256 is not that of {model.name} in "
@@ -118,8 +131,8 @@ def find_checkpoint(checkpoint: str | Path) -> Path:
 
 
 @cache
-def _say_unverified(name: str) -> None:
-    """Say once that nobody knows whether a file is the one that its name promises."""
+def _warn_unverified(name: str) -> None:
+    """Warn once that a model's file cannot be verified without a digest."""
     model = named_models()[name]
     print_log(
         f"{model.file} is not verified: {model.source} gives no sha256 for {model.name}; that of "
@@ -129,11 +142,16 @@ def _say_unverified(name: str) -> None:
 
 
 def checkpoint_for(config: str | Path, checkpoint: str | Path | None) -> Path:
-    """Return the checkpoint that a command tests: the one given, or that of a named model.
+    """Find the checkpoint that a command tests.
+
+    Args:
+        config: Path or name of a config, or name of a model.
+        checkpoint: Path of the checkpoint, or name of a model. None selects the weights of the
+            model that ``config`` names.
 
     Raises:
-        FileNotFoundError: If it does not exist.
-        ValueError: If none is given with a config.
+        FileNotFoundError: If the checkpoint does not exist.
+        ValueError: If ``checkpoint`` is None and ``config`` is not the name of a model.
     """
     is_config = str(config) in named_configs() or Path(config).is_file()
     if checkpoint is None and is_config and str(config) not in named_models():
@@ -141,14 +159,28 @@ def checkpoint_for(config: str | Path, checkpoint: str | Path | None) -> Path:
     return find_checkpoint(config if checkpoint is None else checkpoint)
 
 
-def _named(name: str | Path, what: str, remedy: str = "", others: Iterable[str] = ()) -> NamedModel:
-    """Return a model by its name, or raise an error with the nearest, or with all that ship."""
+def _find_model(
+    name: str | Path, kind: str, remedy: str = "", other_names: Iterable[str] = ()
+) -> NamedModel:
+    """Find a model by its name.
+
+    Args:
+        name: Name of the model.
+        kind: Kind of file that ``name`` may also refer to, for the message of an error.
+        remedy: End of the message.
+        other_names: Further valid names, which the message may suggest.
+
+    Raises:
+        FileNotFoundError: If there is no such model. The message contains the nearest name, or
+            all models that ship.
+    """
     models = named_models()
     if str(name) not in models:
-        close = difflib.get_close_matches(Path(name).stem, [*models, *others], n=1, cutoff=0.7)
-        ours = ", ".join(model.name for model in models.values() if not model.address)
-        hint = f"did you mean {close[0]}?" if close else f"{ours} ship"
+        candidates = [*models, *other_names]
+        close = difflib.get_close_matches(Path(name).stem, candidates, n=1, cutoff=0.7)
+        shipped_names = ", ".join(model.name for model in models.values() if not model.address)
+        hint = f"did you mean {close[0]}?" if close else f"{shipped_names} ship"
         raise FileNotFoundError(
-            f"There is no {what} {name}, and no model of that name ({hint}){remedy}."
+            f"There is no {kind} {name}, and no model of that name ({hint}){remedy}."
         )
     return models[str(name)]

@@ -1,7 +1,8 @@
-"""Weights that others publish: found by their address, checked, and in our backbones' names.
+"""Published weights of backbones: download, verification, and conversion to mmdet's keys.
 
-A config names them by address. The file is looked for under its own name in the folder that the
-environment variable ``GSMAP_WEIGHTS`` names, then among those fetched before, then on the network.
+A config refers to such weights by their address. The file is searched for by its published name in
+the folder of the environment variable ``GSMAP_WEIGHTS``, then in the cache of earlier downloads. If
+it is in neither, it is downloaded.
 """
 
 import hashlib
@@ -33,38 +34,44 @@ from gsmap.utils.files import atomic_write, file_name
 from gsmap.utils.shards import digest
 
 WEIGHTS = "GSMAP_WEIGHTS"
-SILENCE_S = 30.0  # a server that sends nothing for so long is given up
-HEADER_S = 60.0  # so is one whose header is not whole by then
-LIMIT_S = 3600.0  # so is a download that takes longer
+SILENCE_S = 30.0  # longest time without a byte from the server
+HEADER_S = 60.0  # longest time until the header is complete
+LIMIT_S = 3600.0  # longest time of a download
 _BLOCK_BYTES = 1 << 20
-_DIGEST = re.compile(r"-([0-9a-f]{8,64})(\.\w+)?\Z")  # torch's and OpenMMLab's file names
-_EFFICIENTNET = KeyMap("efficientnet", efficientnet_rules("", ""), unused_classifier(""))
-_DETECTRON = "backbone.bottom_up."
+_DIGEST = re.compile(r"-([0-9a-f]{8,64})(\.\w+)?\Z")  # in file names of torch and OpenMMLab
+_EFFICIENTNET = KeyMap(
+    name="efficientnet",
+    rules=efficientnet_rules(theirs="", ours=""),
+    unused=unused_classifier(theirs=""),
+)
+_DETECTRON_PREFIX = "backbone.bottom_up."
+_DETECTRON = re.compile(re.escape(_DETECTRON_PREFIX) + "(.+)")
+_SWIN_PREFIX = "backbone.layers.0.blocks.0.attn."
 _SWIN = re.compile(r"backbone\.((layers|patch_embed|norm\d)\..+)")
 
 
 def load_published(
     address: str, model_dir: object = None, map_location: Any = "cpu", progress: bool = False
 ) -> Any:
-    """Load weights by their address; it takes the place of mmengine's ``load_url``.
+    """Load weights by their address; a replacement for mmengine's ``load_url``.
 
     Args:
-        address: Where they are published.
-        model_dir: Not used: `find_weights` says where a file lies.
+        address: Address of the published file.
+        model_dir: Ignored; `find_weights` determines the folder.
         map_location: Device, as torch takes it.
-        progress: Not used.
+        progress: Ignored.
 
     Returns:
-        The checkpoint, in the names of our backbones (`in_our_names`).
+        The checkpoint, with the keys of mmdet's backbones (`in_our_names`).
 
     Raises:
-        OSError: If it can be neither found nor fetched.
-        ValueError: If it cannot be read. A broken file that was fetched is removed.
+        OSError: If the file is neither available nor can be downloaded.
+        ValueError: If it cannot be read. A downloaded file is removed in this case.
     """
     path = find_weights(address)
     try:
         with refusing(address):
-            checkpoint = load_tensors(path, map_location)
+            checkpoint = load_tensors(path, map_location=map_location)
     except ValueError as error:
         if path != cache_file(address):
             raise InputError(f"{error} The file is {path}.") from error
@@ -74,7 +81,11 @@ def load_published(
 
 
 def load_from_file(path: str, map_location: Any = "cpu") -> Any:
-    """Load weights from a file, in the names of our backbones; a scheme of mmengine's.
+    """Load weights from a file, with the keys of mmdet's backbones; a loader for mmengine.
+
+    Args:
+        path: Path of the file; ``~`` is expanded.
+        map_location: Device, as torch takes it.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -84,14 +95,18 @@ def load_from_file(path: str, map_location: Any = "cpu") -> Any:
     if not file.is_file():
         raise FileNotFoundError(f"there are no weights at {file}: check the path.")
     with refusing(file):
-        return in_our_names(load_tensors(file, map_location))
+        return in_our_names(load_tensors(file, map_location=map_location))
 
 
 def load_from_torchvision(name: str, map_location: Any = "cpu") -> Any:
-    """Load what ``torchvision://NAME`` stands for, without torchvision; a scheme of mmengine's.
+    """Load the weights of ``torchvision://NAME`` without torchvision; a loader for mmengine.
+
+    Args:
+        name: Name of the weights, with its scheme.
+        map_location: Device, as torch takes it.
 
     Raises:
-        ValueError: If torchvision has no weights of that name.
+        ValueError: If torchvision has no weights of this name.
     """
     table = Path(mmengine.__file__).parent / "hub/torchvision_0.12.json"
     addresses = json.loads(table.read_text())
@@ -102,77 +117,85 @@ def load_from_torchvision(name: str, map_location: Any = "cpu") -> Any:
 
 
 def find_weights(address: str) -> Path:
-    """Return the file of published weights, fetched if it is not here.
+    """Find the file of published weights, and download it if it is not available.
 
-    A file whose name ends in the first digits of its sha256 must have that digest if it was
-    fetched; in one's own folder another digest is a warning.
+    A published file name may end in the first digits of the file's sha256. If the digest of a
+    downloaded file differs from them, the file is downloaded again. If the digest of a file in the
+    folder of ``GSMAP_WEIGHTS`` differs, a warning is logged.
+
+    Args:
+        address: Address of the published file.
 
     Raises:
-        OSError: If it can be neither found nor fetched.
+        OSError: If the file is neither available nor can be downloaded.
     """
-    name = _name(address)
+    name = _published_name(address)
     folder = os.environ.get(WEIGHTS)
     if folder and not Path(folder).is_dir():
         raise FileNotFoundError(
             f"{WEIGHTS} names {folder}, which is no folder: put {name} into one."
         )
-    if folder and (own := Path(folder, name)).is_file():
-        if not _is_published(own, name):
-            print_log(
-                f"{own} is used, but is not the published file: its sha256 is {digest(own)}.",
-                level=logging.WARNING,
-            )
-        return own
+    if folder:
+        user_file = Path(folder, name)
+        if user_file.is_file():
+            if not _has_published_digest(user_file, name=name):
+                print_log(
+                    f"{user_file} is used, but is not the published file: its sha256 is "
+                    f"{digest(user_file)}.",
+                    level=logging.WARNING,
+                )
+            return user_file
     cached = cache_file(address)
-    if cached.is_file() and not _is_published(cached, name):
+    if cached.is_file() and not _has_published_digest(cached, name=name):
         print_log(f"{cached} is broken and is fetched again.", level=logging.WARNING)
         cached.unlink()
     if not cached.is_file():
-        _fetch(address, cached)
+        _download(address, path=cached)
     print_log(f"weights of {address} are in {cached}.")
     return cached
 
 
 def cache_file(address: str) -> Path:
-    """Return where a fetched file lies; a digest in its name keeps addresses apart."""
-    name, dot, kind = _name(address).rpartition(".")
+    """Path of a downloaded file. Its name contains a digest of the address, which is unique."""
+    name, dot, suffix = _published_name(address).rpartition(".")
     mark = hashlib.sha256(address.encode()).hexdigest()[:16]
-    marked = f"{name}={mark}.{kind}" if dot else f"{kind}={mark}"
-    return Path(torch.hub.get_dir(), "checkpoints", file_name(marked))
+    marked_name = f"{name}={mark}.{suffix}" if dot else f"{suffix}={mark}"
+    return Path(torch.hub.get_dir(), "checkpoints", file_name(marked_name))
 
 
-def _name(address: str) -> str:
-    """Return the file's name in an address."""
+def _published_name(address: str) -> str:
+    """File name in an address."""
     return file_name(unquote(Path(urlsplit(address).path).name) or "weights.pth")
 
 
-def _is_published(path: Path, name: str) -> bool:
-    """Whether a file has the digest that its published name ends in, if it ends in one."""
-    promised = _DIGEST.search(name)
-    return promised is None or digest(path).startswith(promised[1])
+def _has_published_digest(path: Path, name: str) -> bool:
+    """Whether a file has the digest in its published name; True if the name has none."""
+    published_digest = _DIGEST.search(name)
+    return published_digest is None or digest(path).startswith(published_digest[1])
 
 
-def _fetch(address: str, path: Path) -> None:
-    """Fetch a file whole, or say what to put where."""
+def _download(address: str, path: Path) -> None:
+    """Download a file and check its digest, or raise an error with a remedy."""
     print_log(f"fetching {address} to {path} ...")
-    total = hashlib.sha256()
+    sha256 = hashlib.sha256()
     with atomic_write(path, "wb") as file:
-        for block in _blocks(address):
-            total.update(block)
+        for block in _read_blocks(address):
+            sha256.update(block)
             file.write(block)
-        promised = _DIGEST.search(_name(address))
-        if promised and not total.hexdigest().startswith(promised[1]):
-            raise _unreachable(address, f"it came with sha256 {total.hexdigest()[:16]}...")
+        published_digest = _DIGEST.search(_published_name(address))
+        if published_digest and not sha256.hexdigest().startswith(published_digest[1]):
+            reason = f"it came with sha256 {sha256.hexdigest()[:16]}..."
+            raise _download_error(address, reason=reason)
 
 
-def _blocks(address: str) -> Iterator[bytes]:
-    """Yield a file of the network in blocks, within `LIMIT_S`."""
+def _read_blocks(address: str) -> Iterator[bytes]:
+    """Yield the blocks of a file on the network, for at most `LIMIT_S`."""
     end_s = time.monotonic() + LIMIT_S
     try:
-        with _open_address(address) as answer:
-            length = answer.headers.get("Content-Length")
+        with _open_address(address) as response:
+            length = response.headers.get("Content-Length")
             received = 0
-            while block := answer.read1(_BLOCK_BYTES):
+            while block := response.read1(_BLOCK_BYTES):
                 received += len(block)
                 if time.monotonic() > end_s:
                     raise TimeoutError(f"not whole after {LIMIT_S:.0f} s")
@@ -180,35 +203,37 @@ def _blocks(address: str) -> Iterator[bytes]:
             if length is not None and received != int(length):
                 raise ConnectionError(f"cut after {received} of {length} bytes")
     except (OSError, http.client.HTTPException, ValueError) as error:
-        raise _unreachable(address, str(getattr(error, "reason", None) or error)) from error
+        reason = str(getattr(error, "reason", None) or error)
+        raise _download_error(address, reason=reason) from error
 
 
 def _open_address(address: str) -> HTTPResponse:
-    """Connect to a server and read the header of its answer, both within `HEADER_S`.
+    """Connect to a server and read the header of its response, both within `HEADER_S`.
 
-    The timeout of a socket begins anew with each byte, so another thread waits for the header.
+    The timeout of a socket restarts with each byte, so a second thread opens the connection, and
+    this one waits for it.
     """
-    answers: SimpleQueue[HTTPResponse | Exception] = SimpleQueue()
+    responses: SimpleQueue[HTTPResponse | Exception] = SimpleQueue()
 
     def connect() -> None:
         try:
-            answers.put(urllib.request.urlopen(address, timeout=SILENCE_S))
-        except Exception as error:  # raised again by the thread that waits
-            answers.put(error)
+            responses.put(urllib.request.urlopen(address, timeout=SILENCE_S))
+        except Exception as error:  # raised again in the waiting thread
+            responses.put(error)
 
     threading.Thread(target=connect, daemon=True).start()
     try:
-        answer = answers.get(timeout=HEADER_S)
+        response = responses.get(timeout=HEADER_S)
     except Empty:
         raise TimeoutError(f"no whole header after {HEADER_S:.0f} s") from None
-    if isinstance(answer, Exception):
-        raise answer
-    return answer
+    if isinstance(response, Exception):
+        raise response
+    return response
 
 
-def _unreachable(address: str, reason: str) -> OSError:
-    """Return the error of a file that did not come, which says what to put where."""
-    name = _name(address)
+def _download_error(address: str, reason: str) -> OSError:
+    """Error of a failed download, with the folder in which to put the file."""
+    name = _published_name(address)
     folder = os.environ.get(WEIGHTS)
     place = f"put {name} into {folder or f'a folder and set {WEIGHTS} to it'}"
     return OSError(
@@ -218,11 +243,16 @@ def _unreachable(address: str, reason: str) -> OSError:
 
 
 def in_our_names(checkpoint: Any) -> Any:
-    """Rename the weights of a published backbone as mmdet's and our modules have them.
+    """Rename the weights of a published backbone to the keys of mmdet and of this project.
 
-    It knows EfficientNet as ``efficientnet_pytorch`` publishes it, backbones of detectron2, and the
-    Swin Transformers in the segmentation models of its authors, told by their keys. Whatever else a
-    checkpoint holds is returned as it is.
+    The format is recognised by the keys. Supported are EfficientNet of ``efficientnet_pytorch``,
+    backbones of detectron2, and the Swin Transformers in the segmentation models of their authors.
+
+    Args:
+        checkpoint: Contents of the published file.
+
+    Returns:
+        The weights by their new keys. Contents in another format are returned unchanged.
     """
     if not isinstance(checkpoint, Mapping):
         return checkpoint
@@ -232,16 +262,25 @@ def in_our_names(checkpoint: Any) -> Any:
     elif isinstance(checkpoint.get("model"), Mapping):
         checkpoint = state = checkpoint["model"]
     if "_conv_stem.weight" in state:
-        renamed = {_EFFICIENTNET.to_ours(key): value for key, value in state.items()}
-        return {key: value for key, value in renamed.items() if key is not None}
-    if any(str(key).startswith(_DETECTRON) for key in state):
-        return _part_of(state, re.compile(re.escape(_DETECTRON) + "(.+)"))
-    if any(str(key).startswith("backbone.layers.0.blocks.0.attn.") for key in state):
-        return _part_of(state, _SWIN)
+        renamed: dict[str, Tensor] = {}
+        for key, value in state.items():
+            name = _EFFICIENTNET.to_ours(key)
+            if name is not None:
+                renamed[name] = value
+        return renamed
+    keys = list(map(str, state))
+    if any(key.startswith(_DETECTRON_PREFIX) for key in keys):
+        return _select_weights(state, pattern=_DETECTRON)
+    if any(key.startswith(_SWIN_PREFIX) for key in keys):
+        return _select_weights(state, pattern=_SWIN)
     return checkpoint
 
 
-def _part_of(state: Mapping[str, Tensor], pattern: re.Pattern[str]) -> dict[str, Tensor]:
-    """Return the weights whose names fit a pattern, by its first group."""
-    found = {pattern.fullmatch(str(key)): value for key, value in state.items()}
-    return {match[1]: value for match, value in found.items() if match is not None}
+def _select_weights(state: Mapping[str, Tensor], pattern: re.Pattern[str]) -> dict[str, Tensor]:
+    """Select the weights whose keys match a pattern, and rename them to its first group."""
+    weights: dict[str, Tensor] = {}
+    for key, value in state.items():
+        match = pattern.fullmatch(str(key))
+        if match is not None:
+            weights[match[1]] = value
+    return weights

@@ -1,4 +1,4 @@
-"""What a checkpoint of mmengine may hold beside tensors and plain data."""
+"""Globals that checkpoints of mmengine may refer to, besides tensors and plain data."""
 
 import pickle
 from collections.abc import Callable
@@ -10,19 +10,22 @@ from gsmap.utils.numpy_pickle import CHECKED
 
 
 def mmengine_globals() -> list[Any]:
-    """Return what ``torch.load(weights_only=True)`` needs to read mmengine's checkpoints.
+    """Globals that ``torch.load(weights_only=True)`` needs for mmengine's checkpoints.
 
-    A checkpoint to resume from holds the message hub: ``HistoryBuffer`` objects around arrays,
-    numbers, and references to the class's own statistics (``getattr(HistoryBuffer, "mean")``).
-    Naming just these keeps torch's protection on for everything else. numpy's values are rebuilt by
-    checked functions, as numpy's own give a file memory access.
+    A checkpoint for resuming contains mmengine's message hub: ``HistoryBuffer`` objects with
+    arrays, numbers, and references to statistics of the class
+    (``getattr(HistoryBuffer, "mean")``). Torch refuses all other globals. Arrays are rebuilt by
+    functions that check their arguments, because numpy's functions give a file access to memory.
+
+    Returns:
+        Classes, and pairs of a function and the global name that it replaces.
     """
-    checked = [(function, name) for name, function in CHECKED.items()]
-    return [HistoryBuffer, *checked, (_history_statistic, "builtins.getattr")]
+    array_functions = [(function, name) for name, function in CHECKED.items()]
+    return [HistoryBuffer, *array_functions, (_history_statistic, "builtins.getattr")]
 
 
 def _history_statistic(owner: type, name: str) -> Callable[..., float]:
-    """Stand in for ``getattr`` while unpickling: a statistic of ``HistoryBuffer`` and no more."""
+    """Replacement for ``getattr`` in unpickling, restricted to statistics of ``HistoryBuffer``."""
     if owner is not HistoryBuffer or name not in {"min", "max", "current", "mean"}:
         raise pickle.UnpicklingError(f"A checkpoint must not look up {name!r} of {owner!r}.")
     return getattr(HistoryBuffer, name)

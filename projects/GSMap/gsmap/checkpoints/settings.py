@@ -1,4 +1,4 @@
-"""The settings that a model was trained with, as they stand in its checkpoint."""
+"""Model settings of a training, as stored in its checkpoint."""
 
 import json
 import re
@@ -10,126 +10,184 @@ from mmengine.config import Config, ConfigDict
 
 from gsmap.utils.errors import InputError
 
-MODEL_SETTINGS = "model_settings"  # key of a checkpoint's meta: JSON, as a config's text is code
-# settings of a training alone; those of its start may load files
+MODEL_SETTINGS = "model_settings"  # key in a checkpoint's meta: JSON, since config text is code
+# Settings that only training uses. The settings of its start may load files.
 STARTS = {
     "init_cfg", "pretrained", "equal_weights", "uniform_positions", "allow_untrained", "autocast",
     "compiled",
 }  # fmt: skip
-IMAGE_SIZE = "image_size"  # key of a checkpoint's meta: width and height that images are scaled to
-SIGNALS = "can_bus"  # key of a checkpoint's meta: whether training samples had vehicle signals
-# what a checkpoint names and later versions replace by a part with the same arguments
-_RENAMED = {"Det3DDataPreprocessor": "MapDataPreprocessor"}
+IMAGE_SIZE = "image_size"  # key in a checkpoint's meta: width and height of the scaled images
+SIGNALS = "can_bus"  # key in a checkpoint's meta: whether training samples had vehicle signals
+# Types in old checkpoints, and the types that replace them with equal arguments.
+_REPLACEMENTS = {"Det3DDataPreprocessor": "MapDataPreprocessor"}
 _KEY = re.compile(r"[a-zA-Z]\w*")
-_TEXT = re.compile(r"[\w -]*")  # no name of a file, an address or a module, and no expression
+_TEXT = re.compile(r"[\w -]*")  # excludes file names, addresses, modules and expressions
 _LARGEST = 1_000_000  # layers, channels, voxels
 _DEEPEST = 20
 
 
 def plain(settings: Any) -> Any:
-    """Return settings as JSON knows them: tuples are lists, objects their text."""
+    """Convert settings to JSON types: tuples to lists, other objects to strings."""
     return json.loads(json.dumps(settings, default=str))
 
 
 def differences(ours: Any, others: Any, name: str = "") -> dict[str, tuple[Any, Any]]:
-    """Return both values of what differs, by dotted name; None is what is not there.
+    """Compare nested settings.
 
     Args:
         ours: Nested dictionaries, lists and plain values.
-        others: What to compare them with.
-        name: What the names begin with.
+        others: Settings to compare with.
+        name: Prefix of the names.
+
+    Returns:
+        Both values of each setting that differs, by dotted name; None for an absent value.
     """
     if isinstance(ours, list) and isinstance(others, list):
-        return differences(dict(enumerate(ours)), dict(enumerate(others)), name)
+        return differences(dict(enumerate(ours)), others=dict(enumerate(others)), name=name)
     if not (isinstance(ours, Mapping) and isinstance(others, Mapping)):
         return {} if ours == others else {name: (ours, others)}
-    found: dict[str, tuple[Any, Any]] = {}
+    unequal: dict[str, tuple[Any, Any]] = {}
     for key in dict.fromkeys([*ours, *others]):
-        inner = f"{name}.{key}" if name else str(key)
-        found |= differences(ours.get(key), others.get(key), inner)
-    return found
+        inner_name = f"{name}.{key}" if name else str(key)
+        unequal |= differences(ours.get(key), others=others.get(key), name=inner_name)
+    return unequal
 
 
 def scale_steps(cfg: Config, *parts: str) -> list[ConfigDict]:
-    """Return the steps that scale images in pipelines of a config: train's, val's, test's."""
+    """Steps that scale images in pipelines of a config.
+
+    Args:
+        cfg: The config.
+        parts: ``"train"``, ``"val"`` or ``"test"``.
+    """
     return [step for step in pipeline_steps(cfg, *parts) if step.get("type") == "ScaleImages"]
 
 
 def pipeline_steps(cfg: Config, *parts: str) -> list[ConfigDict]:
-    """Return all steps in pipelines of a config: train's, val's, test's."""
-    loaders = [cfg.get(f"{part}_dataloader") or {} for part in parts]
-    pipelines = [loader.get("dataset", {}).get("pipeline") or [] for loader in loaders]
-    return [step for pipeline in pipelines for step in pipeline if isinstance(step, ConfigDict)]
-
-
-def checked(settings: Any, config: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings of a checkpoint, without `STARTS`, if all they do is to set a model.
-
-    mmengine imports the module of a type that is not registered, and some classes that others
-    register run a text as code or read the file that it names. So a type must be registered, and be
-    this project's, one of torch's layers or one of the config's. Other texts must be plain words or
-    the config's.
+    """All steps in pipelines of a config.
 
     Args:
-        settings: As the JSON in the checkpoint has them.
-        config: The model's settings in the config, which are trusted, from `plain`.
+        cfg: The config.
+        parts: ``"train"``, ``"val"`` or ``"test"``.
+    """
+    steps: list[ConfigDict] = []
+    for part in parts:
+        loader = cfg.get(f"{part}_dataloader") or {}
+        pipeline = loader.get("dataset", {}).get("pipeline") or []
+        for step in pipeline:
+            if isinstance(step, ConfigDict):
+                steps.append(step)
+    return steps
+
+
+def check_settings(settings: Any, config: dict[str, Any]) -> dict[str, Any]:
+    """Check the settings of a checkpoint, which must do no more than configure a model.
+
+    mmengine imports the module of a type that is not registered. Some registered classes of other
+    packages run a string as code, or read the file that it names. Therefore a type must be
+    registered, and must be a part of this project, a layer of torch or a type of the config. Other
+    strings must be plain words or strings of the config.
+
+    Args:
+        settings: Settings from the JSON in the checkpoint.
+        config: Settings of the model in the config, which are trusted, from `plain`.
+
+    Returns:
+        The settings without `STARTS`.
 
     Raises:
-        ValueError: If they hold anything else; the message names the setting.
+        ValueError: If a key or a value is not allowed; the message contains its dotted name.
     """
     if not isinstance(settings, dict):
         raise InputError(f"model must be a dictionary, got {settings!r:.60}")
-    return _checked(settings, "model", _words(config))
+    return _check_value(settings, name="model", known=_strings(config))
 
 
-def _checked(value: Any, name: str, known: set[str]) -> Any:
-    """Return a setting if all in it is allowed; ``known`` are the config's keys and texts."""
+def _check_value(value: Any, name: str, known: set[str]) -> Any:
+    """Check a setting and all nested ones.
+
+    Args:
+        value: Value of the setting.
+        name: Dotted name of the setting.
+        known: Keys and strings of the config, which are allowed.
+
+    Returns:
+        The value without `STARTS`, and with current types in place of old ones.
+    """
     if name.count(".") > _DEEPEST:
         raise InputError(f"{name[:60]}... is nested too deep")
     if isinstance(value, list):
-        return [_checked(inner, f"{name}.{i}", known) for i, inner in enumerate(value)]
+        items: list[Any] = []
+        for index, item in enumerate(value):
+            items.append(_check_value(item, name=f"{name}.{index}", known=known))
+        return items
     if isinstance(value, dict):
-        for key in value:
-            if not _KEY.fullmatch(key) and (key not in known or key.startswith("_")):
-                raise InputError(f"{name} has the key {key!r:.60}, which is no name of a setting")
-        pairs = ((key, inner) for key, inner in value.items() if key not in STARTS)
-        return {key: _checked(inner, f"{name}.{key}", known) for key, inner in pairs}
+        return _check_mapping(value, name=name, known=known)
     if name.endswith(".type"):
-        if value not in known:
-            value = _RENAMED.get(value, value)
-        _check_type(value, name, known)
-    elif isinstance(value, str) and not (_TEXT.fullmatch(value) or value in known):
+        return _check_type(value, name=name, known=known)
+    if isinstance(value, str) and not (_TEXT.fullmatch(value) or value in known):
         raise InputError(f"{name} is {value!r:.60}, no plain word and not the config's")
-    elif isinstance(value, (int, float)) and not abs(value) <= _LARGEST:  # NaN neither
+    if isinstance(value, (int, float)) and not abs(value) <= _LARGEST:  # refuses NaN as well
         raise InputError(f"{name} is {value!r:.60}, not within {_LARGEST}")
     return value
 
 
-def _check_type(kind: Any, name: str, known: set[str]) -> None:
-    """Refuse a type that is not to be built from a file."""
-    made = _registered(kind) if isinstance(kind, str) else None
-    own = str(getattr(made, "__module__", "")).startswith(("gsmap.", "torch.nn."))
-    if made is None or not (own or kind in known):
+def _check_mapping(settings: dict[str, Any], name: str, known: set[str]) -> dict[str, Any]:
+    """Check the keys and the values of a dictionary; arguments as for `_check_value`."""
+    for key in settings:
+        if not _KEY.fullmatch(key) and (key not in known or key.startswith("_")):
+            raise InputError(f"{name} has the key {key!r:.60}, which is no name of a setting")
+    result: dict[str, Any] = {}
+    for key, value in settings.items():
+        if key not in STARTS:
+            result[key] = _check_value(value, name=f"{name}.{key}", known=known)
+    return result
+
+
+def _check_type(kind: Any, name: str, known: set[str]) -> Any:
+    """Check that a type may be built, and return its current name.
+
+    Args:
+        kind: Name of the type.
+        name: Dotted name of the setting.
+        known: Keys and strings of the config, which are allowed.
+    """
+    if kind not in known:
+        kind = _REPLACEMENTS.get(kind, kind)
+    registered_class = _find_registered(kind) if isinstance(kind, str) else None
+    module = str(getattr(registered_class, "__module__", ""))
+    is_trusted = module.startswith(("gsmap.", "torch.nn.")) or kind in known
+    if registered_class is None or not is_trusted:
         raise InputError(f"{name} is {kind!r:.60}, no part of this project and not of the config")
+    return kind
 
 
-def _registered(kind: str) -> Any:
-    """Return what the registries hold under a name, with a scope or without; import no other."""
-    scope, _, bare = kind.rpartition(".")
+def _find_registered(kind: str) -> Any:
+    """Find a class in the registries by name, with or without scope; None if it is absent.
+
+    Only modules of the registries' packages are imported.
+    """
+    scope, _, bare_name = kind.rpartition(".")
     for registry in (MODELS, TASK_UTILS):
         for holder in (registry, registry.root, *registry.root.children.values()):
             reachable = scope == holder.scope if scope else holder in (registry, registry.root)
-            if reachable:
-                holder.import_from_location()  # the package's own modules
-            if reachable and bare in holder.module_dict:
-                return holder.module_dict[bare]
+            if not reachable:
+                continue
+            holder.import_from_location()  # imports the modules of the holder's package
+            if bare_name in holder.module_dict:
+                return holder.module_dict[bare_name]
     return None
 
 
-def _words(value: Any) -> set[str]:
-    """Return the keys and texts in nested settings."""
+def _strings(value: Any) -> set[str]:
+    """All keys and strings in nested settings."""
+    if isinstance(value, str):
+        return {value}
+    strings: set[str] = set()
     if isinstance(value, dict):
-        return {*value, *_words(list(value.values()))}
+        strings.update(value)
+        value = list(value.values())
     if isinstance(value, list):
-        return set().union(*map(_words, value))
-    return {value} if isinstance(value, str) else set()
+        for item in value:
+            strings |= _strings(item)
+    return strings

@@ -1,38 +1,43 @@
-"""Strict loading: every key is used and every weight is loaded, or an error names it."""
+"""Strict loading: every key of a checkpoint is used, and every weight of the model is loaded."""
 
 from collections.abc import Callable, Mapping, Sequence
-from itertools import chain
 
 from torch import Tensor, nn
 
-from gsmap.checkpoints.convert import listed, ours_from_upstream
+from gsmap.checkpoints.convert import ours_from_upstream, summarize_names
 from gsmap.checkpoints.key_map import is_upstream
 from gsmap.utils.errors import InputError
 
 
 class AddsWeights:
-    """A module that extends another one, as GSMap's extend MapTR's.
+    """Mixin for a module with weights that the module it extends does not have.
 
     Attributes:
-        neutral_keys: What it adds without effect at the start: prefixes of state keys, relative to
-            the module. A checkpoint may lack these.
+        neutral_keys: Prefixes of the state keys of additional weights that have no effect at their
+            initial values, relative to the module. A checkpoint may lack these weights.
     """
 
     neutral_keys: tuple[str, ...] = ()
 
 
 def neutral_keys(model: nn.Module, prefix: str = "") -> list[set[str]]:
-    """Return the state keys, behind ``prefix``, that modules declare neutral (`AddsWeights`).
+    """State keys that the modules of a model declare neutral (`AddsWeights`).
+
+    Args:
+        model: The model.
+        prefix: Prefix of all keys.
 
     Returns:
-        The keys of each declared prefix, which may be missing together only.
+        The keys of each declared prefix. A checkpoint must have all or none of the keys of a set.
     """
-    groups = []
+    groups: list[set[str]] = []
     state = model.state_dict(prefix=prefix)
     for name, module in model.named_modules():
+        if not isinstance(module, AddsWeights):
+            continue
         path = f"{prefix}{name}." if name else prefix
-        for relative in module.neutral_keys if isinstance(module, AddsWeights) else ():
-            groups.append({key for key in state if key.startswith(path + relative)})
+        for relative_prefix in module.neutral_keys:
+            groups.append({key for key in state if key.startswith(path + relative_prefix)})
     return groups
 
 
@@ -44,51 +49,79 @@ def adapt_state(
     fit: Callable[[dict[str, Tensor]], None] | None = None,
     allow_untrained: bool = True,
 ) -> None:
-    """Rename upstream's keys in place, then compare the state with what the model expects.
+    """Rename upstream keys in a state in place, and compare the state with the model's.
 
-    Batch counters of BatchNorm may be missing, as in old checkpoints.
+    Batch counters of BatchNorm may be missing, as in old checkpoints. Missing neutral weights are
+    filled with the values of the model.
 
     Args:
-        state: What a checkpoint has, under ``prefix``.
-        expected: What the model has, under ``prefix``.
-        prefix: What the keys begin with.
-        neutral: Keys that may be missing, those of a set all together (``neutral_keys``).
-        fit: Changes the renamed state in place before it is compared.
-        allow_untrained: Whether the neutral keys may be missing.
+        state: Weights of a checkpoint by key with ``prefix``; changed in place.
+        expected: State of the model by key with ``prefix``.
+        prefix: Prefix of all keys.
+        neutral: Sets of keys that may be missing, all of a set together (`neutral_keys`).
+        fit: Function that changes the renamed state in place before the comparison.
+        allow_untrained: Whether neutral keys may be missing.
 
     Raises:
-        ValueError: If a key is missing, left over or of another shape.
+        ValueError: If a key is missing or left over, or a weight has another shape.
     """
-    own = {key.removeprefix(prefix): value for key, value in state.items()}
-    if is_upstream(own):
+    bare_state = {key.removeprefix(prefix): value for key, value in state.items()}
+    if is_upstream(bare_state):
         state.clear()
-        state.update({prefix + key: value for key, value in ours_from_upstream(own).items()})
+        for key, value in ours_from_upstream(bare_state).items():
+            state[prefix + key] = value
     if fit is not None:
         fit(state)
-    missing = {
-        key for key in expected if key not in state and not key.endswith("num_batches_tracked")
-    }
-    untrained = sorted(chain.from_iterable(keys for keys in neutral if keys <= missing))
+    absent = expected.keys() - state.keys()
+    missing = {key for key in absent if not key.endswith("num_batches_tracked")}
+    untrained: list[str] = []
+    for keys in neutral:
+        if keys <= missing:
+            untrained += keys
+    untrained.sort()
     missing -= set(untrained)
-    state.update({key: expected[key] for key in untrained})  # they stay as they are
-    problems = {
-        "missing": sorted(missing),
-        "left over": [key for key in state if key not in expected],
-        "of another shape": [
-            f"{key} {tuple(value.shape)} instead of {tuple(expected[key].shape)}"
-            for key, value in state.items()
-            if key in expected and value.shape != expected[key].shape
-        ],
-    }
-    text = "; ".join(f"{what}: {listed(keys)}" for what, keys in problems.items() if keys)
-    if text:
+    for key in untrained:
+        state[key] = expected[key]  # keeps the value of the model
+    problems = _describe_mismatch(state, expected=expected, missing=sorted(missing))
+    if problems:
         raise InputError(
-            f"the checkpoint does not fit the model; {text}. Load it with the config it was "
-            "trained with; docs/migration.md lists the architectures that load."
+            f"the checkpoint does not fit the model; {problems}. Load it with the "
+            "config it was trained with; docs/migration.md lists the architectures that load."
         )
     if untrained and not allow_untrained:
         raise InputError(
             "the checkpoint was never trained with parts of the config's model: "
-            f"{listed(untrained)}. Give the config that it was trained with, or use them as they "
-            "start: --cfg-options model.allow_untrained=True."
+            f"{summarize_names(untrained)}. Give the config that it was trained with, or use them "
+            "as they start: --cfg-options model.allow_untrained=True."
         )
+
+
+def _describe_mismatch(
+    state: Mapping[str, Tensor], expected: Mapping[str, Tensor], missing: Sequence[str]
+) -> str:
+    """Describe the keys and shapes that differ between a state and the model's state.
+
+    Args:
+        state: Weights of a checkpoint.
+        expected: State of the model.
+        missing: Keys that the state lacks.
+
+    Returns:
+        The description; empty if the states match.
+    """
+    left_over: list[str] = []
+    misshapen: list[str] = []
+    for key, value in state.items():
+        if key not in expected:
+            left_over.append(key)
+        elif value.shape != expected[key].shape:
+            expected_shape = tuple(expected[key].shape)
+            misshapen.append(f"{key} {tuple(value.shape)} instead of {expected_shape}")
+    problems: list[str] = []
+    if missing:
+        problems.append(f"missing: {summarize_names(missing)}")
+    if left_over:
+        problems.append(f"left over: {summarize_names(left_over)}")
+    if misshapen:
+        problems.append(f"of another shape: {summarize_names(misshapen)}")
+    return "; ".join(problems)

@@ -1,6 +1,6 @@
-"""The weights in a checkpoint, whatever a training loop wrapped them in."""
+"""Extraction of the weights from the wrappers that training loops put around them."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,29 +10,28 @@ from torch import Tensor
 from gsmap.utils.errors import InputError
 
 WRAPPERS = ("state_dict", "model_state_dict", "model_state", "model", "network", "net", "weights")
-_DEEPEST = 3  # wrappers within one another
-_OUTER = ("model.", "network.", "net.")  # before all keys, of modules that hold a model
-# parts of keys that wrappers of modules leave; the first one, of parallel training, in front alone
-_PARALLEL = "module."
-_INNER = ("_orig_mod", "_fsdp_wrapped_module", "_checkpoint_wrapped_module")
+_DEEPEST = 3  # nested wrappers
+_OUTER_PREFIXES = ("model.", "network.", "net.")  # removed if all keys start with it
+_PARALLEL_PREFIX = "module."  # of parallel training; removed at the start of a key alone
+_WRAPPER_PARTS = ("_orig_mod", "_fsdp_wrapped_module", "_checkpoint_wrapped_module")
 _AVERAGED = "ema_"
-_SHOWN = 8  # keys in a message
-_MOST_REPEATED = 4  # times that the values of all weights may be more than those stored
-_SPARE_BYTES = 1 << 26  # that may be repeated however few are stored
+_MAX_KEYS_SHOWN = 8  # in a message
+_MOST_REPEATED = 4  # largest ratio of the bytes of all weights to the stored bytes
+_SPARE_BYTES = 1 << 26  # that may be repeated even if few bytes are stored
 
 
 class UnfitError(InputError):
-    """A checkpoint holds no weights that can be used; the message follows its name."""
+    """Error of a checkpoint without usable weights; the message continues the file's name."""
 
 
 @dataclass(frozen=True)
 class Unwrapped:
-    """Weights without what they were wrapped in.
+    """Weights without their wrappers.
 
     Attributes:
-        state: The weights, by keys of the model.
-        holder: The mapping that the weights or their wrapper lie in; None for a bare state dict.
-        left_out: How many entries are not used, by what they are.
+        state: Weights by the keys of the model.
+        holder: Mapping around the weights or their wrapper; None for a bare state dict.
+        left_out: Number of unused entries by their kind.
     """
 
     state: dict[str, Tensor]
@@ -41,125 +40,175 @@ class Unwrapped:
 
 
 def unwrap(content: Any) -> Unwrapped:
-    """Find the weights in what a checkpoint holds, and take the wrapping off their keys.
+    """Find the weights in the contents of a checkpoint, and remove wrappers from their keys.
 
-    They lie under the first of ``WRAPPERS`` that is there, to a depth of three; else they are the
-    content itself; else the one entry that is a state dict. Off the keys come prefixes of parallel
-    training, of compiled modules and of modules that hold the model. Averages beside the weights
-    that they are of, counters and entries that are no tensors are left out.
+    The weights are under the first key of ``WRAPPERS`` that is present, to a depth of three. If no
+    such key is present, they are the contents themselves, or the only entry that is a state dict.
+    Parts of keys from parallel training, from compiled modules and from modules around the model
+    are removed. Averages next to the averaged weights, counters and entries other than tensors are
+    left out.
 
     Args:
-        content: What the file holds.
+        content: Contents of the file.
 
     Raises:
-        UnfitError: If there are no weights, or two under one key; the message lists the keys.
+        UnfitError: If there are no weights, or two weights under one key; the message contains the
+            keys.
     """
-    found = _find(content, 0)
-    if found is None:
-        if not isinstance(content, Mapping):
-            keys = f"is a {type(content).__name__}"
-        else:
-            names = [key for key in content if isinstance(key, str)]
-            keys = f"has the keys {names[:_SHOWN]!r:.300}" if names else "has no key"
-        raise UnfitError(
-            f"holds no state dict of tensors: it {keys}, and weights lie in it as they are, or "
-            f"under {', '.join(WRAPPERS)}: give a training checkpoint"
-        )
-    weights = {key: value for key, value in found.items() if isinstance(value, Tensor)}
-    if not all(map(_is_plain, weights.values())):
-        odd = next(key for key, value in weights.items() if not _is_plain(value))
-        raise UnfitError(f"holds no state dict of plain tensors: {odd!r:.80} is another kind")
+    entries = _find_state(content, depth=0)
+    if entries is None:
+        raise UnfitError(_describe_contents(content))
+    weights = _select_tensors(entries)
     _require_stored(weights.values())
-    left_out = {"entries that are no tensors": len(found) - len(weights)}
-    counters = {key for key, value in weights.items() if _is_counter(key, value)}
-    if _is_dotted(weights):
-        weights = {key: value for key, value in weights.items() if key not in counters}
-        left_out["counters"] = len(counters)
-    state = _plain_keys(weights)
-    flat = {_AVERAGED + key.replace(".", "_") for key in state}
-    averages = flat & state.keys()
-    state = {key: value for key, value in state.items() if key not in averages}
-    left_out["averages of weights (EMA)"] = len(averages)
-    holder = None if found is content else content
-    return Unwrapped(state, holder, {what: count for what, count in left_out.items() if count})
+    left_out: dict[str, int] = {}
+    if len(weights) < len(entries):
+        left_out["entries that are no tensors"] = len(entries) - len(weights)
+    if _has_dotted_key(weights):
+        counters = [key for key, value in weights.items() if _is_counter(key, value=value)]
+        if counters:
+            left_out["counters"] = len(counters)
+        for key in counters:
+            del weights[key]
+    state = _unwrap_keys(weights)
+    averages: set[str] = set()
+    for key in state:
+        name_of_average = _AVERAGED + key.replace(".", "_")
+        if name_of_average in state:
+            averages.add(name_of_average)
+    if averages:
+        left_out["averages of weights (EMA)"] = len(averages)
+    for key in averages:
+        del state[key]
+    holder = None if entries is content else content
+    return Unwrapped(state=state, holder=holder, left_out=left_out)
 
 
-def _find(content: Any, depth: int) -> Mapping[str, Any] | None:
-    """Return the state dict in nested wrappers, or None."""
+def _select_tensors(entries: Mapping[str, Any]) -> dict[str, Tensor]:
+    """Select the tensors of a state dict.
+
+    Raises:
+        UnfitError: If a tensor is sparse, quantized or without values.
+    """
+    tensors: dict[str, Tensor] = {}
+    for key, value in entries.items():
+        if not isinstance(value, Tensor):
+            continue
+        is_dense = value.layout is torch.strided
+        if not is_dense or value.is_quantized or value.is_meta:
+            raise UnfitError(f"holds no state dict of plain tensors: {key!r:.80} is another kind")
+        tensors[key] = value
+    return tensors
+
+
+def _describe_contents(content: Any) -> str:
+    """Message about contents without weights."""
+    if not isinstance(content, Mapping):
+        keys = f"is a {type(content).__name__}"
+    else:
+        names = [key for key in content if isinstance(key, str)]
+        keys = f"has the keys {names[:_MAX_KEYS_SHOWN]!r:.300}" if names else "has no key"
+    return (
+        f"holds no state dict of tensors: it {keys}, and weights lie in it as they are, or "
+        f"under {', '.join(WRAPPERS)}: give a training checkpoint"
+    )
+
+
+def _find_state(content: Any, depth: int) -> Mapping[str, Any] | None:
+    """Find the state dict in nested wrappers; None if there is none.
+
+    Args:
+        content: Contents of a file or of a wrapper.
+        depth: Number of wrappers around ``content``.
+    """
     if not isinstance(content, Mapping) or depth > _DEEPEST:
         return None
     for name in WRAPPERS:
-        if isinstance(content.get(name), Mapping) and (found := _find(content[name], depth + 1)):
-            return found
+        if isinstance(content.get(name), Mapping):
+            state = _find_state(content[name], depth=depth + 1)
+            if state:
+                return state
     if _is_state(content):
         return content
-    states = [value for value in content.values() if _is_state(value) and _is_dotted(value)]
+    states: list[Mapping[str, Any]] = []
+    for value in content.values():
+        if _is_state(value) and _has_dotted_key(value):
+            states.append(value)
     return states[0] if len(states) == 1 else None
 
 
 def _is_state(value: Any) -> bool:
-    """Whether a value maps texts to tensors, and maybe to other things that are no mappings."""
-    if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
+    """Whether a value is a mapping from strings to tensors, and to no other mappings."""
+    if not isinstance(value, Mapping):
         return False
-    has_mapping = any(isinstance(entry, Mapping) for entry in value.values())
-    return not has_mapping and any(isinstance(entry, Tensor) for entry in value.values())
+    has_tensor = False
+    for key, entry in value.items():
+        if not isinstance(key, str) or isinstance(entry, Mapping):
+            return False
+        has_tensor = has_tensor or isinstance(entry, Tensor)
+    return has_tensor
 
 
-def _is_dotted(value: Mapping[str, Any]) -> bool:
-    """Whether the keys are those of a model's parts."""
-    return any("." in key for key in value)
+def _has_dotted_key(state: Mapping[str, Any]) -> bool:
+    """Whether a key contains a dot, as the keys of a model's submodules do."""
+    return any("." in key for key in state)
 
 
 def _is_counter(key: str, value: Tensor) -> bool:
-    """Whether an entry is one number beside the parts of a model."""
+    """Whether an entry is a single number that belongs to no submodule."""
     return "." not in key and not key.startswith(_AVERAGED) and value.numel() == 1
 
 
-def _is_plain(value: Tensor) -> bool:
-    """Whether a tensor has plain values that can be a weight's."""
-    return value.layout is torch.strided and not (value.is_quantized or value.is_meta)
-
-
 def _require_stored(weights: Iterable[Tensor]) -> None:
-    """Refuse tensors that repeat few stored values until they fill all memory.
+    """Refuse expanded tensors, which repeat few stored values and would fill the memory.
 
     Raises:
-        UnfitError: If they do.
+        UnfitError: If the tensors have many more bytes than their storages.
     """
-    stored: dict[int, int] = {}
+    bytes_by_storage: dict[int, int] = {}
     total = 0
     for value in weights:
         storage = value.untyped_storage()
-        stored[storage.data_ptr()] = storage.nbytes()
+        bytes_by_storage[storage.data_ptr()] = storage.nbytes()
         total += value.numel() * value.element_size()
-    if total > _MOST_REPEATED * sum(stored.values()) + _SPARE_BYTES:
+    stored = sum(bytes_by_storage.values())
+    if total > _MOST_REPEATED * stored + _SPARE_BYTES:
         raise UnfitError(
-            f"repeats {sum(stored.values())} bytes of weights until they are {total}: save it with "
+            f"repeats {stored} bytes of weights until they are {total}: save it with "
             "its tensors cloned"
         )
 
 
-def _plain_keys(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return weights by keys without the prefixes of wrappers."""
-    names = {key: _without_parts(key) for key in weights}
-    while prefix := next((p for p in _OUTER if all(n.startswith(p) for n in names.values())), None):
-        if not names:
-            break
-        names = {key: _without_parts(name.removeprefix(prefix)) for key, name in names.items()}
+def _unwrap_keys(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Remove prefixes and parts of wrappers from the keys of weights.
+
+    Raises:
+        UnfitError: If two keys become equal.
+    """
+    names = list(map(_remove_wrapper_parts, weights))
+    prefix = _common_prefix(names)
+    while prefix:
+        names = [_remove_wrapper_parts(name.removeprefix(prefix)) for name in names]
+        prefix = _common_prefix(names)
     state: dict[str, Tensor] = {}
-    for key, value in weights.items():
-        if names[key] in state:
-            raise UnfitError(
-                f"holds two weights under {names[key]!r:.80}, with and without a prefix"
-            )
-        state[names[key]] = value
+    for name, value in zip(names, weights.values(), strict=True):
+        if name in state:
+            raise UnfitError(f"holds two weights under {name!r:.80}, with and without a prefix")
+        state[name] = value
     return state
 
 
-def _without_parts(key: str) -> str:
-    """Return a key without the parts of wrappers of modules."""
-    parts = [part for part in key.split(".") if part not in _INNER]
+def _common_prefix(names: Sequence[str]) -> str:
+    """First prefix of a module around the model that all names start with; empty if none."""
+    for prefix in _OUTER_PREFIXES:
+        if names and all(name.startswith(prefix) for name in names):
+            return prefix
+    return ""
+
+
+def _remove_wrapper_parts(key: str) -> str:
+    """Remove the parts of a key that wrappers of modules add."""
+    parts = [part for part in key.split(".") if part not in _WRAPPER_PARTS]
     name = ".".join(parts)
-    while name.startswith(_PARALLEL):
-        name = name.removeprefix(_PARALLEL)
+    while name.startswith(_PARALLEL_PREFIX):
+        name = name.removeprefix(_PARALLEL_PREFIX)
     return name

@@ -13,7 +13,7 @@ from mmengine.optim import OptimWrapper
 from mmengine.runner import BaseLoop, CheckpointLoader, EpochBasedTrainLoop, Runner
 from mmengine.runner import checkpoint as mmengine_checkpoint
 
-from gsmap.checkpoints.convert import listed
+from gsmap.checkpoints.convert import summarize_names
 from gsmap.checkpoints.published import load_from_file, load_from_torchvision, load_published
 from gsmap.checkpoints.reading import refusing
 from gsmap.checkpoints.safe_globals import mmengine_globals
@@ -138,7 +138,7 @@ class AtomicCheckpointHook(CheckpointHook):
         broken = [key for key, value in state.items() if not bool(value.isfinite().all())]
         if broken:
             raise NotFiniteError(
-                f"weights are NaN or infinite ({listed(broken)}), so they are not saved."
+                f"weights are NaN or infinite ({summarize_names(broken)}), so they are not saved."
             )
         settings = plain(runner.cfg.model.to_dict())
         checkpoint["meta"][MODEL_SETTINGS] = json.dumps(settings)
