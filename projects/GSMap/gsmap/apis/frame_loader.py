@@ -1,4 +1,4 @@
-"""Frames for inference: absent cameras are blank, and broken frames set apart."""
+"""Frames for inference, with blank images for absent cameras, and separate broken frames."""
 
 import copy
 import errno
@@ -17,12 +17,17 @@ from gsmap.utils.errors import InputError
 if TYPE_CHECKING:
     from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
 
-_LACKS = {errno.EMFILE, errno.ENFILE, errno.ENOMEM}  # open files and memory
+_LACK_OF_RESOURCES = {errno.EMFILE, errno.ENFILE, errno.ENOMEM}  # open files and memory
 
 
 @dataclass(frozen=True)
 class BrokenFrame:
-    """A frame that cannot be used, and why, with the file's name."""
+    """A frame that cannot be used.
+
+    Attributes:
+        token: Token of the sample.
+        reason: Message of the error, with the name of the file.
+    """
 
     token: str
     reason: str
@@ -30,12 +35,12 @@ class BrokenFrame:
 
 @dataclass(eq=False)
 class FrameDataset(Dataset):
-    """Frames of a test data set, or what is wrong with them.
+    """Frames of a test data set; errors of a frame become a `BrokenFrame`.
 
     Args:
-        dataset: The data set; its ``cameras`` say which ones the model expects.
-        blank_cameras: Whether a camera that a frame lacks is there, but sees nothing, as long as
-            the frame has another one; else the frame is broken.
+        dataset: The data set; the model expects its ``cameras``.
+        blank_cameras: Whether absent cameras of a frame get black images, as long as the frame has
+            another camera. Otherwise such a frame is broken.
     """
 
     dataset: "VectorizedMapDataset"
@@ -46,52 +51,91 @@ class FrameDataset(Dataset):
 
     def __getitem__(self, row: int) -> dict[str, Any] | BrokenFrame:
         try:
-            return self._frame(row)
+            return self._load(row)
         except (ValueError, OSError) as error:
-            if isinstance(error, OSError) and error.errno in _LACKS:
-                raise  # no frame is to blame
-            return BrokenFrame(self.dataset.sample(row).token, str(error))
+            if isinstance(error, OSError) and error.errno in _LACK_OF_RESOURCES:
+                raise  # a fault of the machine, not of the frame
+            return BrokenFrame(token=self.dataset.sample(row).token, reason=str(error))
 
-    def _frame(self, row: int) -> dict[str, Any]:
-        """Return what the pipeline packs, with the cameras that the model expects."""
-        wanted, sample = self.dataset.cameras, self.dataset.sample(row)
+    def _load(self, row: int) -> dict[str, Any]:
+        """Load a sample by the pipeline, with all cameras that the model expects.
+
+        Args:
+            row: Index of the sample.
+
+        Raises:
+            ValueError: If cameras are absent and ``blank_cameras`` does not allow it.
+        """
+        cameras = self.dataset.cameras
+        sample = self.dataset.sample(row)
         present = {camera.name for camera in sample.cameras}
-        absent = [name for name in wanted or () if name not in present]
-        if not wanted or not absent:
+        absent = [name for name in cameras or () if name not in present]
+        if not cameras or not absent:
             return self.dataset[row]
-        if not self.blank_cameras or len(absent) == len(wanted):
+        if not self.blank_cameras or len(absent) == len(cameras):
             raise InputError(
                 f"sample {sample.token!r} lacks the cameras {absent}, which the model expects; it "
                 f"has {sorted(present)}. With --allow-missing-cameras (allow_missing_cameras=True) "
                 "absent ones are left blank, as long as one is there."
             )
-        partial = copy.copy(self.dataset)
-        partial.cameras = tuple(name for name in wanted if name in present)
-        return _with_blank_cameras(partial[row], wanted)
+        partial_dataset = copy.copy(self.dataset)
+        partial_dataset.cameras = tuple(name for name in cameras if name in present)
+        return _add_blank_cameras(partial_dataset[row], cameras=cameras)
 
 
 def collate(items: Sequence[dict[str, Any] | BrokenFrame]) -> tuple[Any, list[BrokenFrame]]:
-    """Put frames into one batch, None if there is none, and name the broken ones."""
-    broken = [item for item in items if isinstance(item, BrokenFrame)]
-    good = [item for item in items if not isinstance(item, BrokenFrame)]
-    return (pseudo_collate(good) if good else None), broken
+    """Collate frames to a batch.
+
+    Args:
+        items: Frames of a `FrameDataset`.
+
+    Returns:
+        The batch of the usable frames, or None if there is none, and the broken frames.
+    """
+    broken: list[BrokenFrame] = []
+    usable: list[dict[str, Any]] = []
+    for item in items:
+        if isinstance(item, BrokenFrame):
+            broken.append(item)
+        else:
+            usable.append(item)
+    batch = pseudo_collate(usable) if usable else None
+    return batch, broken
 
 
-def _with_blank_cameras(item: dict[str, Any], wanted: Sequence[str]) -> dict[str, Any]:
-    """Return an item with all wanted cameras; ``img_path`` is None for the blank ones."""
+def _add_blank_cameras(item: dict[str, Any], cameras: Sequence[str]) -> dict[str, Any]:
+    """Add black images for the absent cameras of a loaded sample.
+
+    Args:
+        item: Inputs and data sample of the pipeline. Images have shape (V present, 3, H, W).
+        cameras: Names of all cameras, in the order of the result.
+
+    Returns:
+        The item with images (V, 3, H, W) and matrices (V, 4, 4) of all cameras. ``img_path`` is
+        None for an absent one.
+    """
     sample = item["data_samples"].clone()
     meta = sample.metainfo
-    position = {name: index for index, name in enumerate(meta["cam_names"])}
-    order = [position.get(name) for name in wanted]
-    images = item["inputs"]["img"]  # (V present, 3, H, W)
-    stacked = torch.stack([torch.zeros_like(images[0]) if i is None else images[i] for i in order])
-    blank = {"cam2img": meta["cam2img"][0], "img_aug_matrix": meta["img_aug_matrix"][0]}
-    blank["lidar2cam"] = OUT_OF_SIGHT
-    blank["lidar2img"] = blank["img_aug_matrix"] @ blank["cam2img"] @ OUT_OF_SIGHT
-    changed = {
-        key: np.stack([value if i is None else meta[key][i] for i in order])
-        for key, value in blank.items()
+    images = item["inputs"]["img"]
+    intrinsics = meta["cam2img"][0]
+    augmentation = meta["img_aug_matrix"][0]
+    blank_matrices = {
+        "cam2img": intrinsics,
+        "img_aug_matrix": augmentation,
+        "lidar2cam": OUT_OF_SIGHT,
+        "lidar2img": augmentation @ intrinsics @ OUT_OF_SIGHT,
     }
-    paths = [None if i is None else meta["img_path"][i] for i in order]
-    sample.set_metainfo({**changed, "img_path": paths, "cam_names": list(wanted)})
-    return {"inputs": {**item["inputs"], "img": stacked}, "data_samples": sample}
+    position = {name: index for index, name in enumerate(meta["cam_names"])}
+    all_images: list[torch.Tensor] = []
+    all_paths: list[Any] = []
+    all_matrices: dict[str, list[np.ndarray]] = {key: [] for key in blank_matrices}
+    for name in cameras:
+        index = position.get(name)
+        all_images.append(torch.zeros_like(images[0]) if index is None else images[index])
+        all_paths.append(None if index is None else meta["img_path"][index])
+        for key, blank_matrix in blank_matrices.items():
+            all_matrices[key].append(blank_matrix if index is None else meta[key][index])
+    stacked_matrices = {key: np.stack(matrices) for key, matrices in all_matrices.items()}
+    sample.set_metainfo({**stacked_matrices, "img_path": all_paths, "cam_names": list(cameras)})
+    inputs = {**item["inputs"], "img": torch.stack(all_images)}
+    return {"inputs": inputs, "data_samples": sample}

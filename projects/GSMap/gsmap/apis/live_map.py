@@ -1,4 +1,4 @@
-"""A trained model on the cameras of one vehicle, whose images come frame by frame."""
+"""A trained model on the cameras of one vehicle, frame by frame."""
 
 import logging
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ from gsmap.structures.streams import Frame, MapStream
 from gsmap.utils.errors import InputError
 
 _LOGGER = logging.getLogger(__name__)
-_ALONE = Frame("in memory", "", 0, np.eye(4))
+_SINGLE_FRAME = Frame(token="in memory", scene="", timestamp_ns=0, pose=np.eye(4))
 
 if TYPE_CHECKING:
     from mmdet3d.structures import Det3DDataSample
@@ -27,39 +27,46 @@ if TYPE_CHECKING:
 
 
 class Predictor(Protocol):
-    """What a `LiveMap` needs of the `MapInferencer` that makes it."""
+    """Interface of `MapInferencer` that a `LiveMap` uses."""
 
     cfg: Config
-    model: Any  # with its ``mount``
+    model: Any  # of `load_model`
 
     def dataset(self, source: Source) -> "VectorizedMapDataset":
-        """Open samples as the config's test data set."""
+        """Open samples as the test data set of the config."""
 
     def predict(
         self, dataset: "VectorizedMapDataset", *, allow_missing_cameras: bool, stream: Any
     ) -> "Iterator[Det3DDataSample]":
-        """Run the model on the samples of a data set."""
+        """Predict the samples of a data set.
+
+        Args:
+            dataset: From ``dataset``.
+            allow_missing_cameras: Whether cameras of the model may be absent.
+            stream: Drive that the samples continue, or None.
+        """
 
     def elements(self, data_sample: "Det3DDataSample") -> MapElements:
-        """Return a predicted sample's map."""
+        """Map elements of a predicted sample."""
 
 
 class LiveMap:
-    """The map around a vehicle, frame by frame, from images in memory.
+    """Predictor of the map around a vehicle, from images in memory.
 
-    ``MapInferencer.live`` makes it. The calibration is fitted to the model once, with the first
-    frame. Nothing else is kept from one to the next: a model with memory (``temporal``) keeps what
-    it remembers in the caller's stream, and without one sees each frame as a first one.
+    Use ``MapInferencer.live`` to create it. The calibration is prepared at the first frame, and
+    again if an image size changes. Frames are independent of each other unless a stream is given:
+    it has the memory of a model with ``temporal``.
 
     Args:
         inferencer: The trained model.
-        intrinsics: By the cameras' names, or as a list: pinhole matrices, in pixels. each (3, 3)
-        cam_from_frame: In the same form: from the frame to the camera (x right, y down, z ahead),
-            in metres. each (4, 4)
+        intrinsics: Pinhole matrix of each camera in pixels, by name or as a list. (3, 3) each
+        cam_from_frame: Transform from the frame to each camera (x right, y down, z ahead) in
+            metres, by name or as a list. (4, 4) each
         frame: ``vehicle`` (x ahead, y left, on the road below the rear axle), or an annotation
             frame: ``lidar`` (x right, y ahead, at a roof LiDAR) or ``ego`` (x ahead, y left, at the
-            rear axle); the config's by default. The model's own frame lies where it lay in
-            training, the other one where nuScenes and Argoverse 2 have it.
+            rear axle). By default the frame of the config. The annotation frame of the model has
+            the pose of the training data on the vehicle; the other one has the usual pose of
+            nuScenes and Argoverse 2.
         allow_missing_cameras: Whether cameras of the model may be absent.
     """
 
@@ -73,11 +80,12 @@ class LiveMap:
     ):
         self._inferencer = inferencer
         self._config = inferencer.cfg.test_dataloader.dataset
-        self._rig = intrinsics, cam_from_frame
+        self._intrinsics = intrinsics
+        self._cam_from_frame = cam_from_frame
         self._frame = frame or self._config.get("frame") or "lidar"
         self._allow_missing_cameras = allow_missing_cameras
         self._sizes: dict[str, tuple[int, ...]] = {}
-        self._said: set[str] = set()
+        self._logged_warnings: set[str] = set()
         self._dataset: VectorizedMapDataset
 
     def __call__(
@@ -87,9 +95,24 @@ class LiveMap:
         at: Frame | None = None,
         stream: MapStream | None = None,
     ) -> MapElements:
-        """Return the map elements of one frame, in the frame of the calibration, as `predict`."""
-        found = self._inferencer.elements(self.predict(images, can_bus, at, stream))
-        return found.to_frame(self._frame_from_models)
+        """Predict the map elements of one frame.
+
+        Args:
+            images: Images of the cameras, as `predict` takes them. (H, W, 3) each
+            can_bus: Vehicle signals, as `predict` takes them. (18,)
+            at: Name, scene, time and pose of the frame, if there is a stream.
+            stream: Drive that the frame continues.
+
+        Returns:
+            The elements in the frame of the calibration, in metres.
+
+        Raises:
+            TypeError: As `predict`.
+            ValueError: As `predict`.
+        """
+        data_sample = self.predict(images, can_bus=can_bus, at=at, stream=stream)
+        elements = self._inferencer.elements(data_sample)
+        return elements.to_frame(self._calibration_from_model)
 
     def predict(
         self,
@@ -98,26 +121,27 @@ class LiveMap:
         at: Frame | None = None,
         stream: MapStream | None = None,
     ) -> "Det3DDataSample":
-        """Run the model on one frame.
+        """Predict one frame.
 
         Args:
-            images: RGB, uint8, at about the size that the model was trained on. each (H, W, 3)
-            can_bus: Signals of the vehicle, as `motion_signals` makes them of poses; models that
-                were trained with signals see a standing vehicle without. (18,)
-            at: With a stream, the frame's name, scene, time and pose, the latter from the frame of
-                the calibration to the world.
-            stream: With a model that remembers, the drive that the frame continues
-                (``MapInferencer.new_stream``).
+            images: RGB images of the cameras in uint8, by name or as a list, of about the size of
+                the training images. (H, W, 3) each
+            can_bus: Vehicle signals, as `motion_signals` computes them from poses. Without them, a
+                model that was trained with signals assumes a standing vehicle. (18,)
+            at: Name, scene, time and pose of the frame, if there is a stream. The pose is the
+                transform from the frame of the calibration to the world, in metres.
+            stream: Drive that the frame continues (``MapInferencer.new_stream``), for a model with
+                memory.
 
         Returns:
-            The sample, with ``pred_instances_3d`` on the CPU in the frame of the config.
+            The sample with ``pred_instances_3d`` on the CPU, in the annotation frame of the config.
 
         Raises:
             TypeError: If an image is not uint8.
-            ValueError: If an array has another shape, a matrix is none of its kind, a signal is not
-                finite, the cameras of the arguments differ, or they are not those of the model; if
-                only one of ``at`` and ``stream`` is given, the model has no memory for them, or the
-                frame does not follow the stream's last.
+            ValueError: If an array has another shape, a matrix is not a valid intrinsic matrix or
+                pose, or a signal is not finite; if the cameras of the arguments differ from each
+                other or from the model's; if only one of ``at`` and ``stream`` is given, the model
+                has no memory, or the frame is not later than the last frame of the stream.
         """
         if (at is None) != (stream is None):
             raise InputError(
@@ -129,42 +153,55 @@ class LiveMap:
         pixels = bgr_by_name(images)
         sizes = {name: image.shape for name, image in pixels.items()}
         if sizes != self._sizes:
-            self._open(pixels)
+            self._prepare(pixels)
             self._sizes = sizes
         self._dataset.images_in_memory = pixels
-        self._dataset.can_bus_in_memory = None if can_bus is None else np.asarray(can_bus, float)
-        frame = None if self._inferencer.model.temporal is None else _ALONE
+        signals = None if can_bus is None else np.asarray(can_bus, float)
+        self._dataset.can_bus_in_memory = signals
+        frame = None if self._inferencer.model.temporal is None else _SINGLE_FRAME
         if at is not None:
-            frame = replace(at, pose=at.pose @ self._frame_from_models)
+            frame = replace(at, pose=at.pose @ self._calibration_from_model)
         self._dataset.frame_in_memory = frame
-        allowed = self._allow_missing_cameras
-        (found,) = self._inferencer.predict(
-            self._dataset, allow_missing_cameras=allowed, stream=stream
+        (data_sample,) = self._inferencer.predict(
+            self._dataset, allow_missing_cameras=self._allow_missing_cameras, stream=stream
         )
-        return found
+        return data_sample
 
-    def _open(self, pixels: dict[str, np.ndarray]) -> None:
-        """Check the calibration, and make a data set of one sample that has it."""
+    def _prepare(self, pixels: dict[str, np.ndarray]) -> None:
+        """Check the calibration, and create a data set of one sample with it.
+
+        Args:
+            pixels: BGR images by the name of the camera. (H, W, 3) each
+        """
         mount = self._inferencer.model.mount
-        own = mount if self._frame == mount.frame else None
-        source = source_in_memory(pixels, *self._rig, self._frame, own)
+        source = source_in_memory(
+            pixels,
+            intrinsics=self._intrinsics,
+            cam_from_frame=self._cam_from_frame,
+            frame=self._frame,
+            mount=mount if self._frame == mount.frame else None,
+        )
         for line in calibration_warnings(source.samples, source.frame, source.ground_z_m):
-            if line not in self._said:
+            if line not in self._logged_warnings:
                 _LOGGER.warning("calibration: %s", line)
-                self._said.add(line)
-        foreign = set(pixels) - set(self._config.get("cameras") or pixels)
-        if foreign and foreign != set(pixels):
+                self._logged_warnings.add(line)
+        unknown = set(pixels) - set(self._config.get("cameras") or pixels)
+        if unknown and unknown != set(pixels):
             raise InputError(
                 f"the model has the cameras {list(self._config.cameras)}, but not "
-                f"{sorted(foreign)}: name all cameras as it does, or none."
+                f"{sorted(unknown)}: name all cameras as it does, or none."
             )
-        self._dataset = dataset = self._inferencer.dataset(source)
-        Path(dataset.ann_file).unlink()  # it is read, and a rig may be opened often
-        ground_from_given = np.eye(4)
+        dataset = self._inferencer.dataset(source)
+        Path(dataset.ann_file).unlink()  # already read; image sizes may change many times
+        ground_from_calibration = np.eye(4)
         if self._frame != VEHICLE:
-            ground_from_given = ground_from_frame(
-                source.samples[0], source.frame, source.ground_z_m
+            ground_from_calibration = ground_from_frame(
+                source.samples[0], frame=source.frame, ground_z_m=source.ground_z_m
             )
-        meta = dataset.metainfo
-        ground_from_models = ground_from_frame(dataset.sample(0), meta["frame"], meta["ground_z_m"])
-        self._frame_from_models = invert_rigid(ground_from_given) @ ground_from_models
+        ground_from_model = ground_from_frame(
+            dataset.sample(0),
+            frame=dataset.metainfo["frame"],
+            ground_z_m=dataset.metainfo["ground_z_m"],
+        )
+        self._dataset = dataset
+        self._calibration_from_model = invert_rigid(ground_from_calibration) @ ground_from_model

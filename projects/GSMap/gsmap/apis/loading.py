@@ -1,4 +1,4 @@
-"""A trained model by its name, or by its config and checkpoint."""
+"""Trained models by name, or by config and checkpoint."""
 
 import logging
 from collections.abc import Mapping
@@ -21,8 +21,10 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.model_facts import MOUNT, RIG
 
 _LOGGER = logging.getLogger(__name__)
-_USUAL = ("nuscenes", "minicity", "av2")  # data sets whose frames lie where the usual ones do
-_FARTHEST_M, _LARGEST_PX = 100.0, 1e5
+_USUAL_DATASETS = ("nuscenes", "minicity", "av2")  # data sets with the usual mount of a frame
+_FARTHEST_M = 100.0
+_HIGHEST_M = 10.0
+_LARGEST_PX = 1e5
 
 
 def load_model(
@@ -31,20 +33,23 @@ def load_model(
     device: str | torch.device = "cpu",
     cfg_options: dict | None = None,
 ) -> Any:
-    """Build a model and load its weights, ready to predict.
+    """Build a model and load its weights for prediction.
 
     Args:
         config: Config file, a ``Config``, or the name of a model (``list_models``).
-        checkpoint: File or name. None means the named model's; without a name, initial weights.
-        device: Where the model is.
+        checkpoint: File of the weights, or name of a model. None selects the weights of the model
+            that ``config`` names, or initial weights if it names no model.
+        device: Device of the model.
         cfg_options: Overrides of the config, by dotted name.
 
     Returns:
-        The torch module, in evaluation mode; ``model.cfg`` is its config, as it was trained,
-        ``model.mount`` the place of its annotation frame in the vehicle that it was trained on,
-        ``model.rig`` its cameras (width, height, fx, fy, cx, cy in pixels, by name), ``model.seen``
-        the data set, as far as it is known, and ``model.without_signals`` whether
-        that is known to have had none of the vehicle's signals.
+        The model in evaluation mode, with these additional attributes:
+
+        * ``cfg``: Its config, with the settings of its training.
+        * ``mount``: Pose of its annotation frame on the vehicle of the training data.
+        * ``rig``: Cameras of the training data by name: width, height, fx, fy, cx, cy in pixels.
+        * ``training_dataset``: Name of the training's data set; empty if unknown.
+        * ``without_signals``: Whether the training data is known to lack vehicle signals.
 
     Raises:
         FileNotFoundError: If the config or the checkpoint does not exist.
@@ -53,65 +58,93 @@ def load_model(
     cfg = read_config(config, cfg_options)
     if checkpoint is None and str(config) in named_models():
         checkpoint = str(config)
-    read = None if checkpoint is None else read_checked(checkpoint)
+    contents = None if checkpoint is None else read_checked(checkpoint)
     with building(cfg):
         if checkpoint is not None:
-            for line in adopt_settings(cfg, checkpoint, cfg_options, read):
+            for line in adopt_settings(
+                cfg, path=checkpoint, cfg_options=cfg_options, checkpoint=contents
+            ):
                 _LOGGER.warning(line)
         model = MODELS.build(cfg.model)
     if checkpoint is not None:
-        load_weights(model, checkpoint, read)
+        load_weights(model, path=checkpoint, checkpoint=contents)
     model.cfg = cfg
-    model.mount = _mount_of(cfg, read, checkpoint)
-    # of checkpoints that say how they were trained
-    model.without_signals = bool(read and read.settings is not None and not read.can_bus)
-    model.seen = _seen_by(read, checkpoint)
-    model.rig = {} if read is None else trained_rig(read)
+    model.mount = _training_mount(cfg, contents=contents, path=checkpoint)
+    model.without_signals = False
+    if contents is not None and contents.settings is not None:  # older files do not record signals
+        model.without_signals = not contents.can_bus
+    model.training_dataset = _training_dataset(contents, name=checkpoint)
+    model.rig = {} if contents is None else trained_rig(contents)
     if model.temporal is not None:
         model.temporal.name = f"{cfg.filename or 'a config'} with {checkpoint or 'initial weights'}"
     return model.to(device).eval()
 
 
-def trained_rig(read: Checkpoint) -> dict[str, tuple[float, ...]]:
-    """Return width, height, fx, fy, cx and cy of the cameras of a model's training, by name.
+def trained_rig(checkpoint: Checkpoint) -> dict[str, tuple[float, ...]]:
+    """Cameras of the training data of a model.
 
-    What is no such camera is left out: it is a stranger's word, and only spoils a picture.
+    Values that are not valid are left out without an error: only pictures depend on them.
+
+    Args:
+        checkpoint: Contents of the checkpoint.
+
+    Returns:
+        Width, height, fx, fy, cx and cy in pixels, by the name of the camera.
     """
-    said = read.dataset_meta.get(RIG)
-    found = {}
-    for name, values in said.items() if isinstance(said, Mapping) else ():
-        numbers = values if isinstance(values, list | tuple) else ()
-        if len(numbers) != 6 or not all(isinstance(v, int | float) for v in numbers):
+    rig = checkpoint.dataset_meta.get(RIG)
+    cameras: dict[str, tuple[float, ...]] = {}
+    if not isinstance(rig, Mapping):
+        return cameras
+    for name, numbers in rig.items():
+        if not isinstance(numbers, list | tuple) or len(numbers) != 6:
             continue
-        if all(0 < v < _LARGEST_PX for v in numbers[:4]) and np.isfinite(numbers).all():
-            found[str(name)] = tuple(float(v) for v in numbers)
-    return found
+        if not all(isinstance(number, int | float) for number in numbers):
+            continue
+        lengths = numbers[:4]  # all but the principal point
+        if all(0 < length < _LARGEST_PX for length in lengths) and np.isfinite(numbers).all():
+            cameras[str(name)] = tuple(map(float, numbers))
+    return cameras
 
 
-def _seen_by(read: Checkpoint | None, checkpoint: object) -> str:
-    """Return the data set that a model was trained on; the models that ship saw MiniCity."""
-    if read is None:
+def _training_dataset(contents: Checkpoint | None, name: object) -> str:
+    """Name of the data set that a model was trained on; empty if unknown.
+
+    Args:
+        contents: Contents of the checkpoint; None for initial weights.
+        name: Path of the checkpoint, or name of a model. Models that ship are trained on MiniCity.
+    """
+    if contents is None:
         return ""
-    model = named_models().get(str(checkpoint))
-    usual = "minicity" if model is not None and not model.address else ""
-    return str(read.dataset_meta.get("dataset", usual))
+    model = named_models().get(str(name))
+    default = "minicity" if model is not None and not model.address else ""
+    return str(contents.dataset_meta.get("dataset", default))
 
 
-def _mount_of(cfg: Config, read: Checkpoint | None, path: object) -> Mount:
-    """Return where a model's frame lies in the vehicle: as its checkpoint says, or as is usual.
+def _training_mount(cfg: Config, contents: Checkpoint | None, path: object) -> Mount:
+    """Pose of a model's annotation frame on the vehicle of its training data.
+
+    Args:
+        cfg: Config of the model.
+        contents: Contents of the checkpoint; None for initial weights.
+        path: Path of the checkpoint, for messages.
+
+    Returns:
+        The mount in the checkpoint, or the usual one if the checkpoint has none.
 
     Raises:
-        ValueError: If the checkpoint says what cannot be.
+        ValueError: If the mount in the checkpoint is not possible on a vehicle.
     """
     options = cfg.test_dataloader.dataset
     frame = options.get("frame") or "lidar"
-    said = read.dataset_meta if read else {}
-    if said.get("frame", frame) != frame or frame not in RANGES:
+    meta = contents.dataset_meta if contents else {}
+    if meta.get("frame", frame) != frame or frame not in RANGES:
         return Mount(frame)
-    height, matrix = said.get("ground_z_m"), said.get(MOUNT)
-    height = options.get("ground_z_m") if height is None else height
+    height = meta.get("ground_z_m")
+    if height is None:
+        height = options.get("ground_z_m")
+    matrix = meta.get(MOUNT)
     if height is None and matrix is None:
-        if said.get("dataset", _USUAL[0]) not in _USUAL:
+        if meta.get("dataset", _USUAL_DATASETS[0]) not in _USUAL_DATASETS:
             _LOGGER.warning(
                 "%s does not say how high its frame %r lies above the road (train it on files with "
                 "ground_z_m or ego_from_frame): the usual %.2f m are taken.",
@@ -119,13 +152,27 @@ def _mount_of(cfg: Config, read: Checkpoint | None, path: object) -> Mount:
             )  # fmt: skip
         return Mount(frame)
     try:
-        place = None if matrix is None else np.array(matrix, np.float64)
-        height = None if height is None else float(height)
-        bounded = place is None or (place.shape == (4, 4) and abs(place).max() < _FARTHEST_M)
-        if not bounded or not (place is None or is_rigid(place)) or abs(height or 0.0) > 10:
-            raise InputError("no place on a vehicle")
+        height = None if height is None else _check_height(height)
+        matrix = None if matrix is None else _check_mount(matrix)
     except (TypeError, ValueError) as error:
         raise InputError(
             f"{path} was not loaded: where its frame lies in the vehicle makes no sense ({error})."
         ) from error
-    return Mount(frame, height, place)
+    return Mount(frame, ground_z_m=height, ground_from_frame=matrix)
+
+
+def _check_height(value: Any) -> float:
+    """Convert a height of the ground in a file to metres; ValueError if it is not possible."""
+    height = float(value)
+    if abs(height) > _HIGHEST_M:
+        raise InputError("no place on a vehicle")
+    return height
+
+
+def _check_mount(value: Any) -> np.ndarray:
+    """Convert a pose in a file to a matrix (4, 4); ValueError if it is not possible."""
+    matrix = np.array(value, np.float64)
+    is_near = matrix.shape == (4, 4) and abs(matrix).max() < _FARTHEST_M
+    if not is_near or not is_rigid(matrix):
+        raise InputError("no place on a vehicle")
+    return matrix

@@ -131,7 +131,7 @@ class MapInferencer:
     ):
         self.model = load_model(config, checkpoint, cfg_options=cfg_options)
         self.cfg: Config = self.model.cfg
-        self._generated = self.model.seen == _GENERATED
+        self._generated = self.model.training_dataset == _GENERATED
         device = device or ("cuda" if torch.cuda.is_available() else "cpu")
         names = [device] if isinstance(device, str | torch.device) else list(device)
         self.devices = [torch.device(name) for name in names]

@@ -1,9 +1,9 @@
-"""Predictions on their way to a result file: what a killed run goes on from."""
+"""Log of predictions, from which an interrupted run continues."""
 
 import io
 import json
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,23 +15,23 @@ _SUFFIX = ".unfinished"
 
 
 class ResultLog:
-    """A file ``OUT.unfinished`` with one line a frame, which becomes ``OUT`` when all are there.
+    """File ``OUT.unfinished`` with one line per frame, which becomes ``OUT`` when it is complete.
 
-    A context manager. It takes up what another run with the same settings has left.
+    A context manager. The frames of an interrupted run with equal settings are reused.
 
     Args:
         out: The result file.
-        settings: What decides the predictions, as plain values.
-        tokens: The frames of the run; by default any may be in the file.
-        classes: Classes of the model; by default any may be in the file.
+        settings: Settings that determine the predictions, as plain values.
+        tokens: Tokens of the frames of the run; None allows any in the file.
+        classes: Classes of the model; None allows any in the file.
 
     Raises:
-        RuntimeError: If another process is at work on the same result file.
-        ValueError: If ``OUT.unfinished`` is no such file, is damaged, or has other frames; it stays
-            as it is.
+        RuntimeError: If another process writes the same result file.
+        ValueError: If ``OUT.unfinished`` has another format, is damaged, or has other frames. The
+            file is not changed in this case.
 
     Attributes:
-        done: Tokens of the frames that need no more work.
+        done: Tokens of the finished frames.
         broken: Reason of each broken frame, by token.
         dropped: Number of frames of a run with other settings, which are not used.
     """
@@ -56,32 +56,40 @@ class ResultLog:
         self.out.parent.mkdir(parents=True, exist_ok=True)
         self._file = io.BufferedRandom(open_to_append(self.path))
         try:
-            held = f"another process writes {self.path}: wait for its end, or give another --out."
-            lock(self._file, held)
-            self._take_up()
+            lock(
+                self._file,
+                f"another process writes {self.path}: wait for its end, or give another --out.",
+            )
+            self._resume()
         except BaseException:
             self._file.close()
             raise
         return self
 
-    def _take_up(self) -> None:
-        """Note the frames that are there, and cut off what cannot be used."""
+    def _resume(self) -> None:
+        """Record the frames in the file, and cut off an incomplete line or frames of another run.
+
+        The first line has the settings, every other line a frame. A killed run may leave an
+        incomplete last line.
+        """
         self._file.seek(0)
-        head, end = self._file.readline(), 0
-        same = head == self._head.encode()
+        head = self._file.readline()
+        end = 0  # of the part that is kept, in bytes
+        same_settings = head == self._head.encode()
         if head.endswith(b"\n"):
-            self._require(isinstance(_value(head), dict), 1)
+            self._require(isinstance(_parse_line(head), dict), line_number=1)
             end = self._file.tell()
-        else:  # a kill cut the first line, if it is one of this file's
-            self._require(not head or head.startswith(b"{"), 1)
-        for number, line in enumerate(self._file if end else (), 2):
+        else:  # incomplete settings, or a file of another program
+            self._require(not head or head.startswith(b"{"), line_number=1)
+        frame_lines: Iterable[bytes] = self._file if end else ()
+        for line_number, line in enumerate(frame_lines, start=2):
             if not line.endswith(b"\n"):
-                break  # a kill cut the last line
-            frame = _value(line)
-            self._require(self._is_frame(frame, same), number)
-            self._note(frame)
+                break
+            frame = _parse_line(line)
+            self._require(self._is_frame(frame, same_settings), line_number=line_number)
+            self._record(frame)
             end += len(line)
-        if not same:
+        if not same_settings:
             self.dropped = len(self.done)
             self.done.clear()
             self.broken.clear()
@@ -92,83 +100,116 @@ class ResultLog:
                 self._file.write(self._head.encode())
             self._file.flush()
 
-    def _is_frame(self, frame: Any, same: bool) -> bool:
-        """Whether a line is a frame's, of this run if it is of the same settings, and no second."""
+    def _is_frame(self, frame: Any, same_settings: bool) -> bool:
+        """Whether the value of a line is a new frame of the run.
+
+        Args:
+            frame: Value of the line.
+            same_settings: Whether the settings of the file are those of the run; if not, frames of
+                any run are valid.
+        """
         if not isinstance(frame, dict) or not isinstance(frame.get("sample_token"), str):
             return False
-        token, vectors = frame["sample_token"], frame.get("vectors", [])
-        known = not same or self._tokens is None or token in self._tokens
-        reason_fits = isinstance(frame.get("broken", ""), str)
-        first = known and token not in self.done
-        return first and reason_fits and self._are_elements(vectors, same)
+        token = frame["sample_token"]
+        if token in self.done:
+            return False
+        if same_settings and self._tokens is not None and token not in self._tokens:
+            return False
+        if not isinstance(frame.get("broken", ""), str):
+            return False
+        return self._are_elements(frame.get("vectors", []), same_settings)
 
-    def _are_elements(self, vectors: Any, same: bool) -> bool:
-        """Whether the elements of a frame can be read, and are of classes of the run."""
+    def _are_elements(self, vectors: Any, same_settings: bool) -> bool:
+        """Whether the elements of a frame are valid and belong to classes of the run.
+
+        Args:
+            vectors: Elements of the frame.
+            same_settings: As for `_is_frame`.
+        """
         if not isinstance(vectors, list):
             return False
-        classes = self._classes if same else None
-        others = Counter[str]()
+        classes = self._classes if same_settings else None
+        unknown = Counter[str]()
         try:
-            read_vectors(vectors, classes or (), others, gaussians=True)
+            read_vectors(vectors, classes or (), unknown, gaussians=True)
         except (ValueError, KeyError, TypeError, OverflowError):
             return False
-        return classes is None or not others.keys() - {THREE_D}
+        return classes is None or not unknown.keys() - {THREE_D}
 
-    def _require(self, good: bool, number: int) -> None:
-        if not good:
+    def _require(self, is_valid: bool, line_number: int) -> None:
+        """Raise an error about a line that is not valid."""
+        if not is_valid:
             raise InputError(
-                f"{self.path}, line {number}, is no frame of this run: the file is damaged, or "
-                "another program's. Take it away to begin again, or give another --out."
+                f"{self.path}, line {line_number}, is no frame of this run: the file is damaged, "
+                "or another program's. Take it away to begin again, or give another --out."
             )
 
-    def __exit__(self, *raised: object) -> None:
+    def __exit__(self, *exception: object) -> None:
         self._file.close()
 
-    def _note(self, line: dict[str, Any]) -> None:
-        self.done.add(line["sample_token"])
-        if "broken" in line:
-            self.broken[line["sample_token"]] = line["broken"]
+    def _record(self, frame: dict[str, Any]) -> None:
+        """Add a frame to the finished frames."""
+        self.done.add(frame["sample_token"])
+        if "broken" in frame:
+            self.broken[frame["sample_token"]] = frame["broken"]
 
-    def _append(self, line: dict[str, Any]) -> None:
-        self._note(line)
+    def _append(self, frame: dict[str, Any]) -> None:
+        """Write a frame to the file."""
+        self._record(frame)
         with naming_file(self.path):
-            self._file.write(json.dumps(line, separators=(",", ":")).encode() + b"\n")
+            self._file.write(json.dumps(frame, separators=(",", ":")).encode() + b"\n")
             self._file.flush()
 
     def add(self, token: str, vectors: list[dict[str, Any]]) -> None:
-        """Keep a frame's predictions."""
+        """Add the predictions of a frame.
+
+        Args:
+            token: Token of the frame.
+            vectors: Elements in the format of the results JSON.
+        """
         self._append({"sample_token": token, "vectors": vectors})
 
     def add_broken(self, token: str, reason: str) -> None:
-        """Keep that a frame is broken."""
+        """Add a frame that cannot be used.
+
+        Args:
+            token: Token of the frame.
+            reason: Message of the error.
+        """
         self._append({"sample_token": token, "broken": reason})
 
     def finish(self, meta: dict[str, Any]) -> int:
-        """Write the result file, in the order of tokens, remove this one, and count the frames.
+        """Write the result file in the order of tokens, and remove the unfinished one.
 
-        ``meta`` is what to say about the file.
+        Args:
+            meta: Metadata of the result file.
+
+        Returns:
+            Number of frames in the result file. Broken frames are left out.
         """
-        places: list[tuple[str, int]] = []
+        positions: list[tuple[str, int]] = []  # token and start of its line, in bytes
         with self.path.open("rb") as file:
             file.readline()
             position = file.tell()
             for line in file:
                 token = json.loads(line)["sample_token"]
                 if token not in self.broken:
-                    places.append((token, position))
+                    positions.append((token, position))
                 position += len(line)
+            positions.sort()
 
-            def vectors(position: int) -> list[dict[str, Any]]:
-                file.seek(position)
-                return json.loads(file.readline())["vectors"]
+            def samples() -> Iterator[tuple[str, list[dict[str, Any]]]]:
+                for token, position in positions:
+                    file.seek(position)
+                    yield token, json.loads(file.readline())["vectors"]
 
-            write_results(self.out, ((t, vectors(at)) for t, at in sorted(places)), meta)
+            write_results(self.out, samples(), meta)
         self.path.unlink()
-        return len(places)
+        return len(positions)
 
 
-def _value(line: bytes) -> Any:
-    """Return the value of a line of JSON, None if it is none."""
+def _parse_line(line: bytes) -> Any:
+    """Parse a line of JSON; None if it is not valid."""
     try:
         return json.loads(line)
     except (ValueError, RecursionError):
