@@ -174,6 +174,9 @@ def test_what_is_not_known_is_said_and_what_cannot_be_is_refused(tmp_path, caplo
         {MOUNT: "here"},
         {"ground_z_m": "high"},
         {"ground_z_m": 1e9},
+        {"ground_z_m": float("nan")},
+        {"ground_z_m": 10**400},
+        {MOUNT: [[10**400] * 4] * 4},
         {MOUNT: rigid(np.eye(3), [1e4, 0, 0]).tolist()},
     ):
         with pytest.raises(ValueError, match="where its frame lies in the vehicle makes no sense"):
@@ -227,6 +230,8 @@ def test_the_cameras_of_the_training_travel_with_the_checkpoint(tmp_path):
     content = torch.load(checkpoint, weights_only=True)
     content["meta"]["dataset_meta"][RIG]["odd"] = [1.0, "x"]
     content["meta"]["dataset_meta"][RIG]["none"] = [0.0] * 6
+    content["meta"]["dataset_meta"][RIG]["huge"] = [1, 1, 1, 1, 10**400, 1]
+    content["meta"]["dataset_meta"][RIG]["nan"] = [1.0, 1.0, 1.0, 1.0, float("nan"), 1.0]
     torch.save(content, checkpoint)
     model = MapInferencer(config_of("ego"), checkpoint, device="cpu").model
     camera = samples[0].cameras[0]

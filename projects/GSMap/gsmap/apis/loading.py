@@ -101,7 +101,8 @@ def trained_rig(checkpoint: Checkpoint) -> dict[str, tuple[float, ...]]:
         if not all(isinstance(number, int | float) for number in numbers):
             continue
         lengths = numbers[:4]  # all but the principal point
-        if all(0 < length < _LARGEST_PX for length in lengths) and np.isfinite(numbers).all():
+        is_bounded = all(abs(number) < _LARGEST_PX for number in numbers)  # refuses NaN as well
+        if is_bounded and all(length > 0 for length in lengths):
             cameras[str(name)] = tuple(map(float, numbers))
     return cameras
 
@@ -154,7 +155,7 @@ def _training_mount(cfg: Config, contents: Checkpoint | None, path: object) -> M
     try:
         height = None if height is None else _check_height(height)
         matrix = None if matrix is None else _check_mount(matrix)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(
             f"{path} was not loaded: where its frame lies in the vehicle makes no sense ({error})."
         ) from error
@@ -164,7 +165,7 @@ def _training_mount(cfg: Config, contents: Checkpoint | None, path: object) -> M
 def _check_height(value: Any) -> float:
     """Convert a height of the ground in a file to metres; ValueError if it is not possible."""
     height = float(value)
-    if abs(height) > _HIGHEST_M:
+    if not abs(height) <= _HIGHEST_M:  # refuses NaN as well
         raise InputError("no place on a vehicle")
     return height
 
