@@ -184,7 +184,7 @@ def require_own_samples(path: Path) -> None:
     Raises:
         ValueError: If it is another one.
     """
-    from gsmap.apis.map_inferencer import SAMPLES_BY
+    from gsmap.apis.input_dataset import SAMPLES_BY
 
     if not path.exists():
         return

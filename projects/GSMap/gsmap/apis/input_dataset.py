@@ -1,0 +1,112 @@
+"""Samples of any source as the test data set of a config."""
+
+from collections.abc import Sequence
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mmdet3d.registry import DATASETS
+from mmengine.config import Config
+
+from gsmap.checkpoints.building import building
+from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
+from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta, MapSample
+from gsmap.datasets.source import Mount, Source, reframed
+
+if TYPE_CHECKING:
+    from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
+
+SAMPLES_BY = "tools/infer.py"  # command in the metadata of annotation files for inference
+_MAX_SAMPLES = 100  # number of samples that are searched for the names of cameras
+
+
+def open_dataset(
+    cfg: Config, source: Source, mount: Mount, ann_file: Path
+) -> "VectorizedMapDataset":
+    """Open samples as the test data set of a config, with its pipeline.
+
+    Samples in another annotation frame are transformed to the model's. If the samples have no
+    camera of the config, all of their cameras are used.
+
+    Args:
+        cfg: Config of the model.
+        source: The samples.
+        mount: Annotation frame of the model.
+        ann_file: File to which samples are written, unless ``source`` is a suitable annotation
+            file itself.
+
+    Raises:
+        FileNotFoundError: If a file does not exist.
+        ValueError: If the samples cannot be used with this config.
+    """
+    settings: dict[str, Any] = dict(cfg.test_dataloader.dataset)
+    if not settings.get("frame"):
+        mount = Mount(source.frame, ground_z_m=source.ground_z_m)
+    samples = source.samples
+    if isinstance(samples, AnnotationFile) and mount.suits(source.frame, source.ground_z_m):
+        ann_file = samples.path
+    else:
+        samples = [
+            reframed(sample, source.frame, wanted=mount, ground_z_m=source.ground_z_m)
+            for sample in samples
+        ]
+        meta = _annotation_meta(cfg, samples=samples, mount=mount, has_poses=source.has_poses)
+        write_annotations(ann_file, meta, samples)
+        settings["ground_z_m"] = None
+    settings["ann_file"] = str(ann_file.resolve())
+    settings["test_mode"] = True
+    settings["split"] = None
+    settings["dim"] = None
+    settings["cameras"] = _select_cameras(cfg, samples)
+    settings["serialize_data"] = len(samples) > 1  # it runs a garbage collection
+    if source.data_root is not None:
+        settings["data_root"] = str(source.data_root.resolve())
+    with building(cfg):
+        return DATASETS.build(settings)
+
+
+def _annotation_meta(
+    cfg: Config, samples: Sequence[MapSample], mount: Mount, has_poses: bool
+) -> AnnotationMeta:
+    """Metadata of an annotation file for inference.
+
+    Args:
+        cfg: Config of the model.
+        samples: Samples of the file.
+        mount: Annotation frame of the samples.
+        has_poses: Whether the poses of the vehicle are known.
+    """
+    options = cfg.test_dataloader.dataset
+    grid = options.get("grid") or cfg.model.grid
+    dim = 2
+    for sample in samples:
+        for instance in sample.instances or ():
+            dim = max(dim, instance.points.shape[1])
+    return AnnotationMeta(
+        dataset="samples",
+        frame=mount.frame,
+        split="test",
+        classes=tuple(options.get("classes") or CLASSES),
+        x_range=tuple(grid["x_range"]),
+        y_range=tuple(grid["y_range"]),
+        dim=dim,
+        options={} if has_poses else {"poses": False},
+        command=SAMPLES_BY,
+        ground_z_m=mount.ground_z_m,
+    )
+
+
+def _select_cameras(cfg: Config, samples: Sequence[MapSample]) -> Sequence[str] | None:
+    """Select the cameras of the config, or all of the samples' if none of them is the config's.
+
+    Returns:
+        Names of the cameras; None if the config uses all.
+    """
+    configured = cfg.test_dataloader.dataset.get("cameras")
+    available: dict[str, None] = {}  # names in order
+    for sample in islice(samples, _MAX_SAMPLES):
+        for camera in sample.cameras:
+            available[camera.name] = None
+    if configured is None or not available or not available.keys().isdisjoint(configured):
+        return configured
+    return list(available)
