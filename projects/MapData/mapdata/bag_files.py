@@ -1,4 +1,4 @@
-"""How a bag lies on the disk: its files, its parts, and what is wrong with them."""
+"""Files of a bag: their suffixes, the parts of a recording, and damages that can be mended."""
 
 import re
 import struct
@@ -15,7 +15,7 @@ from mapdata.ros_bag import RosBag
 Bag = RosBag | McapBag
 SUFFIXES = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"
-_MOST_BYTES = 300_000  # of metadata; reading a thousand bytes takes some milliseconds
+_MOST_BYTES = 300_000  # of metadata; YAML takes some milliseconds for a thousand bytes
 _ALIAS = re.compile(r"(^|[\s\[{,:-])\*\w", re.MULTILINE)
 _PACKED = (".zstd", ".zst", ".lz4", ".gz", ".bz2", ".xz", ".zip", ".tar")
 _STARTS = {".mcap": MAGIC, ".db3": b"SQLite format 3\0", ".bag": b"#ROSBAG V2.0"}
@@ -29,29 +29,32 @@ def is_bag(path: Path) -> bool:
 
 
 def parts_in(folder: Path) -> list[Path]:
-    """Return the files of bags in a folder, in the order of their numbers."""
-    found = [
-        path
-        for path in folder.iterdir()
-        if path.suffix in SUFFIXES and path.is_file() and not path.name.startswith(".")
-    ]
-    return sorted(found, key=lambda path: (_number_of(path), path.name))
+    """Files of bags in a folder, in the order of their numbers."""
+    parts = []
+    for path in folder.iterdir():
+        is_hidden = path.name.startswith(".")
+        if path.suffix in SUFFIXES and path.is_file() and not is_hidden:
+            parts.append(path)
+    return sorted(parts, key=lambda path: (_part_number(path), path.name))
 
 
-def _number_of(path: Path) -> int:
-    """Return the number at the end of a part's name."""
+def _part_number(path: Path) -> int:
+    """Number at the end of a file's name, such as 3 of ``drive_3.mcap``; 0 without a number."""
     match = re.search(r"_(\d+)$", path.stem)
     return int(match[1]) if match else 0
 
 
 def bag_at(path: Path) -> Bag:
-    """Return the bag at a path, not yet open.
+    """Find the bag at a path, without opening it.
 
     Args:
-        path: A file, a folder of rosbag2, or a folder of the parts of one recording.
+        path: A file, a folder of rosbag2, or a folder with the parts of one recording.
+
+    Returns:
+        The bag, with notes on files that are not read.
 
     Raises:
-        ValueError: If the files of a folder are not the parts of one recording, or it is a pipe.
+        ValueError: If a folder holds parts of several recordings, or the path is a pipe.
     """
     if not path.is_dir():
         heed_input(path)
@@ -59,44 +62,54 @@ def bag_at(path: Path) -> Bag:
     parts = parts_in(path)
     if not (path / _METADATA).is_file():
         _check_parts(parts)
-        names = ", ".join(part.name for part in parts)
-        note = f"{path.name} has no {_METADATA}: {names} are read as the parts of one recording"
-        return _bag_of(parts, [note] * (len(parts) > 1) + _notes_on(parts))
-    listed = _listed_parts(path)
-    notes = _notes_on(listed)
-    if others := [part.name for part in parts if part not in listed]:
+        notes = []
+        if len(parts) > 1:
+            names = ", ".join(part.name for part in parts)
+            notes.append(
+                f"{path.name} has no {_METADATA}: {names} are read as the parts of one recording"
+            )
+        return _bag_of(parts, notes + _notes_on(parts))
+    listed_parts = _listed_parts(path)
+    notes = _notes_on(listed_parts)
+    unlisted = [part.name for part in parts if part not in listed_parts]
+    if unlisted:
         notes.append(
-            f"{', '.join(others)} in {path.name} are not read, since {_METADATA} does not name "
+            f"{', '.join(unlisted)} in {path.name} are not read, since {_METADATA} does not name "
             "them: `ros2 bag reindex` lists them"
         )
-    if listed and listed[0].suffix == ".mcap" and not all(map(is_plain_ros2, listed)):
-        return McapBag(listed, notes)
+    if listed_parts and _needs_mcap_reader(listed_parts):
+        return McapBag(listed_parts, notes)
     return RosBag([path], notes)
 
 
 def _bag_of(parts: Sequence[Path], notes: list[str]) -> Bag:
-    """Return the bag of some files."""
-    if parts[0].suffix == ".mcap" and not all(map(is_plain_ros2, parts)):
+    """Create the bag of some files; there must be at least one."""
+    if _needs_mcap_reader(parts):
         return McapBag(parts, notes)
     return RosBag(parts, notes)
 
 
+def _needs_mcap_reader(parts: Sequence[Path]) -> bool:
+    """Whether files are MCAP files, not all of which rosbags can read."""
+    return parts[0].suffix == ".mcap" and not all(map(is_plain_ros2, parts))
+
+
 def _listed_parts(folder: Path) -> list[Path]:
-    """Return the files in a folder that its metadata name."""
-    text = _metadata(folder / _METADATA)
-    return [
-        part
-        for part in parts_in(folder)
-        if re.search(rf"(?<![\w.-]){re.escape(part.name)}(?![\w.-])", text)
-    ]
+    """Files in a folder that its metadata name."""
+    text = _read_metadata(folder / _METADATA)
+    listed_parts = []
+    for part in parts_in(folder):
+        if re.search(rf"(?<![\w.-]){re.escape(part.name)}(?![\w.-])", text):
+            listed_parts.append(part)
+    return listed_parts
 
 
-def _metadata(file: Path) -> str:
-    """Return the text of a bag's metadata.
+def _read_metadata(file: Path) -> str:
+    """Read the text of a bag's metadata.
 
     Raises:
-        ValueError: If its values may be far more than its letters: it is too long, or its values
-            stand for others (aliases and merge keys of YAML), which rosbag2 does not write.
+        ValueError: If parsing could take much more memory than the text: the text is too long, or
+            has aliases or merge keys of YAML, which rosbag2 does not write.
     """
     if file.stat().st_size > _MOST_BYTES:
         raise InputError(
@@ -109,46 +122,54 @@ def _metadata(file: Path) -> str:
 
 
 def _check_parts(parts: Sequence[Path]) -> None:
-    """Raise a ``ValueError`` unless files are the numbered parts of one recording, or one file."""
+    """Raise a ``ValueError`` unless files are one file, or the numbered parts of one recording."""
     patterns = {re.sub(r"\d+", "0", part.name) for part in parts}
-    numbers = {_number_of(part) for part in parts}
+    numbers = {_part_number(part) for part in parts}
     if len(parts) > 1 and (len(patterns) > 1 or len(numbers) < len(parts)):
-        found = ", ".join(part.name for part in parts)
-        raise InputError(f"it holds several bags ({found}): name one of them")
+        names = ", ".join(part.name for part in parts)
+        raise InputError(f"it holds several bags ({names}): name one of them")
 
 
 def _notes_on(parts: Sequence[Path]) -> list[str]:
-    """Say which files hold messages that are not read."""
-    logs = [part.with_name(f"{part.name}-wal") for part in parts if part.suffix == ".db3"]
-    return [
-        f"{log.name} holds messages that {log.stem}.db3 lacks, and they are not read: "
-        f"`sqlite3 {log.stem}.db3 'PRAGMA wal_checkpoint'` adds them"
-        for log in logs
-        if log.is_file() and log.stat().st_size
-    ]
+    """Notes on write-ahead logs of SQLite, whose messages are not read."""
+    notes = []
+    for part in parts:
+        if part.suffix != ".db3":
+            continue
+        log = part.with_name(f"{part.name}-wal")
+        if log.is_file() and log.stat().st_size:
+            notes.append(
+                f"{log.name} holds messages that {log.stem}.db3 lacks, and they are not read: "
+                f"`sqlite3 {log.stem}.db3 'PRAGMA wal_checkpoint'` adds them"
+            )
+    return notes
 
 
 def damage_in(path: Path) -> str | None:
-    """Say how the files of a bag are damaged, and how to mend them; None if nothing is found."""
+    """Describe the first damage of a bag's files and its remedy; None if no damage is found."""
     if not path.is_dir():
         return _damage_of(path)
-    file = path / _METADATA
-    listed = _listed_names(file) if file.is_file() else []
-    if listed is None:
+    metadata = path / _METADATA
+    names = _listed_names(metadata) if metadata.is_file() else []
+    if names is None:
         return f"{_METADATA} is empty or damaged: `ros2 bag reindex {path.name}` writes it anew"
-    if missing := [name for name in listed if not (path / name).is_file()]:
+    missing = [name for name in names if not (path / name).is_file()]
+    if missing:
         return (
             f"{_METADATA} names {', '.join(missing)}, not there: copy all files of the recording, "
             f"or `ros2 bag reindex {path.name}` to go on with the others"
         )
-    found = ((part.name, _damage_of(part)) for part in parts_in(path))
-    return next((f"{name}: {damage}" for name, damage in found if damage), None)
+    for part in parts_in(path):
+        damage = _damage_of(part)
+        if damage:
+            return f"{part.name}: {damage}"
+    return None
 
 
 def _listed_names(file: Path) -> list[str] | None:
-    """Return the names of the files in metadata, or None if they cannot be read."""
+    """Names of the files that metadata list; None if the metadata cannot be parsed."""
     try:
-        content = yaml.safe_load(_metadata(file))
+        content = yaml.safe_load(_read_metadata(file))
         paths = content["rosbag2_bagfile_information"]["relative_file_paths"]
         return [Path(str(path)).name for path in paths]
     except (yaml.YAMLError, UnicodeDecodeError, TypeError, KeyError):
@@ -156,7 +177,7 @@ def _listed_names(file: Path) -> list[str] | None:
 
 
 def _damage_of(path: Path) -> str | None:
-    """Say how a bag's file is damaged, and how to mend it."""
+    """Describe the damage of one file and its remedy; None if no damage is found."""
     if not path.is_file():
         return "it is a pipe, a socket or a device: give a plain file"
     size = path.stat().st_size
@@ -193,15 +214,18 @@ def _damage_of(path: Path) -> str | None:
 
 
 def _sqlite_size(header: bytes) -> int:
-    """Return how many bytes a file of SQLite has by its header."""
+    """Size of an SQLite file in bytes, according to its header."""
     page_size = struct.unpack(">H", header[16:18])[0]
-    pages = struct.unpack(">I", header[28:32])[0]
-    return (65536 if page_size == 1 else page_size) * pages
+    if page_size == 1:
+        page_size = 65536  # which does not fit the two bytes
+    page_count = struct.unpack(">I", header[28:32])[0]
+    return page_size * page_count
 
 
 def suffix_advice(path: Path) -> str | None:
-    """Say what to do with the file of a bag whose suffix is none of ``SUFFIXES``."""
-    name, suffixes = path.name, [suffix.lower() for suffix in path.suffixes]
+    """Advice on a file that is probably a bag, but has none of ``SUFFIXES``; None on others."""
+    name = path.name
+    suffixes = [suffix.lower() for suffix in path.suffixes]
     if suffixes[-2:] == [".bag", ".active"]:
         return f"its recorder was killed: `rosbag reindex {name}`, and rename it to end in .bag"
     if suffixes and suffixes[-1] in _PACKED and set(suffixes) & set(SUFFIXES):

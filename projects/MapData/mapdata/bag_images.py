@@ -31,21 +31,21 @@ _VIDEO = ("h264", "h265", "hevc", "av1", "vp8", "vp9", "theora", "ffmpeg")
 
 
 def trouble_with(message: Any) -> str | None:
-    """Say why the images of a topic cannot be used at all, by the encoding of one message."""
+    """Reason why images in a message's encoding cannot be used; None if they can."""
     if hasattr(message, "encoding"):
         if message.encoding in _TO_BGR:
             return None
         return f"it has the encoding {message.encoding!r}; known are {sorted(_TO_BGR)}"
-    form = str(message.format)
-    if form.split(";")[0].strip() in _DEPTHS or "compressedDepth" in form:
-        return f"it is a depth image ({form.strip()!r})"
-    if form.strip().lower() in _VIDEO:
-        return f"it is a frame of video ({form.strip()!r}), not a picture of its own"
+    image_format = str(message.format)
+    if image_format.split(";")[0].strip() in _DEPTHS or "compressedDepth" in image_format:
+        return f"it is a depth image ({image_format.strip()!r})"
+    if image_format.strip().lower() in _VIDEO:
+        return f"it is a frame of video ({image_format.strip()!r}), not a picture of its own"
     return None
 
 
 def image_size(message: Any) -> tuple[int, int] | None:
-    """Return width and height of a message's image in pixels, or None if it is damaged."""
+    """Width and height of a message's image in pixels; None if the image is damaged."""
     if hasattr(message, "encoding"):
         return int(message.width), int(message.height)
     content = np.asarray(message.data, np.uint8).tobytes()
@@ -57,43 +57,51 @@ def image_size(message: Any) -> tuple[int, int] | None:
 
 
 def write_image(message: Any, camera: RigCamera, target: Path, where: str) -> None:
-    """Write a message's image as JPEG.
+    """Write a message's image as JPEG, rectified if the camera has distortion.
 
     Args:
-        message: Of rosbags, with an image as it is or compressed.
-        camera: The camera that took it.
+        message: Message of rosbags, with a raw or a compressed image.
+        camera: Camera that took the image.
         target: File to write.
-        where: Camera and time, for messages.
+        where: Camera and time, for error messages.
 
     Raises:
-        BrokenSampleError: If a compressed image is damaged or of another size.
-        ValueError: If an image's encoding is not known, or its size is another.
+        BrokenSampleError: If a compressed image is damaged, or not of the camera's size.
+        ValueError: If the encoding of an image is not known, or a raw image is not of the camera's
+            size.
     """
     if hasattr(message, "encoding"):
         camera.write_image(target, _raw_image(message, camera.size_px))
         return
-    if trouble := trouble_with(message):
+    trouble = trouble_with(message)
+    if trouble:
         raise InputError(trouble)
     content = np.asarray(message.data, np.uint8).tobytes()
     image = decode_image(content, "its message", where, camera.size_px)
-    if camera.is_distorted or not content.startswith(b"\xff\xd8"):
+    is_jpeg = content.startswith(b"\xff\xd8")
+    if camera.is_distorted or not is_jpeg:
         camera.write_image(target, image)
     else:
         write_bytes(target, content)
 
 
 def _raw_image(message: Any, size_px: tuple[int, int]) -> np.ndarray:
-    """Return an uncompressed image, BGR. (H, W, 3)"""
-    encoding, found = message.encoding, (message.width, message.height)
-    if trouble := trouble_with(message):
+    """Convert an uncompressed image to BGR. (H, W, 3)"""
+    trouble = trouble_with(message)
+    if trouble:
         raise InputError(trouble)
-    if found != size_px:
-        raise InputError(f"it has {found} pixels, and its camera info says {size_px}")
+    width = message.width
+    height = message.height
+    if (width, height) != size_px:
+        raise InputError(f"it has {(width, height)} pixels, and its camera info says {size_px}")
+    encoding = message.encoding
     channels = _CHANNELS.get(encoding, 1)
-    rows = np.asarray(message.data, np.uint8).reshape(message.height, message.step)
-    image = rows[:, : message.width * channels].reshape(message.height, message.width, channels)
+    rows = np.asarray(message.data, np.uint8).reshape(height, message.step)
+    image = rows[:, : width * channels].reshape(height, width, channels)
     code = _TO_BGR[encoding]
+    if code is None:
+        return image
     try:
-        return image if code is None else cv2.cvtColor(np.ascontiguousarray(image), code)
+        return cv2.cvtColor(np.ascontiguousarray(image), code)
     except cv2.error as error:
         raise InputError(f"OpenCV cannot convert it from {encoding}: {error.err}") from error

@@ -1,4 +1,4 @@
-"""Transforms and odometry of a bag: where the cameras are on the vehicle, and its poses."""
+"""Transforms and odometry of a bag: the mounting of the cameras, and the poses of the vehicle."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,7 +13,7 @@ from mapdata.folders.rig import PoseTrack
 VEHICLE_FRAMES = ("base_footprint", "base_link")
 _GAP_NS = 10**9
 _FOREVER_NS = 10**20
-_SELDOM_NS = 500_000_000  # a transform that comes less often on average holds until its next one
+_SELDOM_NS = 500_000_000  # longer average steps: each transform holds until the next one
 _STILL_M = 1e-3
 _STILL_JUMP_M = 0.1
 
@@ -25,17 +25,17 @@ def is_static_topic(topic: str) -> bool:
 
 @dataclass
 class Transforms:
-    """The transforms of one frame to one parent, from one topic.
+    """Transforms from one frame to one parent, published on one topic.
 
     Args:
-        topic: The topic.
-        child: The frame.
-        parent: The frame above it.
-        is_static: Whether they come from a static topic, of which the first message counts.
-        times_ns: Their times, as they came. (n,)
-        poses: From the child to the parent. each (4, 4)
+        topic: Topic of the messages.
+        child: Name of the frame.
+        parent: Name of the frame above it.
+        is_static: Whether the topic is static, so that the first message holds.
+        times_ns: Times of the transforms, in the order of the bag. (n,)
+        poses: Transforms from the child to the parent, in metres. each (4, 4)
         count: Number of messages.
-        changed: Number of static ones that differ from the first.
+        changed: Number of static transforms that differ from the first one.
     """
 
     topic: str
@@ -48,7 +48,7 @@ class Transforms:
     changed: int = 0
 
     def add(self, time_ns: int, pose: np.ndarray) -> None:
-        """Add a message."""
+        """Add the transform of a message."""
         self.count += 1
         if not self.is_static or not self.times_ns:
             self.times_ns.append(time_ns)
@@ -58,7 +58,7 @@ class Transforms:
 
     @cached_property
     def moves(self) -> bool:
-        """Whether its pose changes, by a millimetre or more; computed once all are there."""
+        """Whether a pose differs from the first by over a millimetre; read it after the last."""
         return bool(np.abs(np.array(self.poses) - self.poses[0]).max() > _STILL_M)
 
     def __str__(self) -> str:
@@ -67,14 +67,14 @@ class Transforms:
 
 @dataclass
 class Odometry:
-    """The poses of one topic of odometry, of one body in one frame.
+    """Poses of one body in one frame, published on one topic.
 
     Args:
-        topic: The topic.
-        parent: The frame that poses are in.
-        child: The frame of the body, maybe empty.
-        times_ns: Their times. (n,)
-        poses: From the child to the parent. each (4, 4)
+        topic: Topic of the messages.
+        parent: Name of the frame that the poses refer to.
+        child: Name of the body's frame; may be empty.
+        times_ns: Times of the poses. (n,)
+        poses: Transforms from the child to the parent, in metres. each (4, 4)
     """
 
     topic: str
@@ -88,21 +88,23 @@ class Odometry:
 
 
 class PoseChain:
-    """The poses of a vehicle's ground, by transforms one above the other.
+    """Pose of the ground below a vehicle as a function of time, from a chain of transforms.
 
     Args:
-        steps: Tracks from the vehicle upwards.
-        ground: Pose of the ground in the vehicle's frame. (4, 4)
-        span_ns: First and last time at which all tracks have poses.
+        steps: Pose tracks from the vehicle's frame up to the root.
+        ground: Pose of the ground in the vehicle's frame, in metres. (4, 4)
+        span_ns: First and last time at which all tracks have a pose.
     """
 
     def __init__(
         self, steps: Sequence[PoseTrack], ground: np.ndarray, span_ns: tuple[int, int]
     ) -> None:
-        self.steps, self.ground, self.span_ns = steps, ground, span_ns
+        self.steps = steps
+        self.ground = ground
+        self.span_ns = span_ns
 
     def __call__(self, time_ns: int) -> np.ndarray | None:
-        """Return the pose at a time, or None where one of the tracks has none. (4, 4)"""
+        """Pose of the ground in the root at a time; None if one of the tracks has none. (4, 4)"""
         pose = self.ground
         for step in self.steps:
             parent_from_child = step.at(time_ns)
@@ -114,14 +116,14 @@ class PoseChain:
 
 @dataclass
 class FrameTree:
-    """The frames of a bag, each with one parent.
+    """Tree of the frames of a bag, in which each frame has one parent.
 
-    Of several parents or topics, that counts which leads to the vehicle; of others, the one with
-    the most messages, and of as many the first by name.
+    If a frame has several parents, or transforms on several topics, a parent that leads to the
+    vehicle is preferred, then the one with the most messages, then the first topic by name.
 
     Args:
-        edges: Sources of each frame's transforms, by topic and parent.
-        notes: What is not used, and what was assumed.
+        edges: Transforms of each frame, by their topic and parent.
+        notes: Notes on transforms that are not used.
     """
 
     edges: dict[str, dict[tuple[str, str], Transforms]] = field(default_factory=dict)
@@ -129,64 +131,75 @@ class FrameTree:
     _chosen: dict[str, Transforms] = field(default_factory=dict)
 
     def add(self, topic: str, child: str, parent: str, time_ns: int, pose: np.ndarray) -> None:
-        """Add the transform of a message."""
+        """Add the transform of a message.
+
+        Args:
+            topic: Topic of the message.
+            child: Name of the frame.
+            parent: Name of the frame above it.
+            time_ns: Time of the transform.
+            pose: Transform from the child to the parent, in metres. (4, 4)
+        """
         sources = self.edges.setdefault(child, {})
-        key = topic, parent
+        key = (topic, parent)
         if key not in sources:
-            sources[key] = Transforms(topic, child, parent, is_static_topic(topic))
+            sources[key] = Transforms(topic, child, parent, is_static=is_static_topic(topic))
         sources[key].add(time_ns, pose)
 
     @property
     def frames(self) -> set[str]:
-        """The names of all frames."""
-        return set(self.edges).union(
-            parent for sources in self.edges.values() for _, parent in sources
-        )
+        """Names of all frames."""
+        names = set(self.edges)
+        for sources in self.edges.values():
+            names.update(parent for _, parent in sources)
+        return names
 
     def choose_vehicle(self, wanted: str | None) -> str:
         """Choose the vehicle's frame, and one parent for each frame.
 
         Args:
-            wanted: The vehicle's frame; None takes the first of ``VEHICLE_FRAMES`` that is there
-                and moves, or else that is there.
+            wanted: Name of the vehicle's frame. None takes the first of ``VEHICLE_FRAMES`` in the
+                bag that moves, or the first in the bag if none moves.
+
+        Returns:
+            Name of the vehicle's frame.
 
         Raises:
-            ValueError: If there is no such frame.
+            ValueError: If the bag has no such frame.
         """
-        names = VEHICLE_FRAMES if wanted is None else (wanted,)
-        there = [name for name in names if name in self.frames]
-        if not there:
+        candidates = VEHICLE_FRAMES if wanted is None else (wanted,)
+        known_names = [name for name in candidates if name in self.frames]
+        if not known_names:
             raise InputError(
                 f"its transforms have no frame {wanted or ' or '.join(VEHICLE_FRAMES)!s}: name the "
                 f"vehicle's with --vehicle-frame, or give --calibration calibration.yaml; there "
                 f"are {sorted(self.frames) or 'no transforms at all'}"
             )
-        for name in there:
-            self._settle(name)
+        for name in known_names:
+            self._choose_parents(name)
             if any(not self._chosen[frame].is_static for frame in self.chain(name)[:-1]):
                 break
         else:
-            name = there[0]
-            self._settle(name)
-        if name != there[0]:
+            name = known_names[0]
+            self._choose_parents(name)
+        if name != known_names[0]:
             self.notes.append(
-                f"the vehicle's frame is {name!r}, since {there[0]!r} has no moving transform above"
+                f"the vehicle's frame is {name!r}, since {known_names[0]!r} has no moving "
+                "transform above"
             )
         return name
 
-    def _settle(self, vehicle: str) -> None:
-        """Choose one parent for each frame, and note what is not used."""
+    def _choose_parents(self, vehicle: str) -> None:
+        """Choose one parent for each frame, and note the transforms that are not used."""
         self._chosen.clear()
         self.notes.clear()
+
+        def rank(edge: Transforms) -> tuple[bool, int, str]:
+            is_beside = edge.child == vehicle or not self._leads(edge.parent, vehicle)
+            return is_beside, -edge.count, edge.topic
+
         for child, sources in self.edges.items():
-            best = min(
-                sources.values(),
-                key=lambda edge: (
-                    edge.child == vehicle or not self._leads(edge.parent, vehicle),
-                    -edge.count,
-                    edge.topic,
-                ),
-            )
+            best = min(sources.values(), key=rank)
             self._chosen[child] = best
             if best.changed:
                 self.notes.append(
@@ -201,77 +214,104 @@ class FrameTree:
                 )
 
     def _leads(self, frame: str, vehicle: str) -> bool:
-        """Whether a frame is the vehicle's, or one of the ways up from it passes there."""
-        seen, todo = set(), [frame]
-        while todo:
-            name = todo.pop()
+        """Whether a frame is the vehicle's, or a path of parents leads from it to the vehicle."""
+        visited = set()
+        pending = [frame]
+        while pending:
+            name = pending.pop()
             if name == vehicle:
                 return True
-            if name not in seen:
-                seen.add(name)
-                todo += [parent for _, parent in self.edges.get(name, ())]
+            if name not in visited:
+                visited.add(name)
+                pending += [parent for _, parent in self.edges.get(name, ())]
         return False
 
     def chain(self, frame: str) -> list[str]:
-        """Return a frame and those above it, up to the root; ValueError if they form a circle."""
-        chain = [frame]
-        while chain[-1] in self._chosen:
-            parent = self._chosen[chain[-1]].parent
-            if parent in chain:
+        """Names of a frame and all frames above it, up to the root.
+
+        Raises:
+            ValueError: If the transforms form a circle.
+        """
+        names = [frame]
+        while names[-1] in self._chosen:
+            parent = self._chosen[names[-1]].parent
+            if parent in names:
                 raise InputError(f"its transforms lead from {parent!r} back to it")
-            chain.append(parent)
-        return chain
+            names.append(parent)
+        return names
 
     def between(self, vehicle: str, frame: str) -> np.ndarray | None:
-        """Return the pose of a frame on the vehicle, or None if they are not connected. (4, 4)
+        """Pose of a frame on the vehicle; None if the two are not connected. (4, 4)
 
-        Of transforms that move between the two, the first counts, which is noted.
+        If a transform between the two moves, the first pose is used, which is noted.
         """
-        above, of_vehicle = self.chain(frame), self.chain(vehicle)
-        common = next((name for name in above if name in of_vehicle), None)
+        frame_chain = self.chain(frame)
+        vehicle_chain = self.chain(vehicle)
+        common = next((name for name in frame_chain if name in vehicle_chain), None)
         if common is None:
             return None
-        poses = []
-        for chain in (of_vehicle, above):
-            pose = np.eye(4)
-            for name in chain[: chain.index(common)]:
-                edge = self._chosen[name]
-                pose = edge.poses[0] @ pose
-                note = (
-                    f"the transform from {name!r} to {edge.parent!r} moves, and is used as it is "
-                    f"at first for where {frame!r} is on the vehicle"
-                )
-                if edge.moves and note not in self.notes:
-                    self.notes.append(note)
-            poses.append(pose)
-        return invert_rigid(poses[0]) @ poses[1]
+        common_from_vehicle = self._pose_below(common, vehicle_chain, frame)
+        common_from_frame = self._pose_below(common, frame_chain, frame)
+        return invert_rigid(common_from_vehicle) @ common_from_frame
+
+    def _pose_below(self, ancestor: str, names: Sequence[str], frame: str) -> np.ndarray:
+        """First pose of the start of a chain in one of its frames. (4, 4)
+
+        Transforms that move are noted, as they affect where ``frame`` is on the vehicle.
+        """
+        pose = np.eye(4)
+        for name in names[: names.index(ancestor)]:
+            edge = self._chosen[name]
+            pose = edge.poses[0] @ pose
+            note = (
+                f"the transform from {name!r} to {edge.parent!r} moves, and is used as it is "
+                f"at first for where {frame!r} is on the vehicle"
+            )
+            if edge.moves and note not in self.notes:
+                self.notes.append(note)
+        return pose
 
     def poses(self, vehicle: str, ground: np.ndarray) -> PoseChain | None:
-        """Return the poses of the ground by the moving transforms above the vehicle, or None."""
-        above = [self._chosen[name] for name in self.chain(vehicle)[:-1]]
-        moving = [edge for edge in above if not edge.is_static]
-        if not moving:
+        """Poses of the ground below the vehicle, from the transforms above the vehicle's frame.
+
+        Args:
+            vehicle: Name of the vehicle's frame.
+            ground: Pose of the ground in the vehicle's frame, in metres. (4, 4)
+
+        Returns:
+            The poses; None if no transform moves, or transforms jump back and forth.
+        """
+        edges = [self._chosen[name] for name in self.chain(vehicle)[:-1]]
+        moving_edges = [edge for edge in edges if not edge.is_static]
+        if not moving_edges:
             return None
-        start_ns, end_ns = min(moving[0].times_ns), max(moving[0].times_ns)
-        drive_ns, steps = end_ns - start_ns, []
+        lowest = moving_edges[0]
+        start_ns = min(lowest.times_ns)
+        end_ns = max(lowest.times_ns)
+        drive_ns = end_ns - start_ns
+        steps = []
         jumps: list[str] = []
-        for edge in above:
+        for edge in edges:
             if edge.is_static:
-                steps.append(PoseTrack(edge.times_ns, edge.poses, _FOREVER_NS))
+                steps.append(PoseTrack(edge.times_ns, edge.poses, gap_ns=_FOREVER_NS))
                 continue
             count = len(edge.times_ns)
             is_seldom = count == 1 or count * _SELDOM_NS < drive_ns
-            holds = edge is not moving[0] and is_seldom
+            holds = edge is not lowest and is_seldom
             start_ns = max(start_ns, min(edge.times_ns))
-            end_ns = end_ns if holds else min(end_ns, max(edge.times_ns))
-            steps.append(PoseTrack(edge.times_ns, edge.poses, _GAP_NS, holds))
-            jumps += _jumps(steps[-1], f"transforms from {edge.child!r} to {edge}")
+            if not holds:
+                end_ns = min(end_ns, max(edge.times_ns))
+            track = PoseTrack(edge.times_ns, edge.poses, gap_ns=_GAP_NS, holds=holds)
+            steps.append(track)
+            jumps += _jump_notes(track, f"transforms from {edge.child!r} to {edge}")
         self.notes += jumps
-        return None if jumps else PoseChain(steps, ground, (start_ns, end_ns))
+        if jumps:
+            return None
+        return PoseChain(steps, ground, span_ns=(start_ns, end_ns))
 
 
-def _jumps(track: PoseTrack, what: str) -> list[str]:
-    """Say if poses go back and forth between two places, as those of two publishers do."""
+def _jump_notes(track: PoseTrack, source: str) -> list[str]:
+    """Note on poses that alternate between two places, as if two publishers sent them."""
     places = track.poses[:, :3, 3]
     if len(places) < 5:
         return []
@@ -280,31 +320,38 @@ def _jumps(track: PoseTrack, what: str) -> list[str]:
     if to_next < 2 * to_second + _STILL_JUMP_M:
         return []
     return [
-        f"the {what} jump back and forth by {to_next:.1f} m, as if two publishers sent them: they "
-        "are not used"
+        f"the {source} jump back and forth by {to_next:.1f} m, as if two publishers sent them: "
+        "they are not used"
     ]
 
 
 def odometry_poses(
     odometries: Sequence[Odometry], tree: FrameTree, vehicle: str, ground: np.ndarray
 ) -> tuple[PoseChain | None, list[str]]:
-    """Return the poses of the ground by the odometry of one topic, and what is to be said of it.
+    """Poses of the ground below the vehicle, from the odometry of one topic.
 
-    That of the vehicle's frame counts before that of a body that is fixed to it, and this before
-    one that names none; of several, the one with the most poses.
+    Odometry of the vehicle's frame is preferred, then odometry of a frame that is connected to it,
+    then odometry without a frame; of several, the one with the most poses.
 
     Args:
-        odometries: All of a bag.
-        tree: Its frames.
-        vehicle: The vehicle's frame; empty where only a calibration file says where cameras are.
-        ground: Pose of the ground in the vehicle's frame. (4, 4)
+        odometries: All odometries of a bag.
+        tree: Frames of the bag.
+        vehicle: Name of the vehicle's frame; empty if the bag has no transforms.
+        ground: Pose of the ground in the vehicle's frame, in metres. (4, 4)
+
+    Returns:
+        The poses, None without usable odometry, and notes on assumptions.
     """
-    usable: list[tuple[int, int, np.ndarray]] = []
+    # rank, position in ``odometries``, transform from the vehicle to the body
+    candidates: list[tuple[int, int, np.ndarray]] = []
     notes = []
     for number, odometry in enumerate(odometries):
         child = odometry.child
-        if child == vehicle or not child or not vehicle:
-            usable.append((0 if child == vehicle else 2, number, np.eye(4)))
+        if child == vehicle:
+            candidates.append((0, number, np.eye(4)))
+            continue
+        if not child or not vehicle:
+            candidates.append((2, number, np.eye(4)))
             continue
         child_from_vehicle = tree.between(child, vehicle) if child in tree.frames else None
         if child_from_vehicle is None:
@@ -313,20 +360,21 @@ def odometry_poses(
                 "its frame with --vehicle-frame if it is the vehicle's"
             )
         else:
-            usable.append((1, number, child_from_vehicle))
-    if not usable:
+            candidates.append((1, number, child_from_vehicle))
+    if not candidates:
         return None, notes
     rank, number, child_from_vehicle = min(
-        usable, key=lambda entry: (entry[0], -len(odometries[entry[1]].poses))
+        candidates, key=lambda candidate: (candidate[0], -len(odometries[candidate[1]].poses))
     )
     best = odometries[number]
     if rank == 2 and best.child not in VEHICLE_FRAMES:
         notes.append(f"{best} is taken for the poses of the vehicle's frame")
-    others = [str(odometries[other]) for _, other, _ in usable if other != number]
+    others = [str(odometries[other]) for _, other, _ in candidates if other != number]
     if others:
         notes.append(f"of several odometries {best} is used, and {' and '.join(others)} is not")
-    span_ns = min(best.times_ns), max(best.times_ns)
-    track = PoseTrack(best.times_ns, best.poses, _GAP_NS)
-    if jumps := _jumps(track, f"poses of {best}"):
+    track = PoseTrack(best.times_ns, best.poses, gap_ns=_GAP_NS)
+    jumps = _jump_notes(track, f"poses of {best}")
+    if jumps:
         return None, notes + jumps
+    span_ns = (min(best.times_ns), max(best.times_ns))
     return PoseChain([track], child_from_vehicle @ ground, span_ns), notes

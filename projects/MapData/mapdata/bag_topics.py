@@ -1,4 +1,4 @@
-"""Which topics of a bag are its cameras: their images, and the camera info that belongs to them."""
+"""Topics of the cameras of a bag: images, and the camera info that belongs to them."""
 
 import re
 from collections import defaultdict
@@ -8,10 +8,9 @@ from gsmap.utils.errors import InputError
 
 IMAGES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
 INFO = "sensor_msgs/msg/CameraInfo"
-_KINDS = (IMAGES, (INFO,))
 _GENERIC = ("compressed", "raw", "image", "image_raw", "image_color", "image_mono", "image_rect",
             "image_rect_color", "image_rect_raw")  # fmt: skip
-# words in a topic that say nothing about which camera it is
+# words in a topic that do not distinguish cameras
 _WORDS = {
     "", "camera", "image", "img", "info", "camerainfo", "caminfo", "calibration", "raw", "color",
     "mono", "rect", "compressed",
@@ -20,35 +19,39 @@ _REMEDY = "say it by hand with --topics NAME=IMAGE_TOPIC,INFO_TOPIC for each cam
 
 
 def parse_topics(words: Sequence[str]) -> dict[str, tuple[str, str]]:
-    """Read ``NAME=IMAGES,INFO`` of each camera; ``INFO`` may be left out and is empty then.
+    """Parse ``NAME=IMAGES,INFO`` of each camera; without ``INFO`` its topic is empty.
 
     Raises:
-        ValueError: If a word has another form, or two cameras have one name.
+        ValueError: If a word has another form, or two cameras have the same name.
     """
-    found = {}
+    topics: dict[str, tuple[str, str]] = {}
     for word in words:
         match = re.fullmatch(r"([^=,/]+)=(/[^=,]+)(?:,(/[^=,]+))?", word)
-        if match is None or match[1] in found:
+        if match is None or match[1] in topics:
             raise InputError(
                 f"--topics takes NAME=/images/topic,/info/topic once for each camera, got {word!r}."
             )
-        found[match[1]] = match[2], match[3] or ""
-    return found
+        name, images, info = match.groups()
+        topics[name] = (images, info or "")
+    return topics
 
 
-def chosen_topics(
+def check_topics(
     kinds: Mapping[str, str],
     topics: Mapping[str, tuple[str, str]],
     listing: str,
     needs_info: bool,
-) -> dict[str, tuple[str, str]]:
-    """Return topics that were named by hand; ValueError if the bag has no such images or info.
+) -> None:
+    """Check topics that the user named.
 
     Args:
-        kinds: Type of the messages of each topic.
-        topics: Topic of images and of info, which may be empty, by camera.
-        listing: What the bag holds.
-        needs_info: Whether each camera must have an info.
+        kinds: Message type of each topic of the bag.
+        topics: Topics of the images and of the camera info, which may be empty, by camera.
+        listing: Topics of the bag as text, for error messages.
+        needs_info: Whether each camera must have a topic of camera info.
+
+    Raises:
+        ValueError: If a camera lacks camera info, or a topic is missing or of another type.
     """
     lacking = [name for name, (_, info) in topics.items() if needs_info and not info]
     if lacking:
@@ -56,56 +59,56 @@ def chosen_topics(
             f"--topics names no camera info of {', '.join(lacking)}: NAME=IMAGE_TOPIC,INFO_TOPIC, "
             "or give --calibration calibration.yaml"
         )
-    pairs = ((t, w) for pair in topics.values() for t, w in zip(pair, _KINDS, strict=True))
-    for topic, wanted in pairs:
-        if topic and kinds.get(topic) not in wanted:
-            raise InputError(
-                f"--topics: {topic} is {kinds.get(topic, 'not there')}, and must be "
-                f"{' or '.join(wanted)}; it holds: {listing}"
-            )
-    return dict(topics)
+    for images, info in topics.values():
+        for topic, valid_kinds in ((images, IMAGES), (info, (INFO,))):
+            if topic and kinds.get(topic) not in valid_kinds:
+                raise InputError(
+                    f"--topics: {topic} is {kinds.get(topic, 'not there')}, and must be "
+                    f"{' or '.join(valid_kinds)}; it holds: {listing}"
+                )
 
 
 def image_topics(kinds: Mapping[str, str]) -> dict[str, str]:
-    """Return the topic of images of each camera; of both kinds of images, the compressed.
+    """Topic of the images of each camera; compressed images are preferred to raw images.
 
-    A camera is named by the last part of its topic, or by all of it where two have the same.
+    A camera is named by the last part of its topic, or by all parts if names would repeat.
 
     Raises:
-        ValueError: If two cameras get one name.
+        ValueError: If two cameras get the same name.
     """
-    found: dict[str, str] = {}
-    for kind in IMAGES:
-        for topic in sorted(t for t, k in kinds.items() if k == kind):
+    topic_of: dict[str, str] = {}
+    for image_kind in IMAGES:
+        for topic in sorted(kinds):
             parts = topic.split("/")
-            if parts[-1] == "compressedDepth":
+            if kinds[topic] != image_kind or parts[-1] == "compressedDepth":
                 continue
             while len(parts) > 2 and parts[-1] in _GENERIC:
                 parts.pop()
-            found.setdefault("/".join(parts), topic)
-    names = [base.rsplit("/", 1)[-1] for base in found]
+            topic_of.setdefault("/".join(parts), topic)
+    names = [base.rsplit("/", 1)[-1] for base in topic_of]
     if len(set(names)) < len(names):
-        names = [base.strip("/").replace("/", "_") for base in found]
+        names = [base.strip("/").replace("/", "_") for base in topic_of]
     if len(set(names)) < len(names):
-        raise InputError(f"the cameras {sorted(found)} get one name: {_REMEDY}")
-    return dict(zip(names, found.values(), strict=True))
+        raise InputError(f"the cameras {sorted(topic_of)} get one name: {_REMEDY}")
+    return dict(zip(names, topic_of.values(), strict=True))
 
 
 def camera_topics(kinds: Mapping[str, str], listing: str) -> dict[str, tuple[str, str]]:
     """Pair images and camera info, by namespace or by the words in their names.
 
     Args:
-        kinds: Type of the messages of each topic.
-        listing: What the bag holds.
+        kinds: Message type of each topic of the bag.
+        listing: Topics of the bag as text, for error messages.
 
     Returns:
-        Topic of images and of info, by camera; images without any info are left out.
+        Topics of the images and of the camera info, by camera; images without any camera info are
+        left out.
 
     Raises:
-        ValueError: If there is no camera, or it is not clear which info belongs to one.
+        ValueError: If there is no camera, or the camera info of a camera is ambiguous.
     """
     infos = sorted(topic for topic, kind in kinds.items() if kind == INFO)
-    candidates = {topic: _candidates(topic, infos) for topic in kinds}
+    candidates = {topic: _candidate_infos(topic, infos) for topic in kinds}
     cameras = image_topics({t: kind for t, kind in kinds.items() if candidates[t]})
     if not cameras:
         raise InputError(
@@ -117,23 +120,38 @@ def camera_topics(kinds: Mapping[str, str], listing: str) -> dict[str, tuple[str
         if len(candidates[topic]) > 1:
             raise InputError(f"which CameraInfo is that of {topic}, {candidates[topic]}? {_REMEDY}")
         claims[candidates[topic][0]].append(name)
+    topics = {}
     for info, names in claims.items():
-        own = [n for n in names if _words(cameras[n]) == _words(info)]
-        if len(own) == 1:
-            claims[info] = own
-        elif len(names) > 1 or (info.count("/") == 1 and len(claims) > 1):
+        matching_names = [name for name in names if _words(cameras[name]) == _words(info)]
+        is_global_info = info.count("/") == 1 and len(claims) > 1
+        if len(matching_names) == 1:
+            name = matching_names[0]
+        elif len(names) > 1 or is_global_info:
             raise InputError(f"is {info} that of {' or '.join(names)}? {_REMEDY}")
-    return {names[0]: (cameras[names[0]], info) for info, names in claims.items()}
+        else:
+            name = names[0]
+        topics[name] = (cameras[name], info)
+    return topics
 
 
 def _words(topic: str) -> list[str]:
-    """Return the words in a topic that tell its camera."""
+    """Sorted words of a topic that distinguish cameras."""
     return sorted(word for word in re.split(r"[/_]", topic.lower()) if word not in _WORDS)
 
 
-def _candidates(topic: str, infos: Sequence[str]) -> list[str]:
-    """Return the infos that may belong to images: in the nearest namespace, best of equal words."""
-    spaces = {info.rsplit("/", 1)[0] for info in infos}
-    nearest = max((s for s in spaces if topic.startswith(f"{s}/")), key=len, default=None)
-    found = [info for info in infos if info.rsplit("/", 1)[0] == nearest]
-    return [info for info in found if len(found) > 1 and _words(info) == _words(topic)] or found
+def _candidate_infos(topic: str, infos: Sequence[str]) -> list[str]:
+    """Topics of camera info that may belong to images.
+
+    They are in the nearest namespace above the images. If several are, infos with the words of the
+    images are preferred.
+    """
+    nearest = None
+    for info in infos:
+        namespace = info.rsplit("/", 1)[0]
+        if topic.startswith(f"{namespace}/") and (nearest is None or len(namespace) > len(nearest)):
+            nearest = namespace
+    neighbours = [info for info in infos if info.rsplit("/", 1)[0] == nearest]
+    if len(neighbours) < 2:
+        return neighbours
+    matching_infos = [info for info in neighbours if _words(info) == _words(topic)]
+    return matching_infos or neighbours

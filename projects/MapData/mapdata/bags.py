@@ -15,11 +15,11 @@ from gsmap.structures.rigid import invert_rigid, rigid
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import file_name
 from mapdata.argoverse2.samples import thin_out
-from mapdata.bag_cameras import ImageTopic, camera_of, is_calibrated, is_same_calibration
+from mapdata.bag_cameras import ImageTopic, build_camera, is_calibrated, is_same_calibration
 from mapdata.bag_files import Bag, bag_at, damage_in
 from mapdata.bag_images import write_image
 from mapdata.bag_poses import FrameTree, Odometry, PoseChain, is_static_topic, odometry_poses
-from mapdata.bag_topics import camera_topics, chosen_topics, image_topics
+from mapdata.bag_topics import camera_topics, check_topics, image_topics
 from mapdata.folders.images import read_rig
 from mapdata.folders.rig import (
     RigCamera,
@@ -133,7 +133,8 @@ def _read(bag: Bag, path: Path, options: InputOptions) -> Source:
     kinds, listing = {c.topic: c.msgtype for c in bag.connections}, _listing(bag)
     calibration, notes = options.calibration, list(bag.notes)
     ground = rigid(np.eye(3), (0, 0, options.vehicle_ground_z_m or 0.0))
-    topics = chosen_topics(kinds, options.topics, listing, calibration is None)
+    check_topics(kinds, options.topics, listing, needs_info=calibration is None)
+    topics = dict(options.topics)
     if calibration is None:
         topics = topics or camera_topics(kinds, listing)
         content = _first_pass(bag, topics)
@@ -346,7 +347,7 @@ def _camera(
             "--calibration calibration.yaml, or another --vehicle-frame; there are those of "
             f"{sorted(content.tree.edges)}"
         )
-    return camera_of(name, images, info, topics, invert_rigid(vehicle_from_cam) @ ground)
+    return build_camera(name, images, info, topics, invert_rigid(vehicle_from_cam) @ ground)
 
 
 def _poses(

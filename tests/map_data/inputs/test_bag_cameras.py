@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from bag_cases import PINHOLE, START_NS, Recorder, Straight, at, jpeg, options, picture
 
-from mapdata.bag_cameras import ImageTopic, camera_of, is_rectified
+from mapdata.bag_cameras import ImageTopic, build_camera, is_rectified
 from mapdata.bag_topics import parse_topics
 from mapdata.inputs import open_input
 
@@ -38,7 +38,7 @@ def info(**changed):
 def made(size_px, topic="/front/image_raw", **changed):
     """Return the camera of an info whose images have a size, and the notes."""
     images = ImageTopic(times_ns=[1], sizes_px=[size_px])
-    return camera_of("front", images, info(**changed), (topic, "/front/camera_info"), np.eye(4))
+    return build_camera("front", images, info(**changed), (topic, "/front/camera_info"), np.eye(4))
 
 
 def region(x, y, width, height):
