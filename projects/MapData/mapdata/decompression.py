@@ -1,7 +1,7 @@
-"""Chunks and messages of bags unpacked within bounds, so that a small file cannot take all memory.
+"""Bounded decompression of bags, so that a small file cannot fill the memory.
 
-The libraries that read bags unpack whatever a file says. What they unpack with is replaced here by
-functions that count.
+The libraries that read bags decompress without a limit. Their decompression functions are replaced
+by functions that count bytes.
 """
 
 import bz2
@@ -16,7 +16,7 @@ from gsmap.utils.extras import import_extra
 
 FREE_BYTES = 1 << 26
 TIMES = 100
-_OF = {  # modules that unpack, by those that are asked for
+_DECOMPRESSING = {  # modules that decompress, by the module that is imported
     "rosbags.rosbag1": ("rosbags.rosbag1.reader",),
     "rosbags.rosbag2": ("rosbags.rosbag2.reader", "rosbags.rosbag2.storage_mcap"),
     "mcap.reader": ("mcap.stream_reader",),
@@ -25,61 +25,75 @@ _OF = {  # modules that unpack, by those that are asked for
 
 
 class _Bag:
-    """Bytes of the bag at hand."""
+    """Number of bytes read from the current bag."""
 
     packed: ClassVar[int] = 0
     unpacked: ClassVar[int] = 0
 
 
 def begin_bag() -> None:
-    """Count anew, for another bag."""
-    _Bag.packed = _Bag.unpacked = 0
+    """Reset the number of bytes, for another bag."""
+    _Bag.packed = 0
+    _Bag.unpacked = 0
 
 
 def import_bounded(name: str) -> ModuleType:
-    """Import a module that reads bags, and let it unpack no more than their size allows.
+    """Import a module that reads bags, with bounded decompression.
 
     Args:
-        name: Of the extra ``bags``; the message of the RuntimeError without it names the extra.
+        name: Name of a module of the extra ``bags``.
+
+    Returns:
+        The module.
+
+    Raises:
+        RuntimeError: If the module is not installed; the message names the extra.
     """
-    for part in _OF[name]:
+    for part in _DECOMPRESSING[name]:
         _bound(import_extra(part, "bags"))
     return import_extra(name, "bags")
 
 
 def _bound(module: Any) -> None:
-    """Replace what a module unpacks with, once."""
+    """Replace the decompression functions of a module, once."""
     if hasattr(module, "_is_bounded"):
         return
     module._is_bounded = True
-    for table in ("decompressors", "DECOMPRESSORS"):
-        known: dict[str, Any] = getattr(module, table, {})
-        for kind in known.keys() & {"bz2", "zstd"}:
-            known[kind] = _by_stream(bz2.open if kind == "bz2" else module.zstd.open)
-        if "lz4" in known:
-            known["lz4"] = _at_once(known["lz4"])
-    if (zstd := getattr(module, "zstd", None)) is not None:
-        module.zstd = SimpleNamespace(decompress=_by_stream(zstd.open), open=_bounded_file(zstd))
-    if (zstandard := getattr(module, "zstandard", None)) is not None:
-        module.zstandard = SimpleNamespace(decompress=_by_stream(zstandard.open))
-    if (lz4 := getattr(module, "lz4", None)) is not None:
-        module.lz4 = SimpleNamespace(decompress=_at_once(lz4.decompress))
+    for table_name in ("decompressors", "DECOMPRESSORS"):
+        table: dict[str, Any] = getattr(module, table_name, {})
+        if "bz2" in table:
+            table["bz2"] = _bounded_stream(bz2.open)
+        if "zstd" in table:
+            table["zstd"] = _bounded_stream(module.zstd.open)
+        if "lz4" in table:
+            table["lz4"] = _bounded_lz4(table["lz4"])
+    zstd = getattr(module, "zstd", None)
+    if zstd is not None:
+        module.zstd = SimpleNamespace(
+            decompress=_bounded_stream(zstd.open), open=_bounded_file(zstd)
+        )
+    zstandard = getattr(module, "zstandard", None)
+    if zstandard is not None:
+        module.zstandard = SimpleNamespace(decompress=_bounded_stream(zstandard.open))
+    lz4 = getattr(module, "lz4", None)
+    if lz4 is not None:
+        module.lz4 = SimpleNamespace(decompress=_bounded_lz4(lz4.decompress))
 
 
-def _room(packed: int) -> int:
-    """Count packed bytes, and return how many more they may become."""
-    _Bag.packed += packed
+def _count_packed(size: int) -> int:
+    """Count compressed bytes, and return the number of bytes that may still be decompressed."""
+    _Bag.packed += size
     return FREE_BYTES + TIMES * _Bag.packed - _Bag.unpacked
 
 
-def _counted(content: bytes, room: int) -> bytes:
-    """Count unpacked bytes.
+def _count_unpacked(content: bytes, limit: int) -> bytes:
+    """Count decompressed bytes, and return them.
 
     Raises:
-        ValueError: If they are too many.
+        ValueError: If there are more than ``limit`` bytes.
     """
     _Bag.unpacked += len(content)
-    if len(content) > room:
+    if len(content) > limit:
         raise InputError(
             f"what is packed in it becomes more than {TIMES} times as large: if that is meant, "
             "unpack the bag first, such as by `mcap compress --compression none`"
@@ -87,35 +101,35 @@ def _counted(content: bytes, room: int) -> bytes:
     return content
 
 
-def _by_stream(opened: Callable[[BytesIO], Any]) -> Callable[..., bytes]:
-    """Return a function that unpacks bytes through a file, no farther than the bound."""
+def _bounded_stream(open_stream: Callable[[BytesIO], Any]) -> Callable[..., bytes]:
+    """Function that decompresses bytes as a stream, at most up to the limit."""
 
-    def unpack(data: bytes, *_: object) -> bytes:
-        room = _room(len(data))
-        with opened(BytesIO(data)) as file:
-            return _counted(file.read(room + 1), room)
+    def decompress(data: bytes, *_: object) -> bytes:
+        limit = _count_packed(len(data))
+        with open_stream(BytesIO(data)) as file:
+            return _count_unpacked(file.read(limit + 1), limit)
 
-    return unpack
+    return decompress
 
 
-def _at_once(decompress: Callable[..., bytes]) -> Callable[..., bytes]:
-    """Return a function that unpacks LZ4, which becomes at most 255 times as large."""
+def _bounded_lz4(unbounded: Callable[..., bytes]) -> Callable[..., bytes]:
+    """Function that decompresses LZ4 at once, as it grows by a factor of at most 255."""
 
-    def unpack(data: bytes, *others: object) -> bytes:
-        room = _room(len(data))
-        return _counted(decompress(data, *others), room)
+    def decompress(data: bytes, *options: object) -> bytes:
+        limit = _count_packed(len(data))
+        return _count_unpacked(unbounded(data, *options), limit)
 
-    return unpack
+    return decompress
 
 
 def _bounded_file(zstd: Any) -> Callable[..., Any]:
-    """Return a function that opens a packed file, whose parts are counted as they are read."""
+    """Function that opens a compressed file, and counts the bytes of each read."""
 
-    def opened(file: Any, mode: str) -> Any:
-        _room(os.fstat(file.fileno()).st_size)
+    def open_file(file: Any, mode: str) -> Any:
+        _count_packed(os.fstat(file.fileno()).st_size)
         unpacked = zstd.open(file, mode)
         read = unpacked.read
-        unpacked.read = lambda size=-1: _counted(read(size), _room(0))
+        unpacked.read = lambda size=-1: _count_unpacked(read(size), limit=_count_packed(0))
         return unpacked
 
-    return opened
+    return open_file

@@ -1,4 +1,4 @@
-"""Foxglove's messages (protobuf), given as those of ROS."""
+"""Messages of Foxglove in protobuf, converted to messages of ROS."""
 
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -8,20 +8,23 @@ from gsmap.utils.extras import import_extra
 
 
 def foxglove_parser(name: str, descriptors: bytes) -> Callable[[bytes], Any]:
-    """Return a function that makes a message of ROS of the content of one of Foxglove's.
+    """Create a function that parses a message of Foxglove, and converts it to one of ROS.
 
     Args:
         name: Type of the messages, one of ``ROS_TYPES``.
-        descriptors: Their description, from the schema of an MCAP.
+        descriptors: Descriptors of the type and its parts, from the schema of an MCAP file.
+
+    Returns:
+        Function from the content of a message to an object with the fields of ROS.
     """
-    pb2 = import_extra("google.protobuf.descriptor_pb2", "bags")
+    descriptor_pb2 = import_extra("google.protobuf.descriptor_pb2", "bags")
     pool = import_extra("google.protobuf.descriptor_pool", "bags").DescriptorPool()
     factory = import_extra("google.protobuf.message_factory", "bags")
-    for file in pb2.FileDescriptorSet.FromString(descriptors).file:
+    for file in descriptor_pb2.FileDescriptorSet.FromString(descriptors).file:
         pool.Add(file)
-    parse = factory.GetMessageClass(pool.FindMessageTypeByName(name)).FromString
-    convert = _KINDS[name][1]
-    return lambda content: convert(parse(content))
+    message_class = factory.GetMessageClass(pool.FindMessageTypeByName(name))
+    _, convert = _KINDS[name]
+    return lambda content: convert(message_class.FromString(content))
 
 
 def _header(message: Any) -> Any:
@@ -29,22 +32,33 @@ def _header(message: Any) -> Any:
     return SimpleNamespace(stamp=stamp, frame_id=getattr(message, "frame_id", ""))
 
 
-def _compressed(message: Any) -> Any:
-    data = memoryview(message.data)
-    return SimpleNamespace(header=_header(message), format=message.format, data=data)
+def _compressed_image(message: Any) -> Any:
+    return SimpleNamespace(
+        header=_header(message), format=message.format, data=memoryview(message.data)
+    )
 
 
-def _raw(message: Any) -> Any:
-    names = ("width", "height", "encoding", "step")
-    fields = {name: getattr(message, name) for name in names}
-    return SimpleNamespace(header=_header(message), data=memoryview(message.data), **fields)
+def _raw_image(message: Any) -> Any:
+    return SimpleNamespace(
+        header=_header(message),
+        width=message.width,
+        height=message.height,
+        encoding=message.encoding,
+        step=message.step,
+        data=memoryview(message.data),
+    )
 
 
-def _info(message: Any) -> Any:
-    matrices = {"d": list(message.D), "k": list(message.K), "p": list(message.P)}
-    size = {"width": message.width, "height": message.height}
-    model = message.distortion_model
-    return SimpleNamespace(header=_header(message), distortion_model=model, **matrices, **size)
+def _camera_info(message: Any) -> Any:
+    return SimpleNamespace(
+        header=_header(message),
+        width=message.width,
+        height=message.height,
+        distortion_model=message.distortion_model,
+        d=list(message.D),
+        k=list(message.K),
+        p=list(message.P),
+    )
 
 
 def _transforms(message: Any) -> Any:
@@ -55,14 +69,14 @@ def _transforms(message: Any) -> Any:
 def _transform(item: Any) -> Any:
     header = _header(item)
     header.frame_id = item.parent_frame_id
-    pose = SimpleNamespace(translation=item.translation, rotation=item.rotation)
-    return SimpleNamespace(header=header, child_frame_id=item.child_frame_id, transform=pose)
+    transform = SimpleNamespace(translation=item.translation, rotation=item.rotation)
+    return SimpleNamespace(header=header, child_frame_id=item.child_frame_id, transform=transform)
 
 
 _KINDS: dict[str, tuple[str, Callable[[Any], Any]]] = {
-    "foxglove.CompressedImage": ("sensor_msgs/msg/CompressedImage", _compressed),
-    "foxglove.RawImage": ("sensor_msgs/msg/Image", _raw),
-    "foxglove.CameraCalibration": ("sensor_msgs/msg/CameraInfo", _info),
+    "foxglove.CompressedImage": ("sensor_msgs/msg/CompressedImage", _compressed_image),
+    "foxglove.RawImage": ("sensor_msgs/msg/Image", _raw_image),
+    "foxglove.CameraCalibration": ("sensor_msgs/msg/CameraInfo", _camera_info),
     "foxglove.FrameTransform": ("tf2_msgs/msg/TFMessage", _transforms),
     "foxglove.FrameTransforms": ("tf2_msgs/msg/TFMessage", _transforms),
 }

@@ -1,4 +1,4 @@
-"""MCAP files whose messages are not all those of ROS 2: also of ROS 1, of Foxglove, and mixed."""
+"""MCAP files with messages of ROS 1, ROS 2 and Foxglove, also mixed in one file."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -14,18 +14,18 @@ from mapdata.foxglove_messages import ROS_TYPES, foxglove_parser
 from mapdata.ros_bag import Parser, RosTypes, library_errors
 
 MAGIC = b"\x89MCAP0\r\n"
-_OF_ROS_2 = ("ros2msg", "ros2idl", "omgidl", "")
+_ROS_2_SCHEMAS = ("ros2msg", "ros2idl", "omgidl", "")
 
 
 @dataclass(frozen=True)
 class McapConnection:
-    """A topic of an MCAP file.
+    """A topic of an MCAP file, with messages of one type.
 
     Args:
-        topic: Its name.
-        msgtype: Type of ROS that its messages are given as, or their own.
-        encoding: How they are serialized.
-        schema: Description of their type, or None.
+        topic: Name of the topic.
+        msgtype: Type of the messages, named as in ROS 2 if it is one of ROS.
+        encoding: Serialization of the messages, such as ``cdr``.
+        schema: Definition of the type as a record of ``mcap``; None if there is none.
     """
 
     topic: str
@@ -35,7 +35,7 @@ class McapConnection:
 
 
 def is_plain_ros2(path: Path) -> bool:
-    """Whether rosbags can read an MCAP file: one of ROS 2 alone, or damaged."""
+    """Whether an MCAP file is left to rosbags: it has messages of ROS 2 only, or is damaged."""
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
             return True
@@ -47,17 +47,21 @@ def is_plain_ros2(path: Path) -> bool:
             summary = reader.get_summary()
     if summary is None:
         return True
-    encodings = {channel.message_encoding for channel in summary.channels.values()}
-    return encodings <= {"cdr"} and all(s.encoding in _OF_ROS_2 for s in summary.schemas.values())
+    if any(channel.message_encoding != "cdr" for channel in summary.channels.values()):
+        return False
+    return all(schema.encoding in _ROS_2_SCHEMAS for schema in summary.schemas.values())
 
 
 @dataclass
 class McapBag:
-    """The parts of one recording in MCAP, with messages of any encoding.
+    """A recording in one or several MCAP files, with messages of any encoding.
 
     Args:
         paths: The files.
-        notes: What is to be said about the files.
+        notes: Notes on the files.
+        connections: Topics of the files; known once the bag is open.
+        topics: Type (``msgtype``) and number of the messages (``msgcount``) by topic; known once
+            the bag is open.
     """
 
     paths: Sequence[Path]
@@ -68,14 +72,18 @@ class McapBag:
     _types: RosTypes = field(init=False)
 
     def open(self) -> None:
-        """Read which topics there are; ValueError if that fails."""
+        """Read the topics of the files.
+
+        Raises:
+            ValueError: If a file is damaged.
+        """
         begin_bag()
         self._types = RosTypes()
         for path in self.paths:
             with library_errors(), path.open("rb") as file:
-                channels, schemas, counts = _contents(file)
+                channels, schemas, counts = _read_channels(file)
             for channel in channels.values():
-                connection = _connection(channel, schemas.get(channel.schema_id))
+                connection = _connection_of(channel, schemas.get(channel.schema_id))
                 if connection not in self.connections:
                     self.connections.append(connection)
                 topic = self.topics.setdefault(
@@ -84,80 +92,89 @@ class McapBag:
                 topic.msgcount += counts.get(channel.id, 0)
 
     def close(self) -> None:
-        """Nothing stays open."""
+        """Close the bag; no file is open between calls."""
 
     def messages(
         self, connections: Iterable[McapConnection]
     ) -> Iterator[tuple[McapConnection, int, bytes]]:
         """Yield connection, time in nanoseconds and content of messages, file by file."""
-        chosen = set(connections)
-        topics = sorted({connection.topic for connection in chosen})
+        selected = set(connections)
+        topics = sorted({connection.topic for connection in selected})
         for path in self.paths:
             with path.open("rb") as file:
                 reader = import_bounded("mcap.reader").make_reader(file)
                 summary = reader.get_summary()
-                # without an index, messages in order would all lie in memory
+                # without an index, sorting would hold all messages in memory
                 has_index = summary is not None and bool(summary.chunk_indexes)
-                known: dict[int, McapConnection] = {}
+                connection_of: dict[int, McapConnection] = {}
                 for schema, channel, message in reader.iter_messages(
                     topics, log_time_order=has_index
                 ):
-                    if channel.id not in known:
-                        known[channel.id] = _connection(channel, schema)
-                    if known[channel.id] in chosen:
-                        yield known[channel.id], message.log_time, message.data
+                    if channel.id not in connection_of:
+                        connection_of[channel.id] = _connection_of(channel, schema)
+                    connection = connection_of[channel.id]
+                    if connection in selected:
+                        yield connection, message.log_time, message.data
 
     def parser(self, connection: McapConnection) -> Parser:
-        """Return what parses the messages of a connection; ValueError if nothing does."""
+        """Function that parses the messages of a connection.
+
+        Raises:
+            ValueError: If the encoding or the type of the messages is not supported.
+        """
         if connection not in self._parsers:
-            self._parsers[connection] = _parser_of(connection, self._types)
+            self._parsers[connection] = _create_parser(connection, self._types)
         return self._parsers[connection]
 
 
-def _contents(file: Any) -> tuple[dict[int, Any], dict[int, Any], dict[int, int]]:
-    """Return the channels and schemas of an MCAP by their number, and each channel's messages."""
+def _read_channels(file: Any) -> tuple[dict[int, Any], dict[int, Any], dict[int, int]]:
+    """Channels and schemas of an MCAP file by their id, and the number of messages by channel."""
     summary = import_bounded("mcap.reader").make_reader(file).get_summary()
     if summary is not None and summary.channels:
         counts = summary.statistics.channel_message_counts if summary.statistics else {}
         return summary.channels, summary.schemas, counts
     records = import_extra("mcap.records", "bags")
-    channels, schemas, counted = {}, {}, Counter[int]()
+    channels = {}
+    schemas = {}
+    message_counts = Counter[int]()
     file.seek(0)
     for record in import_bounded("mcap.stream_reader").StreamReader(file).records:
         if isinstance(record, records.Message):
-            counted[record.channel_id] += 1
+            message_counts[record.channel_id] += 1
         elif isinstance(record, records.Channel):
             channels[record.id] = record
         elif isinstance(record, records.Schema):
             schemas[record.id] = record
-    return channels, schemas, counted
+    return channels, schemas, message_counts
 
 
-def _connection(channel: Any, schema: Any) -> McapConnection:
-    """Return the connection of a channel, its type named as in ROS 2."""
-    name, encoding = "" if schema is None else schema.name, channel.message_encoding
+def _connection_of(channel: Any, schema: Any) -> McapConnection:
+    """Connection of a channel, with the type named as in ROS 2."""
+    name = "" if schema is None else schema.name
+    encoding = channel.message_encoding
     if encoding == "protobuf":
         name = ROS_TYPES.get(name, name)
     elif encoding == "ros1" and name.count("/") == 1:
         name = name.replace("/", "/msg/")
-    return McapConnection(channel.topic, name, encoding, schema)
+    return McapConnection(channel.topic, msgtype=name, encoding=encoding, schema=schema)
 
 
 def _listed_type(connection: McapConnection) -> str:
-    """Return a connection's type as a listing names it, with an encoding that is not ROS'."""
+    """Type of a connection for a listing, followed by an encoding that is not of ROS."""
     name = connection.schema.name if connection.schema else "no type"
     is_known = connection.encoding in ("cdr", "ros1") or name in ROS_TYPES
     return name if is_known else f"{name} in {connection.encoding}"
 
 
-def _parser_of(connection: McapConnection, types: RosTypes) -> Parser:
-    """Return what parses the messages of a connection."""
-    schema, encoding = connection.schema, connection.encoding
+def _create_parser(connection: McapConnection, types: RosTypes) -> Parser:
+    """Create a function that parses the messages of a connection."""
+    schema = connection.schema
+    encoding = connection.encoding
     with library_errors():
         if encoding == "protobuf" and schema is not None and schema.name in ROS_TYPES:
             return foxglove_parser(schema.name, schema.data)
         if encoding not in ("cdr", "ros1"):
             raise InputError(f"its messages are in the encoding {encoding!r}")
-        text = "" if schema is None else schema.data.decode()
+        definition = "" if schema is None else schema.data.decode()
         is_idl = schema is not None and schema.encoding in ("ros2idl", "omgidl")
-    return types.parser(connection.msgtype, text, is_idl, encoding == "ros1")
+    return types.parser(connection.msgtype, definition, is_idl=is_idl, is_ros1=encoding == "ros1")

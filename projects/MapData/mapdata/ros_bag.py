@@ -1,4 +1,4 @@
-"""Bags of ROS 1 and ROS 2 as rosbags reads them, each topic by itself."""
+"""Bags of ROS 1 and ROS 2, read with rosbags; an unreadable topic leaves the others readable."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -13,7 +13,7 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.extras import import_extra
 from mapdata.decompression import begin_bag, import_bounded
 
-_MOST_FIELDS = 10_000  # of the types of a bag; rosbags makes some lines of code for each
+_MOST_FIELDS = 10_000  # of the types of a bag; rosbags generates some lines of code for each
 _MOST_LETTERS = 100_000  # of a definition
 
 Parser = Callable[[bytes], Any]
@@ -21,7 +21,7 @@ Parser = Callable[[bytes], Any]
 
 @contextmanager
 def library_errors() -> Iterator[None]:
-    """Turn what rosbags and the parsers below it raise for a damaged bag into a ``ValueError``."""
+    """Convert any error that rosbags or its parsers raise for a damaged bag to a ``ValueError``."""
     try:
         yield
     except MemoryError as error:
@@ -33,130 +33,137 @@ def library_errors() -> Iterator[None]:
 
 
 class _AddressedPath(type(Path())):  # type: ignore[misc]
-    """A path that rosbags can put into an address of SQLite, whatever signs it has."""
+    """Path that formats as part of an SQLite URI, with special characters escaped."""
 
     def __format__(self, _: str) -> str:
         return str(self).replace("%", "%25").replace("?", "%3f").replace("#", "%23")
 
 
 class RosTypes:
-    """The types of a bag's messages, made as they are needed.
+    """Message types of a bag, created on demand.
 
-    Definitions that contradict each other, or that cannot be read, concern their own type alone.
+    A definition that contradicts others or cannot be parsed affects only its type.
     """
 
     def __init__(self) -> None:
         self._typesys = import_extra("rosbags.typesys", "bags")
-        self._common = self._empty()
-        self._fields = 0
+        self._common_store = self._empty_store()
+        self._field_count = 0
 
-    def _empty(self) -> Any:
+    def _empty_store(self) -> Any:
         return self._typesys.get_typestore(self._typesys.Stores.EMPTY)
 
     def parser(self, msgtype: str, definition: str, is_idl: bool, is_ros1: bool) -> Parser:
-        """Return a function that makes a message of its content.
+        """Create a function that parses messages of a type.
 
         Args:
             msgtype: Type of the messages, such as ``sensor_msgs/msg/Image``.
-            definition: Its definition as the bag holds it; empty takes that of ROS 2 Humble.
+            definition: Definition of the type in the bag; empty takes the one of ROS 2 Humble.
             is_idl: Whether the definition is in IDL.
-            is_ros1: Whether the content is serialized as in ROS 1.
+            is_ros1: Whether the messages are serialized as in ROS 1.
+
+        Returns:
+            Function from the content of a message to the message.
 
         Raises:
-            ValueError: If the definition cannot be read.
+            ValueError: If the definition cannot be parsed, or is too large.
         """
         with library_errors():
-            store = self._store_of(msgtype, definition, is_idl)
+            store = self._store_with(msgtype, definition, is_idl)
             if msgtype not in store.fielddefs:
                 raise InputError(f"the bag does not define its type {msgtype!r}")
         deserialize = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
         return lambda content: deserialize(content, msgtype)
 
-    def _store_of(self, msgtype: str, definition: str, is_idl: bool) -> Any:
-        """Return a store that has a type."""
+    def _store_with(self, msgtype: str, definition: str, is_idl: bool) -> Any:
+        """Store of types that has the types of a definition."""
         if not definition:
             return _standard_store()
         if len(definition) > _MOST_LETTERS:
             raise InputError(f"its definition has {len(definition)} letters, not {_MOST_LETTERS}")
-        types = _types(self._typesys, msgtype, definition, is_idl)
+        types = _parse_types(self._typesys, msgtype, definition=definition, is_idl=is_idl)
         self._count_fields(types)
         try:
-            self._common.register(types)
-            return self._common
-        except self._typesys.TypesysError:  # it contradicts a type of another topic
-            store = self._empty()
+            self._common_store.register(types)
+            return self._common_store
+        except self._typesys.TypesysError:  # a type of another topic has another definition
+            store = self._empty_store()
             store.register(types)
             return store
 
     def _count_fields(self, types: Mapping[str, Any]) -> None:
-        """Refuse types that take too long to make readers of, or whose messages have no size.
+        """Count the fields of types, since rosbags generates code for each of them.
 
         Raises:
-            ValueError: If they have too many fields, or arrays of values without any.
+            ValueError: If the bag has too many fields, or a type has an array of empty messages.
         """
-        sizes: dict[str, int] = {}
-        known = self._common.fielddefs | types
+        counts: dict[str, int] = {}
+        known_types = self._common_store.fielddefs | types
+        nodes = self._typesys.base.Nodetype
 
-        def size_of(kind: Any, of_kind: Any) -> int:
-            """Return how many values a field has at least."""
-            nodes = self._typesys.base.Nodetype
-            if kind == nodes.BASE:
+        def count_values(node: Any, description: Any) -> int:
+            """Least number of values of a field."""
+            if node == nodes.BASE:
                 return 1
-            if kind == nodes.NAME:
-                return size_of_type(of_kind)
-            item, count = of_kind
-            values = size_of(*item)
+            if node == nodes.NAME:
+                return count_values_of_type(description)
+            (item_node, item_description), length = description
+            values = count_values(item_node, item_description)
             if not values:
                 raise InputError("it has an array of values without any field")
-            is_plain = item[0] == nodes.BASE and item[1][0] != "string"
-            return 1 if kind == nodes.SEQUENCE or is_plain else values * count
+            is_plain = item_node == nodes.BASE and item_description[0] != "string"
+            return 1 if node == nodes.SEQUENCE or is_plain else values * length
 
-        def size_of_type(name: str) -> int:
-            if name not in known:
-                return 1  # which rosbags says
-            if name not in sizes:
-                sizes[name] = 1  # a type of itself, which rosbags refuses
-                constants, fields = known[name]
-                values = sum(size_of(*of_field) for _, of_field in fields)
-                sizes[name] = values
-                self._fields += len(constants) + values
-                if self._fields > _MOST_FIELDS:
+        def count_values_of_type(name: str) -> int:
+            if name not in known_types:
+                return 1  # rosbags raises an error for it
+            if name not in counts:
+                counts[name] = 1  # ends the recursion of a type in itself, which rosbags refuses
+                constants, fields = known_types[name]
+                values = 0
+                for _, (node, description) in fields:
+                    values += count_values(node, description)
+                counts[name] = values
+                self._field_count += len(constants) + values
+                if self._field_count > _MOST_FIELDS:
                     raise InputError(
                         f"the types of the bag have more than {_MOST_FIELDS} fields, arrays counted"
                     )
-            return sizes[name]
+            return counts[name]
 
         for name in types:
-            size_of_type(name)
+            count_values_of_type(name)
 
 
 @cache
 def _standard_store() -> Any:
-    """Return the types of ROS 2 Humble."""
+    """Types of ROS 2 Humble."""
     typesys = import_extra("rosbags.typesys", "bags")
     return typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
 
 
-def _types(typesys: Any, msgtype: str, definition: str, is_idl: bool) -> dict[str, Any]:
-    """Return the types that a definition names."""
+def _parse_types(typesys: Any, msgtype: str, definition: str, is_idl: bool) -> dict[str, Any]:
+    """Parse the types of a definition."""
     if not is_idl:
         return dict(typesys.get_types_from_msg(definition, msgtype))
     separator = "=" * 80 + "\n"
     if not definition.startswith(f"{separator}IDL: "):
         return dict(typesys.get_types_from_idl(definition))
-    found: dict[str, Any] = {}
+    types: dict[str, Any] = {}
     for part in definition.split(separator)[1:]:
-        found |= typesys.get_types_from_idl(part.partition("\n")[2])
-    return found
+        text = part.partition("\n")[2]  # below the line ``IDL: name``
+        types |= typesys.get_types_from_idl(text)
+    return types
 
 
 @dataclass
 class RosBag:
-    """The parts of one recording, read by rosbags.
+    """A recording in one or several parts, read with rosbags.
 
     Args:
         paths: Bags of ROS 1, or files or folders of rosbag2.
-        notes: What is to be said about the files.
+        notes: Notes on the files.
+        connections: Connections of rosbags; known once the bag is open.
     """
 
     paths: Sequence[Path]
@@ -168,7 +175,11 @@ class RosBag:
     _types: RosTypes = field(init=False)
 
     def open(self) -> None:
-        """Read which topics there are; ValueError if that fails."""
+        """Open the files and read their connections.
+
+        Raises:
+            ValueError: If a file is damaged.
+        """
         begin_bag()
         self._types = RosTypes()
         self._is_ros1 = self.paths[0].suffix == ".bag"
@@ -189,31 +200,40 @@ class RosBag:
 
     @property
     def topics(self) -> dict[str, Any]:
-        """Type and number of the messages of each topic."""
-        found: dict[str, Any] = {}
+        """Type (``msgtype``) and number of the messages (``msgcount``) by topic."""
+        topics: dict[str, Any] = {}
         for connection in self.connections:
-            topic = found.setdefault(
+            topic = topics.setdefault(
                 connection.topic, SimpleNamespace(msgtype=connection.msgtype, msgcount=0)
             )
             topic.msgcount += connection.msgcount
             if topic.msgtype != connection.msgtype:
                 topic.msgtype = "several types"
-        return found
+        return topics
 
     def messages(self, connections: Iterable[Any]) -> Iterator[tuple[Any, int, bytes]]:
-        """Yield connection, time in nanoseconds and content of messages, in their order of time."""
-        parts = []
+        """Yield connection, time in nanoseconds and content of messages, in order of time."""
+        selected_ids = {id(connection) for connection in connections}
+        streams = []
         for reader in self._readers:
-            known = {id(connection) for connection in reader.connections}
-            of_reader = [c for c in connections if id(c) in known]
-            if of_reader:
-                parts.append(reader.messages(connections=of_reader))
-        yield from merge(*parts, key=lambda message: message[1])
+            selected = [item for item in reader.connections if id(item) in selected_ids]
+            if selected:
+                streams.append(reader.messages(connections=selected))
+        yield from merge(*streams, key=lambda message: message[1])
 
     def parser(self, connection: Any) -> Parser:
-        """Return what parses the messages of a connection; ValueError if nothing does."""
-        key = connection.msgtype, connection.msgdef.data
+        """Function that parses the messages of a connection.
+
+        Raises:
+            ValueError: If the type of the messages is not supported.
+        """
+        definition = connection.msgdef.data
+        key = (connection.msgtype, definition)
         if key not in self._parsers:
-            is_idl = connection.msgdef.format.name == "IDL"
-            self._parsers[key] = self._types.parser(*key, is_idl, self._is_ros1)
+            self._parsers[key] = self._types.parser(
+                connection.msgtype,
+                definition,
+                is_idl=connection.msgdef.format.name == "IDL",
+                is_ros1=self._is_ros1,
+            )
         return self._parsers[key]

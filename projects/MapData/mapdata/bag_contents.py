@@ -1,0 +1,237 @@
+"""First pass over a bag: calibrations, transforms, poses, and the times of all images."""
+
+import hashlib
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from gsmap.datasets.errors import naming
+from gsmap.structures.rigid import rigid
+from gsmap.utils.errors import InputError
+from mapdata.bag_cameras import ImageTopic, is_calibrated, is_same_calibration
+from mapdata.bag_files import Bag
+from mapdata.bag_poses import FrameTree, Odometry, is_static_topic
+from mapdata.folders.rig import rotation_of
+from mapdata.ros_bag import library_errors
+
+_ODOMETRY = "nav_msgs/msg/Odometry"
+_TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+_AFTER_STAMP = 12  # bytes of a message of ROS up to the end of its stamp
+_RULES = b"2"  # version of the rules for making images, so that images of others are not reused
+
+
+@dataclass
+class BagContent:
+    """Everything of a bag but the images themselves.
+
+    Args:
+        infos: Camera info, by the topic of the images.
+        images: Frame, times and sizes of the images, by their topic.
+        tree: Frames of the transforms.
+        odometries: Odometry, by topic, parent and child.
+        digest: Digest of all messages.
+        unread: Errors of messages that cannot be read, by topic.
+        unreadable: Reason why no message of a topic can be read, by topic.
+        unstamped: Number of transforms and poses with the stamp 0, by topic.
+        changed_infos: Number of camera infos that differ from the first, by the topic of the
+            images.
+    """
+
+    infos: dict[str, Any] = field(default_factory=dict)
+    images: dict[str, ImageTopic] = field(default_factory=lambda: defaultdict(ImageTopic))
+    tree: FrameTree = field(default_factory=FrameTree)
+    odometries: dict[tuple[str, str, str], Odometry] = field(default_factory=dict)
+    digest: Any = field(default_factory=hashlib.sha256)
+    unread: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
+    unreadable: dict[str, str] = field(default_factory=dict)
+    unstamped: Counter[str] = field(default_factory=Counter)
+    changed_infos: Counter[str] = field(default_factory=Counter)
+
+    def add_info(self, topic: str, info: Any) -> bool:
+        """Store the first camera info with focal lengths, and count the others that differ.
+
+        Args:
+            topic: Topic of the images.
+            info: Message with the camera info.
+
+        Returns:
+            Whether the camera info was stored.
+        """
+        first_info = self.infos.get(topic)
+        if first_info is None or not is_calibrated(first_info):
+            self.infos[topic] = info
+            return True
+        if not is_same_calibration(first_info, info):
+            self.changed_infos[topic] += 1
+        return False
+
+    def add(self, message: Any, topic: str, kind: str, recorded_ns: int) -> None:
+        """Add the transforms, the odometry or the image of a message.
+
+        Args:
+            message: The message.
+            topic: Topic of the message.
+            kind: Type of the message.
+            recorded_ns: Time of recording, used if a stamp is 0.
+        """
+        if kind in _TRANSFORMS:
+            self._add_transforms(message, topic, recorded_ns)
+        elif kind == _ODOMETRY:
+            self._add_odometry(message, topic, recorded_ns)
+        else:
+            self._add_image(message, topic, recorded_ns)
+
+    def _add_transforms(self, message: Any, topic: str, recorded_ns: int) -> None:
+        is_static = is_static_topic(topic)
+        for item in message.transforms:
+            pose = _pose_matrix(item.transform.translation, item.transform.rotation)
+            child = item.child_frame_id.lstrip("/")
+            parent = item.header.frame_id.lstrip("/")
+            stamp = stamp_ns(item.header)
+            self.tree.add(topic, child, parent, time_ns=stamp or recorded_ns, pose=pose)
+            if not stamp and not is_static:
+                self.unstamped[topic] += 1
+
+    def _add_odometry(self, message: Any, topic: str, recorded_ns: int) -> None:
+        stamp = stamp_ns(message.header)
+        pose = _pose_matrix(message.pose.pose.position, message.pose.pose.orientation)
+        parent = message.header.frame_id.lstrip("/")
+        child = message.child_frame_id.lstrip("/")
+        key = (topic, parent, child)
+        odometry = self.odometries.setdefault(key, Odometry(topic, parent, child))
+        odometry.poses.append(pose)
+        odometry.times_ns.append(stamp or recorded_ns)
+        if not stamp:
+            self.unstamped[topic] += 1
+
+    def _add_image(self, message: Any, topic: str, recorded_ns: int) -> None:
+        stamp = stamp_ns(message.header)
+        images = self.images[topic]
+        images.add(message, stamp or recorded_ns)
+        if not stamp:
+            images.unstamped += 1
+
+    def reason(self, topics: Sequence[str]) -> str:
+        """Reason why messages of some topics cannot be read; empty if all can be read."""
+        for topic in topics:
+            if topic in self.unreadable:
+                return self.unreadable[topic]
+        for topic in topics:
+            if topic in self.unread:
+                return self.unread[topic][0]
+        return ""
+
+    def notes(self) -> list[str]:
+        """Notes on messages that cannot be read or are not used."""
+        notes = [f"{topic!r} is left out: {reason}" for topic, reason in self.unreadable.items()]
+        for topic, count in self.changed_infos.items():
+            notes.append(
+                f"{count} messages of the camera info of {topic!r} differ from the first, which is "
+                "used"
+            )
+        for topic, reasons in self.unread.items():
+            notes.append(
+                f"{len(reasons)} messages of {topic!r} cannot be read and are left out: "
+                f"{reasons[0]}"
+            )
+        for topic, count in self.unstamped.items():
+            notes.append(
+                f"{count} transforms or poses of {topic!r} have the stamp 0: their time of "
+                "recording is used"
+            )
+        for topic, images in self.images.items():
+            notes += images.notes(topic)
+        return notes
+
+
+def read_messages(bag: Bag, connections: Sequence[Any]) -> Iterator[tuple[Any, int, bytes]]:
+    """Yield connection, time of recording in nanoseconds, and content of messages.
+
+    Raises:
+        ValueError: If the bag is damaged.
+    """
+    if not connections:
+        return
+    messages = iter(bag.messages(connections))
+    while True:
+        with library_errors():
+            message = next(messages, None)
+        if message is None:
+            return
+        yield message
+
+
+def stamp_ns(header: Any) -> int:
+    """Stamp of a message's header in nanoseconds; 0 if the publisher set none."""
+    stamp = header.stamp
+    return int(stamp.sec) * 10**9 + int(getattr(stamp, "nanosec", 0) or 0)
+
+
+def _pose_matrix(position: Any, orientation: Any) -> np.ndarray:
+    """Pose from the position and the quaternion of a message. (4, 4)"""
+    wxyz = (orientation.w, orientation.x, orientation.y, orientation.z)
+    pose = rigid(rotation_of(wxyz), (position.x, position.y, position.z))
+    if not np.isfinite(pose).all():
+        raise InputError(f"a position is not finite: {pose[:3, 3].tolist()}")
+    return pose
+
+
+def read_content(bag: Bag, topics: Mapping[str, tuple[str, str]]) -> BagContent:
+    """Read everything of a bag but the images themselves.
+
+    Args:
+        bag: The bag, open.
+        topics: Topics of the images and of the camera info, which may be empty, by camera.
+
+    Returns:
+        The content; messages that cannot be read are left out and noted.
+    """
+    content = BagContent()
+    content.digest.update(_RULES)
+    image_topics_of: dict[str, list[str]] = defaultdict(list)  # by the topic of the camera info
+    for image_topic, info_topic in topics.values():
+        if info_topic:
+            image_topics_of[info_topic].append(image_topic)
+    connections = _readable_connections(bag, topics, content)
+    known_infos: dict[str, bytes] = {}
+    for connection, recorded_ns, raw in read_messages(bag, connections):
+        topic = connection.topic
+        kind = connection.msgtype
+        content.digest.update(f"{topic} {kind} {len(raw)}\n".encode())
+        content.digest.update(raw)
+        if topic in known_infos and raw[_AFTER_STAMP:] == known_infos[topic]:
+            continue  # the stored camera info once more
+        try:
+            with naming(f"the message at {recorded_ns} ns", "it is damaged"):
+                with library_errors():
+                    message = bag.parser(connection)(raw)
+                if topic in image_topics_of:
+                    for image_topic in image_topics_of[topic]:
+                        if content.add_info(image_topic, message):
+                            known_infos[topic] = bytes(raw[_AFTER_STAMP:])
+                else:
+                    content.add(message, topic, kind=kind, recorded_ns=recorded_ns)
+        except ValueError as error:
+            content.unread[topic].append(str(error))
+    return content
+
+
+def _readable_connections(
+    bag: Bag, topics: Mapping[str, tuple[str, str]], content: BagContent
+) -> list[Any]:
+    """Connections of cameras, transforms and odometry; unreadable topics are noted in content."""
+    camera_topics = {topic for pair in topics.values() for topic in pair if topic}
+    readable = []
+    for connection in bag.connections:
+        is_pose = connection.msgtype in _TRANSFORMS or connection.msgtype == _ODOMETRY
+        if connection.topic not in camera_topics and not is_pose:
+            continue
+        try:
+            bag.parser(connection)
+            readable.append(connection)
+        except ValueError as error:
+            content.unreadable[connection.topic] = " ".join(str(error).split())
+    return readable
