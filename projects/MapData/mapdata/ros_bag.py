@@ -120,9 +120,7 @@ class RosTypes:
             if name not in counts:
                 counts[name] = 1  # ends the recursion of a type in itself, which rosbags refuses
                 constants, fields = known_types[name]
-                values = 0
-                for _, (node, description) in fields:
-                    values += count_values(node, description)
+                values = sum(count_values(node, description) for _, (node, description) in fields)
                 counts[name] = values
                 self._field_count += len(constants) + values
                 if self._field_count > _MOST_FIELDS:
