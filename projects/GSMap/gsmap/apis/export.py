@@ -1,4 +1,4 @@
-"""A trained model as one ONNX file: images and calibration in, map elements out."""
+"""Export of a trained model to a single ONNX file, from images and calibration to elements."""
 
 import json
 import tempfile
@@ -14,11 +14,11 @@ from torch import Tensor, nn
 from gsmap.apis.onnx_inferencer import (
     CAN_BUS_RULE,
     FORMAT,
-    MEMORY,
+    MEMORY_PREFIX,
     METADATA_KEY,
     NO_SIGNALS,
-    OF_STREAM,
     POSE_ONLY_RULE,
+    STREAM_INPUTS,
     OnnxInferencer,
 )
 from gsmap.structures.calibration import NUM_CAN_BUS, OF_ONE_FRAME
@@ -32,13 +32,21 @@ OPSET = 18
 
 
 class ExportedDetector(nn.Module):
-    """A `MapDetector` of cameras as a function of tensors alone, for one sample.
+    """A camera `MapDetector` as a function of tensors, for one sample.
 
-    With memory it is one step of a stream: what the frame before has left is further inputs, and
-    what this one leaves further outputs.
+    For a model with memory, it computes one step of a stream. Then the memory of the previous frame
+    is part of the inputs, and the new memory is part of the outputs.
+
+    Args:
+        model: A `MapDetector` of cameras.
+
+    Attributes:
+        input_names: Names of the inputs. Names of the memory are added by `example_inputs`.
+        output_names: Names of the outputs. Names of the memory are added by `example_inputs`.
+        memory: Names of the tensors of the memory; empty until `example_inputs`.
 
     Raises:
-        ValueError: If the model reads LiDAR, or its head cannot be exported.
+        ValueError: If the model reads LiDAR, or its head or its memory cannot be exported.
     """
 
     def __init__(self, model: Any) -> None:
@@ -60,83 +68,112 @@ class ExportedDetector(nn.Module):
                 "model.temporal.elements=None (temporal=None without other memory)."
             )
         self.model = model
-        of_stream = () if model.temporal is None else OF_STREAM
-        self.input_names = ("images", *model.bev_encoder.calibration, *of_stream)
+        stream_inputs = () if model.temporal is None else STREAM_INPUTS
+        self.input_names = ("images", *model.bev_encoder.calibration, *stream_inputs)
         self.output_names = ("scores", "labels", "points", *head.reference.outputs[1:])
-        self.memory: tuple[str, ...] = ()  # names of what is remembered, after `example_inputs`
+        self.memory: tuple[str, ...] = ()
 
     def forward(self, images: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """Find the best map elements, wherever they lie.
+        """Predict the best map elements, including elements outside of the map.
 
         Args:
-            images: Pixel values as the data pipeline leaves them: 0 to 255, not normalised, not
-                padded. (V, 3, H, W)
-            inputs: ``input_names[1:]``: what the BEV encoder reads, (V, 4, 4) or (18,). With
-                memory also the motion since the frame before (4, 4), which takes metres then to
-                metres now, its seconds (1,), whether the stream continues, 1 or 0 (1,), and what
-                that frame has left.
+            images: Pixel values of the data pipeline: 0 to 255, neither normalised nor padded.
+                (V, 3, H, W)
+            inputs: Tensors of ``input_names[1:]``. The first ones are the calibration of the BEV
+                encoder, (V, 4, 4) or (18,) each. A model with memory also takes the transform from
+                the previous to the current frame in metres (4, 4), the seconds between them (1,),
+                1 or 0 for whether the stream continues (1,), and the memory of the previous frame.
 
         Returns:
-            Scores (M,), labels (M,), points in metres (M, P, 2 or 3), and with Gaussians scales in
-            metres (M, P, 2) and rotations in radians (M, P), for elements of any number of points
-            how many count (M,); best first. With memory also what this frame leaves.
+            Tensors of ``output_names``, best element first: scores (M,), labels (M,), and points in
+            metres (M, P, 2 or 3). Gaussian heads add scales in metres (M, P, 2) and rotations in
+            radians (M, P). Heads with a variable number of points add the numbers (M,). A model
+            with memory adds its new memory.
         """
-        elements, left = self.step(images, dict(zip(self.input_names[1:], inputs, strict=True)))
-        return (*elements, *left.values())
+        named_inputs = dict(zip(self.input_names[1:], inputs, strict=True))
+        elements, new_memory = self.step(images, inputs=named_inputs)
+        return (*elements, *new_memory.values())
 
     def step(
-        self, images: Tensor, given: dict[str, Tensor]
+        self, images: Tensor, inputs: dict[str, Tensor]
     ) -> tuple[tuple[Tensor, ...], dict[str, Tensor]]:
-        """Map elements of a frame, and the new state of the memory, by name."""
+        """Predict the map elements of a frame, and update the memory.
+
+        Args:
+            images: Pixel values of the data pipeline. (V, 3, H, W)
+            inputs: Other inputs by name, without batch dimension.
+
+        Returns:
+            Fields of the elements in the order of ``output_names``, and the new memory by name.
+        """
         # a tensor of four axes is normalised and padded image by image
         images = self.model.data_preprocessor({"inputs": {"img": images}})["inputs"]["imgs"]
         feats = self.model.bev_encoder.levels(self.model.extract_img_feats(images[None]))
-        if "can_bus" in given:  # `without_history`
-            given["can_bus"] = nn.functional.pad(given["can_bus"][OF_ONE_FRAME], (3, 1))
-        named = {name: value[None] for name, value in given.items()}
+        if "can_bus" in inputs:  # as `without_history`, in operators of ONNX
+            inputs["can_bus"] = nn.functional.pad(inputs["can_bus"][OF_ONE_FRAME], (3, 1))
+        batched = {name: value[None] for name, value in inputs.items()}
         head = self.model.map_head
         temporal = self.model.temporal
-        outputs = self.model.bev_encoder.encode(feats, named, tuple(images.shape[-2:]))
+        image_size = tuple(images.shape[-2:])
+        outputs = self.model.bev_encoder.encode(feats, calibration=batched, img_shape=image_size)
         if temporal is None:
             predictions = head(outputs)
         else:
-            memory = {name: named[f"{MEMORY}{name}"] for name in self.memory}
-            motion, seconds, continues = (named[name] for name in OF_STREAM)
-            batch = temporal.recall(outputs, Past(memory, motion, seconds[0], continues[0] > 0.5))
-            predictions = head(batch.outputs, **batch.hooks)
-        decoded = head.reference.decode(predictions[-1].references[0])
-        best = head.coder.best(head.coder.weighed(predictions[-1].scores[0], decoded))
+            past = Past(
+                memory={name: batched[f"{MEMORY_PREFIX}{name}"] for name in self.memory},
+                now_from_then=batched["now_from_then"],
+                seconds=batched["seconds"][0],
+                continues=batched["continues"][0] > 0.5,
+            )
+            recalled = temporal.recall(outputs, past)
+            predictions = head(recalled.outputs, **recalled.hooks)
+        last_layer = predictions[-1]
+        decoded = head.reference.decode(last_layer.references[0])
+        best = head.coder.best(head.coder.weighed(last_layer.scores[0], decoded))
         fields = head.detected(decoded, best)
-        names = ("pts", *head.reference.outputs[1:])
-        elements = (best.scores, best.labels, *(fields[name] for name in names))
-        left = {} if temporal is None else temporal.collect_memory(batch)
-        return elements, {name: value[0] for name, value in left.items()}
+        elements = [best.scores, best.labels, fields["pts"]]
+        for name in head.reference.outputs[1:]:
+            elements.append(fields[name])
+        new_memory: dict[str, Tensor] = {}
+        if temporal is not None:
+            for name, value in temporal.collect_memory(recalled).items():
+                new_memory[name] = value[0]
+        return tuple(elements), new_memory
 
     @torch.no_grad()
     def example_inputs(self, num_cams: int, image_size: tuple[int, int]) -> tuple[Tensor, ...]:
-        """Return inputs of the right shapes: black images of cameras at the origin.
+        """Create inputs of the right shapes: black images of cameras at the origin.
 
-        With memory, a first frame says what it is, which sets ``memory`` and all names.
+        For a model with memory, a frame is computed to find the names and shapes of its memory.
+
+        Args:
+            num_cams: Number of cameras.
+            image_size: Rows and columns of the images, in pixels.
+
+        Returns:
+            Tensors of ``input_names``.
         """
-        special = {
-            "can_bus": torch.zeros(NUM_CAN_BUS),
-            "now_from_then": torch.eye(4),
-            "seconds": torch.zeros(1),
-            "continues": torch.zeros(1),
-        }
-        given = {  # a tensor of its own for each: torch takes one tensor for one input
-            name: special.get(name, torch.eye(4).repeat(num_cams, 1, 1))
-            for name in self.input_names[1:]
-            if not name.startswith(MEMORY)
-        }
+        inputs: dict[str, Tensor] = {}
+        for name in self.input_names[1:]:
+            if name.startswith(MEMORY_PREFIX):
+                continue
+            if name == "can_bus":
+                inputs[name] = torch.zeros(NUM_CAN_BUS)
+            elif name == "now_from_then":
+                inputs[name] = torch.eye(4)
+            elif name in STREAM_INPUTS:
+                inputs[name] = torch.zeros(1)
+            else:
+                inputs[name] = torch.eye(4).repeat(num_cams, 1, 1)
         images = torch.zeros(num_cams, 3, *image_size)
         if self.model.temporal is not None and not self.memory:
-            _, left = self.step(images, dict(given))
-            self.memory = tuple(left)
-            given |= {f"{MEMORY}{name}": torch.zeros_like(value) for name, value in left.items()}
-            self.input_names = ("images", *given)
-            self.output_names += tuple(f"new_{MEMORY}{name}" for name in left)
-        return images, *given.values()
+            _, memory = self.step(images, inputs=dict(inputs))
+            self.memory = tuple(memory)
+            for name, value in memory.items():
+                inputs[f"{MEMORY_PREFIX}{name}"] = torch.zeros_like(value)
+            self.input_names = ("images", *inputs)
+            self.output_names += tuple(f"new_{MEMORY_PREFIX}{name}" for name in memory)
+        return images, *inputs.values()
 
 
 def export_onnx(
@@ -146,25 +183,27 @@ def export_onnx(
     image_size: tuple[int, int],
     frame: str = "lidar",
 ) -> None:
-    """Write a model as an ONNX file that holds standard operators only.
+    """Export a model to an ONNX file with standard operators only.
+
+    The metadata of the file contain the pose of the annotation frame on the vehicle if ``model`` is
+    from ``load_model``.
 
     Args:
-        model: A `MapDetector` with its weights, on the CPU; it is left in evaluation mode.
+        model: A `MapDetector` with its weights on the CPU. It is set to evaluation mode.
         out: File to write.
         cameras: Names of the cameras, in the order of the images.
-        image_size: Rows and columns of the images as the data pipeline leaves them.
-        frame: Frame of the annotations, for whoever uses the file. Where a model of ``load_model``
-            has it in the vehicle is written beside it.
+        image_size: Rows and columns of the images of the data pipeline, in pixels.
+        frame: Annotation frame, for the metadata: ``"lidar"`` or ``"ego"``.
 
     Raises:
         RuntimeError: If the packages of the extra ``onnx`` are not installed.
-        ValueError: If the model reads LiDAR, has another number of cameras, or does something for
-            which ONNX has no operator.
+        ValueError: If the model reads LiDAR, has another number of cameras, or needs an operator
+            that ONNX does not have.
     """
     onnx = import_extra("onnx", "onnx")
-    import_extra("onnxscript", "onnx")  # what torch's exporter is written with
+    import_extra("onnxscript", "onnx")  # a dependency of torch's exporter
     exported = ExportedDetector(model).eval()
-    inputs = exported.example_inputs(len(cameras), image_size)
+    inputs = exported.example_inputs(len(cameras), image_size=image_size)
     try:
         with torch.no_grad():
             program = torch.onnx.export(
@@ -174,16 +213,16 @@ def export_onnx(
                 opset_version=OPSET,
                 input_names=exported.input_names,
                 output_names=exported.output_names,
-                custom_translation_table=_translations(),
+                custom_translation_table=_operator_translations(),
                 verbose=False,
             )
     except torch.onnx.errors.OnnxExporterError as error:
-        raise InputError(_reason(error)) from error
-    assert program is not None  # it is None only where torch writes the file itself
+        raise InputError(_describe_export_error(error)) from error
+    assert program is not None  # None is returned only if torch writes the file itself
     proto = program.model_proto
-    for part in (proto.graph, *proto.graph.node):  # stack traces of the machine that exported
-        del part.metadata_props[:]
-    metadata = graph_metadata(exported, cameras, image_size, frame)
+    for part in (proto.graph, *proto.graph.node):
+        del part.metadata_props[:]  # stack traces with paths of this machine
+    metadata = graph_metadata(exported, cameras=cameras, image_size=image_size, frame=frame)
     onnx.helper.set_model_props(proto, {METADATA_KEY: json.dumps(metadata)})
     onnx.checker.check_model(proto)
     write_bytes(out, proto.SerializeToString())
@@ -192,7 +231,7 @@ def export_onnx(
 def graph_metadata(
     exported: ExportedDetector, cameras: Sequence[str], image_size: tuple[int, int], frame: str
 ) -> dict[str, Any]:
-    """Facts about a model that a file of `export_onnx` carries for `OnnxInferencer`.
+    """Metadata of an ONNX file for `OnnxInferencer`.
 
     Args:
         exported: The model in its exported form.
@@ -201,7 +240,7 @@ def graph_metadata(
         frame: Annotation frame: ``"lidar"`` or ``"ego"``.
 
     Returns:
-        The facts, as JSON can hold them.
+        The metadata, in JSON types.
     """
     model = exported.model
     head = model.map_head
@@ -217,10 +256,11 @@ def graph_metadata(
         "score_threshold": head.coder.score_threshold,
         "unfold_classes": list(head.coder.unfold_classes),
     }
-    if getattr(model, "mount", None) is not None:  # of `load_model`
-        metadata["ground_z_m"] = model.mount.ground_z_m
-        metadata["ground_from_frame"] = model.mount.matrix.tolist()
-        metadata["ego_from_frame"] = model.mount.ego_from_frame.tolist()
+    mount = getattr(model, "mount", None)  # only models of `load_model` have one
+    if mount is not None:
+        metadata["ground_z_m"] = mount.ground_z_m
+        metadata["ground_from_frame"] = mount.matrix.tolist()
+        metadata["ego_from_frame"] = mount.ego_from_frame.tolist()
     if "can_bus" in exported.input_names:
         metadata["can_bus"] = signals_rule(model)
     if model.temporal is not None:
@@ -229,7 +269,7 @@ def graph_metadata(
 
 
 def signals_rule(model: Any) -> str:
-    """Values of ``can_bus`` that a model of `load_model` was trained with, in words."""
+    """Description of the ``can_bus`` values that a model of `load_model` was trained with."""
     if getattr(model, "without_signals", False):
         return NO_SIGNALS
     cfg = getattr(model, "cfg", None)
@@ -239,9 +279,14 @@ def signals_rule(model: Any) -> str:
 
 
 def halve_onnx(path: str | Path, out: str | Path) -> None:
-    """Write a file of `export_onnx` anew, with convolutions that work in half precision.
+    """Convert the convolutions of an exported file to half precision.
 
-    They are nearly all of the arithmetic. What places and scores elements stays in float32.
+    Convolutions are nearly all of the arithmetic. All other operators, which compute positions and
+    scores of elements, stay in float32.
+
+    Args:
+        path: File of `export_onnx`.
+        out: File to write.
     """
     import onnx
     from onnx import TensorProto, helper, numpy_helper
@@ -256,7 +301,7 @@ def halve_onnx(path: str | Path, out: str | Path) -> None:
             continue
         for name in node.input[1:]:
             half = numpy_helper.to_array(weights[name]).astype(np.float16)
-            weights[name].CopyFrom(numpy_helper.from_array(half, name))
+            weights[name].CopyFrom(numpy_helper.from_array(half, name=name))
         image, *parameters = node.input
         (result,) = node.output
         half_input = f"{result}_half_in"
@@ -273,33 +318,33 @@ def halve_onnx(path: str | Path, out: str | Path) -> None:
 def quantize_onnx(
     path: str | Path, out: str | Path, inputs: Iterable[dict[str, NDArray[np.float32]]]
 ) -> None:
-    """Write a file of `export_onnx` anew, with convolutions in 8 bits, calibrated on samples.
+    """Quantize the convolutions of an exported file to 8 bits, with calibration on samples.
 
     Args:
-        path: The file of `export_onnx`.
-        out: The file to write.
-        inputs: Inputs of the graph for some samples, as `OnnxInferencer.prepare` returns them.
+        path: File of `export_onnx`.
+        out: File to write.
+        inputs: Inputs of the graph for some samples, from `OnnxInferencer.prepare`.
 
     Raises:
         ValueError: If there are no inputs.
     """
     from onnxruntime.quantization import CalibrationDataReader, QuantType, quantize_static
 
-    samples = iter(inputs)
+    remaining_inputs = iter(inputs)
 
-    class Samples(CalibrationDataReader):
-        """Hands over one sample at a time."""
+    class SampleReader(CalibrationDataReader):
+        """Reader of one sample at a time."""
 
         def get_next(self) -> dict[str, NDArray[np.float32]] | None:
-            """Return the next sample's inputs, or None after the last."""
-            return next(samples, None)
+            """Inputs of the next sample, or None after the last one."""
+            return next(remaining_inputs, None)
 
     with tempfile.TemporaryDirectory(prefix="gsmap-") as folder:
         quantized = Path(folder, "int8.onnx")
         quantize_static(
             path,
             quantized,
-            Samples(),
+            SampleReader(),
             op_types_to_quantize=["Conv"],
             per_channel=True,
             activation_type=QuantType.QUInt8,
@@ -311,65 +356,74 @@ def quantize_onnx(
 def graph_inputs(
     inferencer: OnnxInferencer, dataset: Any, indices: Iterable[int]
 ) -> Iterator[tuple[str, dict[str, NDArray[np.float32]]]]:
-    """Yield token and inputs of some samples.
+    """Inputs of the exported graph for samples of a data set.
+
+    For a model with memory, the graph is run as well, and the samples of a scene form a stream in
+    the order of ``indices``.
 
     Args:
         inferencer: The exported graph.
         dataset: Data set with the test pipeline.
-        indices: Samples of the data set.
+        indices: Indices of the samples.
 
-    With memory the samples of a scene continue each other, in their order.
+    Yields:
+        Token of a sample, and its inputs by name.
 
     Raises:
-        ValueError: If images or matrices are not those of the file's cameras.
+        ValueError: If images or matrices do not fit the cameras of the graph.
     """
     streams = inferencer.new_scenes() if inferencer.has_memory else None
     for index in indices:
         packed = dataset[index]
         images = packed["inputs"]["img"].permute(0, 2, 3, 1).numpy()  # (V, H, W, 3)
         meta = packed["data_samples"].metainfo
-        inputs = inferencer.prepare(images, meta, streams)
+        inputs = inferencer.prepare(images, meta=meta, stream=streams)
         yield meta["token"], inputs
         if streams is not None:
-            inferencer.remember(streams, meta, inferencer.run(inputs))
+            outputs = inferencer.run(inputs)
+            inferencer.remember(streams, meta=meta, outputs=outputs)
 
 
 def largest_differences(
     found: MapElements, expected: MapElements, unfolded: Sequence[int] = ()
 ) -> tuple[float, float]:
-    """Compare two predictions of one sample; elements of nearly one score may change places.
+    """Compare two predictions of one sample. The order of elements may differ.
 
     Args:
-        found: Elements of one way.
-        expected: Elements of the other.
-        unfolded: Class indices whose points may change places, too: where two orders are nearly as
-            short, rounding decides which one ``unfold_classes`` takes.
+        found: Elements of the first prediction.
+        expected: Elements of the second prediction.
+        unfolded: Class indices whose points may be in another order. Where two orders are nearly
+            equally short, rounding determines which one ``unfold_classes`` selects.
 
     Returns:
-        The largest difference of a score, and of a coordinate in metres between an element and the
-        nearest one of its class; infinite if there are not as many elements of each class.
+        The largest difference of a score, and the largest distance of an element to the nearest one
+        of its class: the largest difference of a coordinate, in metres. Both are infinite if the
+        numbers of elements of a class differ.
     """
     if sorted(found.labels) != sorted(expected.labels):
         return float("inf"), float("inf")
     if not len(found):
         return 0.0, 0.0
     scores = np.abs(np.sort(found.confidence) - np.sort(expected.confidence)).max()
-    apart = np.full((len(found), len(found)), np.inf)
-    for i, ours in enumerate(found.polylines):
-        for j, theirs in enumerate(expected.polylines):
-            if found.labels[i] == expected.labels[j] and ours.shape == theirs.shape:
-                apart[i, j] = np.abs(ours - theirs).max()
-                if found.labels[i] in unfolded:
-                    between = np.abs(ours[:, None] - theirs).max(-1)
-                    apart[i, j] = max(between.min(0).max(), between.min(1).max())
-    return float(scores), float(apart.min(1).max())
+    distances = np.full((len(found), len(found)), fill_value=np.inf)  # (M, M)
+    for i, line in enumerate(found.polylines):
+        for j, expected_line in enumerate(expected.polylines):
+            if found.labels[i] != expected.labels[j] or line.shape != expected_line.shape:
+                continue
+            distances[i, j] = np.abs(line - expected_line).max()
+            if found.labels[i] in unfolded:
+                between_points = np.abs(line[:, None] - expected_line).max(-1)  # (P, P)
+                to_line = between_points.min(0).max()
+                from_line = between_points.min(1).max()
+                distances[i, j] = max(to_line, from_line)
+    return float(scores), float(distances.min(1).max())
 
 
-def _translations() -> dict[Any, Any]:
-    """Translations of torch's operators to ONNX that replace those of the exporter."""
+def _operator_translations() -> dict[Any, Any]:
+    """Translations of torch's operators to ONNX that replace the exporter's."""
     from onnxscript import opset18
 
-    op: Any = opset18  # its types know tensors by element type, which no value here has yet
+    op: Any = opset18  # its annotations expect element types, which are unknown here
 
     def embedding_bag(
         table: Any,
@@ -382,12 +436,13 @@ def _translations() -> dict[Any, Any]:
         include_last_offset: bool,
         _padding_idx: int | None,
     ) -> Any:
-        """Sum weighted rows in bags of one size, as `sum_rows` does, without a loop."""
+        """Weighted sums of rows in bags of one size, as in `sum_rows`, without a loop."""
         if mode != 0 or weights is None or include_last_offset:
             raise NotImplementedError("embedding_bag other than weighted sums in bags of one size")
         one = op.Constant(value_ints=[1])
-        size = op.Div(op.Shape(rows), op.Max(op.Shape(offsets), one))  # -1 fails without any bag
-        bags = op.Concat(op.Shape(offsets), size, axis=0)
+        num_bags = op.Shape(offsets)
+        bag_size = op.Div(op.Shape(rows), op.Max(num_bags, one))  # Reshape to -1 fails for 0 bags
+        bags = op.Concat(num_bags, bag_size, axis=0)
         weights = op.Unsqueeze(op.Reshape(weights, bags, allowzero=1), one)
         sums = op.MatMul(weights, op.Gather(table, op.Reshape(rows, bags, allowzero=1)))
         return op.Squeeze(sums, one), offsets, offsets, offsets
@@ -395,13 +450,13 @@ def _translations() -> dict[Any, Any]:
     return {torch.ops.aten.embedding_bag.padding_idx: embedding_bag}
 
 
-def _reason(error: BaseException) -> str:
+def _describe_export_error(error: BaseException) -> str:
     """Message of the first cause of a failed export."""
     while error.__cause__ is not None:
         error = error.__cause__
-    if isinstance(error, GsmapError):  # the model's own word, for instance of a number of cameras
+    if isinstance(error, GsmapError):  # raised by the model, for example for a number of cameras
         return str(error)
     return (
         f"the model cannot be written in ONNX's operators ({error!s:.300}): say how in "
-        "_translations() of gsmap/apis/export.py, or replace that part of the model."
+        "_operator_translations() of gsmap/apis/export.py, or replace that part of the model."
     )

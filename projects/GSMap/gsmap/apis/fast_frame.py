@@ -2,7 +2,7 @@
 
 A frame of these models consists of hundreds of small operations, and the GPU waits for the host to
 launch each of them. If no tensor size depends on values, all launches of a frame are recorded once
-for each image size and replayed for later frames.
+per image size, and replayed for later frames.
 """
 
 import threading
@@ -25,17 +25,20 @@ from gsmap.utils.errors import InputError, WorkError
 if TYPE_CHECKING:
     from mmdet3d.structures import Det3DDataSample
 
-SWITCH = "cuda_graphs"  # of `MapInferencer`; --cuda-graphs of the commands
-CAPTURE_BY_DEFAULT = True  # an H100 has found captured frames equal to launched ones
-_MOST_GRAPHS = 4  # of different sizes; each holds the memory of a frame
-_WARM_UP = 3  # frames before a capture: libraries choose and load their kernels
+SWITCH = "cuda_graphs"  # argument of `MapInferencer`; --cuda-graphs in commands
+CAPTURE_BY_DEFAULT = True  # replayed and launched frames were equal on an H100
+_MOST_GRAPHS = 4  # of different sizes; each occupies the memory of a frame
+_WARM_UP = 3  # frames before a capture, in which libraries select and load kernels
 
 
 def reason_against(model: Any) -> str:
-    """Why frames of a model cannot be one static function; empty if they can.
+    """Reason why a model has no static form (`StaticFrame`).
 
     Args:
         model: A `MapDetector`.
+
+    Returns:
+        The reason, as a clause about the model; empty if the model has a static form.
     """
     head = model.map_head
     if model.lidar_encoder is not None:
@@ -50,14 +53,15 @@ def reason_against(model: Any) -> str:
 
 
 class StaticFrame(nn.Module):
-    """A model from pixels to its best elements, as a function of tensors of fixed sizes.
+    """A model from pixels to its best elements, as a function of tensors with fixed sizes.
 
     Args:
-        model: A `MapDetector` of cameras in evaluation mode. Its encoder takes the paths of fixed
-            sizes from then on, whose results differ from the others' by rounding.
+        model: A camera `MapDetector` in evaluation mode. Its encoder is switched to operations of
+            fixed sizes, whose results differ from the default operations by rounding.
 
     Attributes:
-        layout: Name, shape and type of each field of an element, after the first call.
+        names: Names of the calibration arrays.
+        layout: Shape and type of each field of an element, by name; empty before the first call.
 
     Raises:
         ValueError: If the model has no static form (`reason_against`).
@@ -75,14 +79,14 @@ class StaticFrame(nn.Module):
                 part.fixed_sizes = True
 
     def forward(self, images: Tensor, *calibration: Tensor) -> Tensor:
-        """Best elements of each sample, wherever they lie, best first.
+        """Predict the best elements of each sample, including elements outside of the map.
 
         Args:
             images: Pixel values of the cameras, 0 to 255. (B, V, 3, H, W)
             calibration: Arrays of ``names`` (`calibration_arrays`). (B, V, 4, 4) or (B, 18) each
 
         Returns:
-            The fields of ``layout`` side by side, in float32. (B, M, F)
+            Concatenated fields of ``layout`` in float32, best element first. (B, M, F)
         """
         model = self.model
         images = model.data_preprocessor.normalise(images)
@@ -95,11 +99,19 @@ class StaticFrame(nn.Module):
         last_layer = model.map_head(outputs)[-1]
         samples = []
         for scores, references in zip(last_layer.scores, last_layer.references, strict=True):
-            samples.append(self._elements(scores, references))
+            samples.append(self._elements(scores, references=references))
         return torch.stack(samples)
 
     def _elements(self, scores: Tensor, references: Any) -> Tensor:
-        """Best elements of one sample, their fields side by side. (M, F)"""
+        """Decode the best elements of one sample, and concatenate their fields.
+
+        Args:
+            scores: Class logits of all elements. (N, classes)
+            references: References of all elements, as the head predicts them.
+
+        Returns:
+            Concatenated fields of ``layout``. (M, F)
+        """
         head = self.model.map_head
         decoded = head.reference.decode(references)
         best = head.coder.best(head.coder.weighed(scores, decoded))
@@ -111,10 +123,17 @@ class StaticFrame(nn.Module):
             layout[name] = (value.shape[1:], value.dtype)
             columns.append(value.unsqueeze(-1).flatten(1).float())
         self.layout = layout
-        return torch.cat(columns, 1)
+        return torch.cat(columns, dim=1)
 
     def unpack(self, elements: Tensor) -> dict[str, Tensor]:
-        """Split the elements of a sample into their fields. (M, F) -> (M, ...) each"""
+        """Split the elements of a sample into fields.
+
+        Args:
+            elements: Concatenated fields of ``layout``. (M, F)
+
+        Returns:
+            Fields by name. (M, ...) each
+        """
         fields = {}
         start = 0
         for name, (shape, dtype) in self.layout.items():
@@ -126,24 +145,31 @@ class StaticFrame(nn.Module):
 
 @dataclass
 class _Captured:
-    """A recorded frame of one size."""
+    """Recorded frame of one size.
+
+    Attributes:
+        graph: The CUDA graph.
+        inputs: Tensors that the graph reads.
+        output: Tensor that the graph writes.
+        versions: Versions of the model's weights at the time of the recording.
+    """
 
     graph: Any
     inputs: list[Tensor]
     output: Tensor
-    versions: list[tuple[int, int]]  # of the model's weights
+    versions: list[tuple[int, int]]
 
 
 @dataclass
 class FastFrames:
-    """Predicts batches by a `StaticFrame`, recorded as a CUDA graph for each size.
+    """Predictor of batches by a `StaticFrame`, recorded as a CUDA graph for each size.
 
-    Several threads may call it; their frames are computed one after another.
+    It is safe for several threads, whose frames are computed one after another.
 
     Args:
-        frame: The function.
-        device: Where its model is.
-        capture: Whether frames are recorded and replayed; else each is launched by itself.
+        frame: The model as a function of tensors.
+        device: Device of the model.
+        capture: Whether frames are recorded and replayed; if not, their operations are launched.
     """
 
     frame: StaticFrame
@@ -153,7 +179,7 @@ class FastFrames:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def serves(self, batch: dict[str, Any]) -> bool:
-        """Whether a batch consists of images of one size, which the function requires."""
+        """Whether a batch consists of images of one size and has no other inputs."""
         images = batch["inputs"].get("img")
         shapes = {tuple(image.shape) for image in images or ()}
         return len(shapes) == 1 and set(batch["inputs"]) == {"img"}
@@ -162,16 +188,15 @@ class FastFrames:
         """Predict the samples of a collated batch.
 
         Args:
-            batch: ``inputs`` with ``img``, one tensor (V, 3, H, W) per sample, and
-                ``data_samples``.
+            batch: ``inputs`` with images ``img``, (V, 3, H, W) per sample, and ``data_samples``.
 
         Returns:
             The samples with ``pred_instances_3d``, on the CPU.
 
         Raises:
-            RuntimeError: If a frame of this size cannot be captured.
-            ValueError: If a sample lacks a field that the encoder reads, or has another number of
-                cameras than the model.
+            RuntimeError: If a frame of this size cannot be recorded.
+            ValueError: If a sample lacks a field that the encoder reads, or its number of cameras
+                differs from the model's.
         """
         samples = batch["data_samples"]
         images = batch["inputs"]["img"]
@@ -181,7 +206,7 @@ class FastFrames:
             images = preprocessor.run_noted_steps(pixels, samples)
         else:
             images = torch.stack(list(images))
-        self._add_shapes(batch, (images.shape[-2], images.shape[-1]))
+        self._add_shapes(batch, image_size=(images.shape[-2], images.shape[-1]))
         inputs = [images, *self._stack_calibration(samples)]
         with (
             self._lock,
@@ -189,31 +214,43 @@ class FastFrames:
             matrix_products(self.frame.model.half_backbone is not None),
         ):
             batch_elements = self._run(inputs)
-        predicted = []
+        predictions: list[Det3DDataSample] = []
         for sample, elements in zip(samples, batch_elements, strict=True):
-            predicted.append(self._with_predictions(sample, elements))
-        return predicted
+            predictions.append(self._with_predictions(sample, elements=elements))
+        return predictions
 
     def _stack_calibration(self, samples: "Sequence[Det3DDataSample]") -> list[Tensor]:
-        """Calibration arrays of a batch in the order of the frame's ``names``. (B, ...) each"""
+        """Stack the calibration arrays of samples, in the order of ``names``. (B, ...) each"""
         names = self.frame.names
-        arrays = [calibration_arrays(sample.metainfo, names) for sample in samples]
+        arrays = [calibration_arrays(sample.metainfo, names=names) for sample in samples]
         stacks = []
         for name in names:
             stack = np.stack([sample_arrays[name] for sample_arrays in arrays])
             stacks.append(torch.from_numpy(stack))
         return stacks
 
-    def _add_shapes(self, batch: dict[str, Any], size: tuple[int, int]) -> None:
-        """Add the sizes of the padded images to the samples, as the data preprocessor does."""
+    def _add_shapes(self, batch: dict[str, Any], image_size: tuple[int, int]) -> None:
+        """Add the sizes of the padded images to the samples, as the data preprocessor does.
+
+        Args:
+            batch: Inputs and data samples.
+            image_size: Rows and columns of the images, in pixels.
+        """
         preprocessor = self.frame.model.data_preprocessor
-        shape = padded_size(size, preprocessor.pad_size_divisor)
+        shape = padded_size(image_size, preprocessor.pad_size_divisor)
         padded = preprocessor._get_pad_shape(batch)
         for sample, pad_shape in zip(batch["data_samples"], padded, strict=True):
             sample.set_metainfo({"batch_input_shape": shape, "pad_shape": pad_shape})
 
     def _run(self, inputs: Sequence[Tensor]) -> Tensor:
-        """Elements of a batch, on the host. (B, M, F)"""
+        """Compute the elements of a batch, by the recorded frame of this size.
+
+        Args:
+            inputs: Images and calibration arrays.
+
+        Returns:
+            Elements on the CPU. (B, M, F)
+        """
         if not self.capture:
             on_device = [tensor.to(self.device) for tensor in inputs]
             return self.frame(*on_device).cpu()
@@ -221,18 +258,23 @@ class FastFrames:
         while True:
             captured = self._graphs.get(key)
             if captured is None:
-                captured = self._record(key, inputs)
+                captured = self._record(key, inputs=inputs)
             for buffer, value in zip(captured.inputs, inputs, strict=True):
                 buffer.copy_(value, non_blocking=True)
             captured.graph.replay()
-            # While the GPU works: the graph is valid only for the weights that it recorded.
+            # The GPU computes in the meantime. A graph is valid only for unchanged weights.
             if tensor_versions(self.frame.model) == captured.versions:
                 self._graphs.move_to_end(key)
                 return captured.output.cpu()
             del self._graphs[key]
 
     def _record(self, key: Any, inputs: Sequence[Tensor]) -> _Captured:
-        """Record a frame of the inputs' sizes."""
+        """Record a frame with the sizes of the inputs.
+
+        Args:
+            key: Key of the sizes and types.
+            inputs: Images and calibration arrays.
+        """
         while len(self._graphs) >= _MOST_GRAPHS:
             self._graphs.popitem(last=False)
         buffers = [tensor.to(self.device) for tensor in inputs]
@@ -240,7 +282,7 @@ class FastFrames:
             stream = torch.cuda.Stream()
             stream.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(stream):
-                for _ in range(_WARM_UP):  # errors of the input are raised here, unchanged
+                for _ in range(_WARM_UP):  # errors of the input are raised here
                     self.frame(*buffers)
             torch.cuda.current_stream().wait_stream(stream)
             graph = torch.cuda.CUDAGraph()
@@ -253,11 +295,16 @@ class FastFrames:
                     f"without ({SWITCH}=False, --no-{SWITCH.replace('_', '-')})."
                 ) from error
         versions = tensor_versions(self.frame.model)
-        self._graphs[key] = _Captured(graph, buffers, output, versions)
+        self._graphs[key] = _Captured(graph=graph, inputs=buffers, output=output, versions=versions)
         return self._graphs[key]
 
     def _with_predictions(self, sample: "Det3DDataSample", elements: Tensor) -> "Det3DDataSample":
-        """Add the elements (M, F) that lie on the map to a sample."""
+        """Add the elements on the map to a sample.
+
+        Args:
+            sample: The sample.
+            elements: Concatenated fields of its elements. (M, F)
+        """
         head = self.frame.model.map_head
         fields = self.frame.unpack(elements)
         on_map = head.coder.keep_mask(fields["scores_3d"], fields["pts"])
@@ -266,13 +313,17 @@ class FastFrames:
         visible = {name: value[on_map] for name, value in fields.items()}
         visible = head.coder.unfolded(visible, labels)
         visible.update(scores_3d=scores, labels_3d=labels)
-        predicted = InstanceData(metainfo=dict(head.reference.metainfo), **visible)
-        return self.frame.model.add_pred_to_datasample([sample], [predicted])[0]
+        instances = InstanceData(metainfo=dict(head.reference.metainfo), **visible)
+        return self.frame.model.add_pred_to_datasample([sample], [instances])[0]
 
 
 @contextmanager
 def matrix_products(in_tf32: bool) -> Iterator[None]:
-    """Context in which float32 matrix products on a GPU use TF32, if asked for."""
+    """Use TF32 for float32 matrix products on a GPU in a block.
+
+    Args:
+        in_tf32: Whether to use TF32; if not, the precision is not changed.
+    """
     before = torch.get_float32_matmul_precision()
     if in_tf32:
         torch.set_float32_matmul_precision("high")

@@ -126,16 +126,18 @@ def _add_blank_cameras(item: dict[str, Any], cameras: Sequence[str]) -> dict[str
         "lidar2img": augmentation @ intrinsics @ OUT_OF_SIGHT,
     }
     position = {name: index for index, name in enumerate(meta["cam_names"])}
+    indices = list(map(position.get, cameras))  # None for an absent camera
     all_images: list[torch.Tensor] = []
     all_paths: list[Any] = []
-    all_matrices: dict[str, list[np.ndarray]] = {key: [] for key in blank_matrices}
-    for name in cameras:
-        index = position.get(name)
+    for index in indices:
         all_images.append(torch.zeros_like(images[0]) if index is None else images[index])
         all_paths.append(None if index is None else meta["img_path"][index])
-        for key, blank_matrix in blank_matrices.items():
-            all_matrices[key].append(blank_matrix if index is None else meta[key][index])
-    stacked_matrices = {key: np.stack(matrices) for key, matrices in all_matrices.items()}
-    sample.set_metainfo({**stacked_matrices, "img_path": all_paths, "cam_names": list(cameras)})
+    metainfo: dict[str, Any] = {"img_path": all_paths, "cam_names": list(cameras)}
+    for key, blank_matrix in blank_matrices.items():
+        matrices: list[np.ndarray] = []
+        for index in indices:
+            matrices.append(blank_matrix if index is None else meta[key][index])
+        metainfo[key] = np.stack(matrices)
+    sample.set_metainfo(metainfo)
     inputs = {**item["inputs"], "img": torch.stack(all_images)}
     return {"inputs": inputs, "data_samples": sample}

@@ -156,7 +156,7 @@ class LiveMap:
             self._prepare(pixels)
             self._sizes = sizes
         self._dataset.images_in_memory = pixels
-        signals = None if can_bus is None else np.asarray(can_bus, float)
+        signals = None if can_bus is None else np.asarray(can_bus, dtype=float)
         self._dataset.can_bus_in_memory = signals
         frame = None if self._inferencer.model.temporal is None else _SINGLE_FRAME
         if at is not None:

@@ -172,7 +172,7 @@ def _check_height(value: Any) -> float:
 
 def _check_mount(value: Any) -> np.ndarray:
     """Convert a pose in a file to a matrix (4, 4); ValueError if it is not possible."""
-    matrix = np.array(value, np.float64)
+    matrix = np.array(value, dtype=np.float64)
     is_near = matrix.shape == (4, 4) and abs(matrix).max() < _FARTHEST_M
     if not is_near or not is_rigid(matrix):
         raise InputError("no place on a vehicle")

@@ -150,7 +150,8 @@ class MapInferencer:
         for model, place in zip([self.model, *copies], self.devices, strict=True):
             replica = model.to(place)
             self.replicas.append(replica)
-            self._fast_frames.append(self._build_fast_frames(replica, place, cuda_graphs))
+            fast_frames = self._build_fast_frames(replica, device=place, cuda_graphs=cuda_graphs)
+            self._fast_frames.append(fast_frames)
         self._camera_embeds = getattr(self.model.bev_encoder, "cams_embeds", None)
         self.visualizer = _build_visualizer(self.cfg)
         self._scratch = tempfile.TemporaryDirectory(prefix="gsmap-")
@@ -245,7 +246,8 @@ class MapInferencer:
         if allow_missing_cameras:
             available: set[str] = set()
             for index in range(len(dataset)):
-                available.update(camera.name for camera in dataset.sample(index).cameras)
+                for camera in dataset.sample(index).cameras:
+                    available.add(camera.name)
             cameras = tuple(name for name in dataset.cameras if name in available)
             if cameras:
                 dataset = copy.copy(dataset)
@@ -254,7 +256,7 @@ class MapInferencer:
             return dataset
         from gsmap.apis.rig_fit import camera_rows
 
-        rows = camera_rows(dataset, trained)
+        rows = camera_rows(dataset, trained=trained)
         for replica, device in zip(self.replicas, self.devices, strict=True):
             embeds = self._camera_embeds.detach()[rows].to(device)  # (V, C)
             replica.bev_encoder.cams_embeds = torch.nn.Parameter(embeds)
@@ -327,9 +329,9 @@ class MapInferencer:
             stream = self._temporal().new_scenes()
         elif stream is not None:
             self._temporal()
-        dataset = self._fit_cameras(dataset, allow_missing_cameras)
+        dataset = self._fit_cameras(dataset, allow_missing_cameras=allow_missing_cameras)
         frames = FrameDataset(dataset, blank_cameras=allow_missing_cameras)
-        subset = frames if indices is None else Subset(frames, indices)
+        subset = frames if indices is None else Subset(frames, indices=indices)
         batches = DataLoader(
             subset, batch_size=batch_size, num_workers=num_workers, collate_fn=collate
         )
@@ -344,7 +346,10 @@ class MapInferencer:
                 if batch is not None:
                     turn = number % len(pools)
                     with signals_later():  # a pool has locks, see `result_of`
-                        pending.append(pools[turn].submit(self._step, turn, batch, stream))
+                        future = pools[turn].submit(
+                            self._step, turn=turn, batch=batch, stream=stream
+                        )
+                        pending.append(future)
                 if len(pending) > num_ahead:
                     yield from result_of(pending.popleft())
             while pending:
@@ -480,4 +485,4 @@ class MapInferencer:
         Returns:
             The samples in order, with ``pred_instances_3d`` on the CPU.
         """
-        return list(self.predict(self.dataset(source, data_root), stream=stream))
+        return list(self.predict(self.dataset(source, data_root=data_root), stream=stream))

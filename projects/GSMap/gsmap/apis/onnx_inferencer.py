@@ -1,4 +1,4 @@
-"""An exported model on a vehicle's images: numpy and onnxruntime alone, neither torch nor mmcv."""
+"""Predictor for exported models on a vehicle, which requires only numpy and onnxruntime."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -27,32 +27,32 @@ POSE_ONLY_RULE = (
     "the vehicle, as the model was trained"
 )
 NO_SIGNALS = "not needed: the model was trained without vehicle signals; zeros are taken"
-OF_STREAM = ("now_from_then", "seconds", "continues")  # inputs of a model with memory
-MEMORY = "memory_"  # how its further inputs start; what replaces them has new_ besides
+STREAM_INPUTS = ("now_from_then", "seconds", "continues")  # inputs of a model with memory
+MEMORY_PREFIX = "memory_"  # of further inputs; the outputs that replace them start with new_memory_
 _PRECISIONS = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
-_OUTPUTS = {"scores", "labels", "points"}
+_REQUIRED_OUTPUTS = {"scores", "labels", "points"}
 
 
 class OnnxInferencer:
-    """Runs an ONNX file that ``tools/export.py`` wrote.
+    """Predictor of map elements by an ONNX file of ``tools/export.py``.
 
     Args:
         path: The file.
-        providers: Execution providers of ONNX Runtime, by preference.
-        num_threads: Threads of one operator; 0 for one a core.
+        providers: Execution providers of ONNX Runtime, in order of preference.
+        num_threads: Number of threads of an operator; 0 uses one per core.
 
     Attributes:
         classes: Names of the classes.
-        cameras: Names of the cameras, in the order in which images and matrices are given.
-        image_size: Rows and columns of the images.
-        metadata: All that the file says of itself. With ``ground_from_frame`` (4, 4) it says where
-            the annotation frame lay over the ground below the rear axle (x ahead, y left, z up, in
-            metres) in training: a vehicle's calibration belongs into a frame that lies there.
+        cameras: Names of the cameras, in the order of images and matrices.
+        image_size: Rows and columns of the images, in pixels.
+        metadata: Metadata of the file. ``ground_from_frame`` (4, 4), if present, is the transform
+            in metres from the annotation frame to the ground below the rear axle (x ahead, y left,
+            z up) in the training data. The frame of a vehicle's calibration must have this pose.
 
     Raises:
         FileNotFoundError: If there is no such file.
         RuntimeError: If onnxruntime is not installed.
-        ValueError: If the file is not an exported model, or of another version.
+        ValueError: If the file is not an exported model, or was exported by another version.
     """
 
     def __init__(
@@ -67,33 +67,18 @@ class OnnxInferencer:
             raise FileNotFoundError(f"There is no ONNX file {path}; tools/export.py writes one.")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = num_threads
-        options.log_severity_level = 4  # what fails is raised as well
+        options.log_severity_level = 4  # errors are raised, so they need no log
         try:
             self.session = onnxruntime.InferenceSession(
                 str(path), options, providers=list(providers)
             )
-        except Exception as error:  # onnxruntime's errors have no common class of their own
+        except Exception as error:  # errors of onnxruntime have no common base class
             raise InputError(
                 f"{path} cannot be run by ONNX Runtime {onnxruntime.__version__} "
                 f"({error!s:.300}): export it again, or install a newer onnxruntime."
             ) from error
         try:
-            found = self.session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
-            self.metadata: dict[str, Any] = json.loads(found or "{}")
-            if self.metadata["format"] != FORMAT:
-                raise InputError("another format")
-            _check_metadata(self.metadata)
-            self._outputs = [value.name for value in self.session.get_outputs()]
-            images, *others = self.session.get_inputs()
-            shape = [len(self.metadata["cameras"]), 3, *self.metadata["image_size"]]
-            if images.shape != shape or not set(self._outputs) >= _OUTPUTS:
-                raise InputError("its graph is not the one that its metadata tell of")
-            memory = [value for value in others if value.name.startswith(MEMORY)]
-            self._empty = {
-                value.name: np.zeros(value.shape, _PRECISIONS[value.type]) for value in memory
-            }
-            if self.has_memory != bool(memory):
-                raise InputError("its graph and its metadata do not agree on a memory")
+            self._read_graph()
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise InputError(
                 f"{path} does not say that tools/export.py of this version wrote it ({error!r}): "
@@ -102,25 +87,55 @@ class OnnxInferencer:
         self.classes: tuple[str, ...] = tuple(self.metadata["classes"])
         self.cameras: tuple[str, ...] = tuple(self.metadata["cameras"])
         self.image_size: tuple[int, int] = tuple(self.metadata["image_size"])
-        names = [value.name for value in others]
-        self._calibration = [n for n in names if n not in (*self._empty, *OF_STREAM)]
+
+    def _read_graph(self) -> None:
+        """Read and check the metadata, the inputs and the outputs of the graph."""
+        metadata_text = self.session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
+        self.metadata: dict[str, Any] = json.loads(metadata_text or "{}")
+        if self.metadata["format"] != FORMAT:
+            raise InputError("another format")
+        _check_metadata(self.metadata)
+        self._outputs = [output.name for output in self.session.get_outputs()]
+        images, *other_inputs = self.session.get_inputs()
+        shape = [len(self.metadata["cameras"]), 3, *self.metadata["image_size"]]
+        if images.shape != shape or not _REQUIRED_OUTPUTS.issubset(self._outputs):
+            raise InputError("its graph is not the one that its metadata tell of")
+        self._initial_memory: dict[str, NDArray[Any]] = {}
+        self._calibration: list[str] = []
+        for graph_input in other_inputs:
+            name = graph_input.name
+            if name.startswith(MEMORY_PREFIX):
+                dtype = _PRECISIONS[graph_input.type]
+                self._initial_memory[name] = np.zeros(graph_input.shape, dtype=dtype)
+            elif name not in STREAM_INPUTS:
+                self._calibration.append(name)
+        if self.has_memory != bool(self._initial_memory):
+            raise InputError("its graph and its metadata do not agree on a memory")
 
     def __str__(self) -> str:
         return str(self.path)
 
     @property
     def has_memory(self) -> bool:
-        """Whether the model remembers the frames before."""
+        """Whether the model uses the memory of previous frames."""
         return "max_gap_s" in self.metadata
 
     def new_stream(self) -> MapStream:
-        """Return the empty memory of one drive, for calls; ValueError if the file has no memory."""
+        """Create the empty memory of a drive.
+
+        Raises:
+            ValueError: If the model has no memory.
+        """
         if not self.has_memory:
             raise InputError(f"{self.path.name} has no memory: leave the stream out.")
         return MapStream(self.metadata["max_gap_s"])
 
     def new_scenes(self) -> Scenes:
-        """Return empty memories of several scenes, as `new_stream`."""
+        """Create the empty memories of several scenes.
+
+        Raises:
+            ValueError: If the model has no memory.
+        """
         return Scenes(self.new_stream().max_gap_s)
 
     def __call__(
@@ -129,32 +144,37 @@ class OnnxInferencer:
         meta: Mapping[str, Any],
         stream: Scenes | None = None,
     ) -> MapElements:
-        """Find the map elements of one sample.
+        """Predict the map elements of one sample.
 
         Args:
-            images: One image of each of ``cameras``, in their order: BGR as OpenCV reads them,
-                values 0 to 255, scaled to ``image_size``. V x (H, W, 3)
-            meta: ``lidar2img`` (V, 4, 4): from metres in the annotation frame to (u * d, v * d, d,
-                1) in pixels of these images. Camera-aware LSS encoders also read ``lidar2cam``,
-                ``cam2img`` of the original images, ``img_aug_matrix`` (V, 4, 4) from those to
-                these, and ``lidar2ego`` (4, 4), by default that of the training. GKT and BEVFormer
-                read
-                ``can_bus`` (18,), as a record has it; zeros if the model was trained without it.
-                With memory also ``scene``, ``timestamp_ns`` and ``lidar2global`` (4, 4), from the
-                annotation frame to the world.
-            stream: With memory, that of the drive (`new_stream`); it is brought forward.
+            images: Images of ``cameras`` in their order: BGR as OpenCV reads them, values 0 to 255,
+                scaled to ``image_size``. (V, H, W, 3)
+            meta: Calibration of the sample.
+
+                * All models read ``lidar2img`` (V, 4, 4): from metres in the annotation frame to
+                  (u * d, v * d, d, 1) in pixels of these images.
+                * Camera-aware LSS encoders also read ``lidar2cam`` in metres, ``cam2img`` of the
+                  original images in pixels, ``img_aug_matrix`` from the original to these images,
+                  (V, 4, 4) each, and ``lidar2ego`` (4, 4) in metres, by default the one of the
+                  training data.
+                * GKT and BEVFormer also read ``can_bus`` (18,) of a record, unless the model was
+                  trained without vehicle signals.
+                * Models with memory also read ``scene``, ``timestamp_ns`` and ``lidar2global``
+                  (4, 4), from the annotation frame to the world in metres.
+            stream: Drive of the sample, for a model with memory (`new_stream`); it is advanced.
 
         Returns:
-            The elements, best first, with their scores and, if the model has them, Gaussians.
+            The elements, best first, with scores and, if the model predicts them, Gaussians.
 
         Raises:
-            ValueError: If images or matrices are not those of the file's cameras, or a matrix is
-                missing; with memory, if there is no stream, or the frame does not follow its last.
+            ValueError: If images or matrices do not fit the cameras, or a matrix is missing; for a
+                model with memory, if there is no stream, or the frame is not later than the last
+                frame of the stream.
         """
-        outputs = self.run(self.prepare(images, meta, stream))
+        outputs = self.run(self.prepare(images, meta=meta, stream=stream))
         elements = self.elements(outputs)
         if stream is not None:
-            self.remember(stream, meta, outputs)
+            self.remember(stream, meta=meta, outputs=outputs)
         return elements
 
     def prepare(
@@ -163,28 +183,24 @@ class OnnxInferencer:
         meta: Mapping[str, Any],
         stream: Scenes | None = None,
     ) -> dict[str, NDArray[np.float32]]:
-        """Inputs of the graph for one frame; errors as of a call.
+        """Prepare the inputs of the graph for one frame.
 
         Args:
-            images: One image of each camera, (H, W, 3) in uint8.
+            images: Images of the cameras in uint8. (V, H, W, 3)
             meta: Calibration and pose of the frame, as a call takes them.
             stream: Drive of the frame, for a model with memory.
 
         Returns:
             The inputs by their names, in float32.
+
+        Raises:
+            ValueError: As a call.
         """
         self._check_images(images)
-        told = self.metadata.get("can_bus") == NO_SIGNALS or meta.get("can_bus") is not None
-        if "can_bus" in self._calibration and not told:
-            if self.metadata.get("can_bus") == POSE_ONLY_RULE:
-                raise InputError(f"{self.path.name} needs can_bus, {POSE_ONLY_RULE}.")
-            raise InputError(
-                f"{self.path.name} needs can_bus, {CAN_BUS_RULE}. From poses: motion_signals of "
-                "gsmap.structures.vehicle_signals; zeros for a model that was trained without."
-            )
+        self._check_signals(meta)
         if meta.get("lidar2ego") is None:
             meta = {**meta, "lidar2ego": self.metadata.get("ego_from_frame")}
-        inputs = calibration_arrays(meta, self._calibration)
+        inputs = calibration_arrays(meta, names=self._calibration)
         for name, array in inputs.items():
             if name != "can_bus" and array.shape != (len(self.cameras), 4, 4):
                 raise InputError(
@@ -192,32 +208,52 @@ class OnnxInferencer:
                     f"{len(self.cameras)} cameras {', '.join(self.cameras)}, got shape "
                     f"{array.shape}."
                 )
-        stacked = np.stack([np.asarray(image) for image in images])
+        stacked = np.stack(list(map(np.asarray, images)))  # (V, H, W, 3)
         pixels = np.ascontiguousarray(stacked.transpose(0, 3, 1, 2), dtype=np.float32)
         if self.has_memory or stream is not None:
-            inputs |= self._of_stream(meta, stream)
+            inputs |= self._stream_inputs(meta, stream=stream)
         return {"images": pixels, **inputs}
 
-    def _of_stream(self, meta: Mapping[str, Any], stream: Scenes | None) -> dict[str, Any]:
-        """State after the previous frame, and the motion since then."""
+    def _check_signals(self, meta: Mapping[str, Any]) -> None:
+        """Raise ValueError if the graph needs vehicle signals and ``meta`` has none."""
+        rule = self.metadata.get("can_bus")
+        has_signals = rule == NO_SIGNALS or meta.get("can_bus") is not None
+        if "can_bus" not in self._calibration or has_signals:
+            return
+        if rule == POSE_ONLY_RULE:
+            raise InputError(f"{self.path.name} needs can_bus, {POSE_ONLY_RULE}.")
+        raise InputError(
+            f"{self.path.name} needs can_bus, {CAN_BUS_RULE}. From poses: motion_signals of "
+            "gsmap.structures.vehicle_signals; zeros for a model that was trained without."
+        )
+
+    def _stream_inputs(self, meta: Mapping[str, Any], stream: Scenes | None) -> dict[str, Any]:
+        """Inputs for the memory after the previous frame and the motion since then.
+
+        Args:
+            meta: Pose and time of the frame, as a call takes them.
+            stream: Drive of the frame.
+        """
         if stream is None or not self.has_memory:
-            self.new_stream()  # says so if there is no memory
+            self.new_stream()  # raises an error if the model has no memory
             raise InputError(
                 f"{self.path.name} remembers the frames of a drive: give the call its stream, "
                 "which new_stream() starts."
             )
         stream.claim(self)
         frame = Frame.of(meta)
-        (before,) = stream.previous([frame])
-        if before is None:
-            before = StreamState(frame, self._empty)
-        of_stream = (
-            frame.motion_from(before.frame),
-            [frame.seconds_after(before.frame)],
-            [float(before.values is not self._empty)],
-        )
-        arrays = (np.asarray(values, np.float32) for values in of_stream)
-        return {**dict(zip(OF_STREAM, arrays, strict=True)), **before.values}
+        (previous,) = stream.previous([frame])
+        continues = previous is not None
+        if previous is None:
+            previous = StreamState(frame, values=self._initial_memory)
+        motion = frame.motion_from(previous.frame)  # (4, 4)
+        seconds = frame.seconds_after(previous.frame)
+        return {
+            "now_from_then": np.asarray(motion, dtype=np.float32),
+            "seconds": np.asarray([seconds], dtype=np.float32),
+            "continues": np.asarray([continues], dtype=np.float32),
+            **previous.values,
+        }
 
     def remember(
         self, stream: Scenes, meta: Mapping[str, Any], outputs: Mapping[str, NDArray[Any]]
@@ -229,11 +265,11 @@ class OnnxInferencer:
             meta: Pose and time of the frame, as a call takes them.
             outputs: Outputs of `run` for the frame.
         """
-        left = {name: outputs[f"new_{name}"] for name in self._empty}
-        stream.keep([StreamState(Frame.of(meta), left)])
+        memory = {name: outputs[f"new_{name}"] for name in self._initial_memory}
+        stream.keep([StreamState(Frame.of(meta), values=memory)])
 
     def _check_images(self, images: Sequence[NDArray[Any]] | NDArray[Any]) -> None:
-        """Raise ValueError if the number or the form of the images is not that of the cameras."""
+        """Raise ValueError if the number or the shapes of images do not fit the cameras."""
         if len(images) != len(self.cameras):
             raise InputError(
                 f"{self.path.name} takes {len(self.cameras)} cameras, {', '.join(self.cameras)}, "
@@ -249,14 +285,20 @@ class OnnxInferencer:
                 )
 
     def run(self, inputs: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[Any]]:
-        """Return the outputs of the graph by name, wherever the elements lie.
+        """Run the graph.
+
+        Args:
+            inputs: Inputs of `prepare`.
+
+        Returns:
+            The outputs by name. Elements outside of the map are included.
 
         Raises:
             ValueError: If ONNX Runtime cannot run the graph on these inputs.
         """
         try:
             values = self.session.run(self._outputs, inputs)
-        except Exception as error:  # onnxruntime's errors have no common class of their own
+        except Exception as error:  # errors of onnxruntime have no common base class
             raise InputError(
                 f"{self.path} cannot be run ({error!s:.300}): if the inputs are those of its "
                 "cameras, the file is damaged; export it again."
@@ -264,55 +306,76 @@ class OnnxInferencer:
         return dict(zip(self._outputs, values, strict=True))
 
     def elements(self, outputs: Mapping[str, NDArray[Any]]) -> MapElements:
-        """Keep the elements that lie on the map or close to it and score enough.
+        """Select the elements on or near the map whose scores are high enough.
+
+        Args:
+            outputs: Outputs of `run`.
 
         Raises:
-            ValueError: If the outputs are no map elements.
+            ValueError: If the outputs are not valid map elements.
         """
         try:
-            return self._kept(outputs)
+            return self._select_elements(outputs)
         except (ValueError, TypeError, IndexError) as error:
             raise InputError(
                 f"{self.path} gave no map elements ({error}): if the images are whole, the file "
                 "is damaged; export it again."
             ) from error
 
-    def _kept(self, outputs: Mapping[str, NDArray[Any]]) -> MapElements:
-        """Select among the elements."""
-        margin, threshold = self.metadata["margin_m"], self.metadata["score_threshold"]
-        keep = np.ones(len(outputs["scores"]), dtype=bool)
+    def _select_elements(self, outputs: Mapping[str, NDArray[Any]]) -> MapElements:
+        """Select elements as `elements`, with the errors of numpy."""
+        margin = self.metadata["margin_m"]
+        threshold = self.metadata["score_threshold"]
+        keep = np.ones(len(outputs["scores"]), dtype=bool)  # (M,)
         if margin is not None:
             low, high = np.array([self.metadata["x_range"], self.metadata["y_range"]]).T
-            points = outputs["points"][..., :2]
+            points = outputs["points"][..., :2]  # (M, P, 2)
             keep = ((points >= low - margin) & (points <= high + margin)).all((1, 2))
         if threshold is not None:
             keep &= outputs["scores"] > threshold
-        kept = {
-            name: values[keep]
-            for name, values in outputs.items()
-            if not name.startswith(f"new_{MEMORY}")
-        }
-        if not np.isin(kept["labels"], range(len(self.classes))).all():
+        fields: dict[str, NDArray[Any]] = {}
+        for name, values in outputs.items():
+            if not name.startswith(f"new_{MEMORY_PREFIX}"):
+                fields[name] = values[keep]
+        if not np.isin(fields["labels"], range(len(self.classes))).all():
             raise InputError(f"a label is none of the {len(self.classes)} classes")
-        lines = np.isin(kept["labels"], self.metadata.get("unfold_classes", []))
-        if lines.any():
-            orders = shortest_orders(kept["points"][lines])
-            for name in kept.keys() - {"scores", "labels", "num_pts"}:
-                kept[name][lines] = kept[name][lines][np.arange(len(orders))[:, None], orders]
-        points, numbers = kept.pop("points"), kept.pop("num_pts", None)
-        if numbers is None:
-            return MapElements.from_polylines(points, **kept)
-        cut = [line[:number] for line, number in zip(points, numbers, strict=True)]
-        return MapElements.from_polylines(cut, **kept)
+        self._unfold(fields)
+        points = fields.pop("points")
+        counts = fields.pop("num_pts", None)
+        if counts is None:
+            return MapElements.from_polylines(points, **fields)
+        polylines = [line[:count] for line, count in zip(points, counts, strict=True)]
+        return MapElements.from_polylines(polylines, **fields)
+
+    def _unfold(self, fields: dict[str, NDArray[Any]]) -> None:
+        """Reorder the points of elements of ``unfold_classes`` to the shortest lines, in place."""
+        unfolded = np.isin(fields["labels"], self.metadata.get("unfold_classes", []))  # (M,)
+        if not unfolded.any():
+            return
+        orders = shortest_orders(fields["points"][unfolded])  # (n, P)
+        rows = np.arange(len(orders))[:, None]
+        for name in fields.keys() - {"scores", "labels", "num_pts"}:
+            fields[name][unfolded] = fields[name][unfolded][rows, orders]
 
     def write(self, path: str | Path, samples: Iterable[tuple[str, MapElements]]) -> None:
-        """Write each sample's token and elements as ``tools/test.py --out`` does."""
-        vectors = ((token, vectors_of(found, self.classes)) for token, found in samples)
-        write_results(path, vectors, {"classes": list(self.classes)})
+        """Write predictions in the format of ``tools/test.py --out``.
+
+        Args:
+            path: File to write.
+            samples: Token and elements of each sample.
+        """
+        vectors = ((token, vectors_of(elements, self.classes)) for token, elements in samples)
+        write_results(path, vectors, meta={"classes": list(self.classes)})
 
 
 def _check_metadata(metadata: Mapping[str, Any]) -> None:
-    """Raise an error unless a file's metadata are such as `export_onnx` writes."""
+    """Check the format of a file's metadata.
+
+    Raises:
+        KeyError: If a field is missing.
+        TypeError: If a field has another type.
+        ValueError: If a value is not possible.
+    """
     for name in ("classes", "cameras"):
         names = metadata[name]
         if not (isinstance(names, list) and names and all(isinstance(n, str) for n in names)):
@@ -325,16 +388,16 @@ def _check_metadata(metadata: Mapping[str, Any]) -> None:
         if metadata[name] is not None and not np.isfinite(metadata[name]):
             raise InputError(f"{name} must be a number, got {metadata[name]!r:.80}")
     _check_poses(metadata)
-    unfold = metadata.get("unfold_classes", [])
-    if not (isinstance(unfold, list) and all(type(label) is int for label in unfold)):
-        raise InputError(f"unfold_classes must be class indices, got {unfold!r:.80}")
+    labels = metadata.get("unfold_classes", [])
+    if not (isinstance(labels, list) and all(type(label) is int for label in labels)):
+        raise InputError(f"unfold_classes must be class indices, got {labels!r:.80}")
     if not 0 < metadata.get("max_gap_s", 1.0) < np.inf:
         raise InputError(f"max_gap_s must be seconds > 0, got {metadata['max_gap_s']!r:.80}")
 
 
 def _check_poses(metadata: Mapping[str, Any]) -> None:
-    """Raise ValueError if a mount in the metadata is no rigid pose."""
+    """Raise ValueError if a transform in a file's metadata is not rigid."""
     for name in ("ground_from_frame", "ego_from_frame"):
-        matrix = np.asarray(metadata.get(name, np.eye(4)), np.float64)
+        matrix = np.asarray(metadata.get(name, np.eye(4)), dtype=np.float64)
         if matrix.shape != (4, 4) or not is_rigid(matrix):
             raise InputError(f"{name} must be a pose, got {metadata[name]!r:.80}")

@@ -86,7 +86,8 @@ class ResultLog:
             if not line.endswith(b"\n"):
                 break
             frame = _parse_line(line)
-            self._require(self._is_frame(frame, same_settings), line_number=line_number)
+            is_valid = self._is_frame(frame, same_settings=same_settings)
+            self._require(is_valid, line_number=line_number)
             self._record(frame)
             end += len(line)
         if not same_settings:
@@ -117,7 +118,7 @@ class ResultLog:
             return False
         if not isinstance(frame.get("broken", ""), str):
             return False
-        return self._are_elements(frame.get("vectors", []), same_settings)
+        return self._are_elements(frame.get("vectors", []), same_settings=same_settings)
 
     def _are_elements(self, vectors: Any, same_settings: bool) -> bool:
         """Whether the elements of a frame are valid and belong to classes of the run.
@@ -203,7 +204,7 @@ class ResultLog:
                     file.seek(position)
                     yield token, json.loads(file.readline())["vectors"]
 
-            write_results(self.out, samples(), meta)
+            write_results(self.out, samples(), meta=meta)
         self.path.unlink()
         return len(positions)
 

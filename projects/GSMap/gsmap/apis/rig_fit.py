@@ -133,10 +133,12 @@ def fit_start(
     """
     initial = model.state_dict()
     metainfo = dataset.metainfo
-    lines = _fit_cameras(state, initial, dataset=dataset, trained=origin.get("cameras"))
-    lines += _fit_cells(state, initial)
-    lines += _fit_queries(state, initial, model=model)
-    lines += _fit_classes(state, initial, trained=origin.get("classes"), names=metainfo["classes"])
+    lines = _fit_cameras(state, initial=initial, dataset=dataset, trained=origin.get("cameras"))
+    lines += _fit_cells(state, initial=initial)
+    lines += _fit_queries(state, initial=initial, model=model)
+    lines += _fit_classes(
+        state, initial=initial, trained=origin.get("classes"), names=metainfo["classes"]
+    )
     notes = {
         "x_range": "the queries of the map are stretched to it",
         "y_range": "the queries of the map are stretched to it",
@@ -180,7 +182,7 @@ def _fit_cameras(
     if not names_are_known and not directions_are_known:
         state[key] = embeds.mean(0, keepdim=True).repeat(num_cameras, 1)  # (V, C)
         return ["its cameras are not known: each camera starts from the mean of their embeddings."]
-    rows = camera_rows(dataset, trained)
+    rows = camera_rows(dataset, trained=trained)
     state[key] = embeds[rows]  # (V, C)
     replacements: list[str] = []
     for name, row in zip(names, rows, strict=True):
@@ -266,21 +268,21 @@ def _fit_classes(
     """
     if trained is None or list(trained) == list(names):
         return []
-    first_rows: dict[str, int] = {}  # by key
-    for prefix, first_row in _CLASS_ROWS.items():
-        for key in initial.keys() & state.keys():
-            if not key.startswith(prefix):
-                continue
-            has_old_rows = len(state[key]) == first_row + len(trained)
-            has_new_rows = len(initial[key]) == first_row + len(names)
-            if has_old_rows and has_new_rows:
-                first_rows[key] = first_row
+    first_rows = _find_class_weights(
+        state, initial=initial, old_count=len(trained), new_count=len(names)
+    )
     if all(key.startswith(_GENERATOR_LABELS) for key in first_rows):
         return [
             f"classes were {', '.join(trained)}, are {', '.join(names)}: this head's weights of "
             "classes are taken as they are, where their sizes fit."
         ]
-    old_rows = {name: list(trained).index(name) for name in names if name in trained}
+    old_rows: dict[str, int] = {}  # by class
+    new_classes: list[str] = []
+    for name in names:
+        if name in trained:
+            old_rows[name] = list(trained).index(name)
+        else:
+            new_classes.append(name)
     for key, first_row in first_rows.items():
         old_weights = state[key]
         weights = initial[key].detach().clone().to(old_weights)
@@ -290,8 +292,34 @@ def _fit_classes(
                 weights[row] = old_weights[first_row + old_rows[name]]
         state[key] = weights
     with_weights = summarize_names(list(old_rows))
-    without_weights = summarize_names([name for name in names if name not in old_rows])
+    without_weights = summarize_names(new_classes)
     return [f"classes keep their weights: {with_weights}; begin as new: {without_weights}."]
+
+
+def _find_class_weights(
+    state: Mapping[str, Tensor], initial: Mapping[str, Tensor], old_count: int, new_count: int
+) -> dict[str, int]:
+    """Find the weights with a row for each class.
+
+    Args:
+        state: Weights of the checkpoint.
+        initial: Initial weights of the model.
+        old_count: Number of classes of the checkpoint.
+        new_count: Number of classes of the model.
+
+    Returns:
+        Number of rows before the rows of the classes, by key.
+    """
+    first_rows: dict[str, int] = {}
+    for prefix, first_row in _CLASS_ROWS.items():
+        for key in initial.keys() & state.keys():
+            if not key.startswith(prefix):
+                continue
+            has_old_rows = len(state[key]) == first_row + old_count
+            has_new_rows = len(initial[key]) == first_row + new_count
+            if has_old_rows and has_new_rows:
+                first_rows[key] = first_row
+    return first_rows
 
 
 @HOOKS.register_module()
@@ -316,7 +344,7 @@ class RigFitHook(Hook):
         if is_upstream(weights):
             weights = ours_from_upstream(weights)
         model = getattr(runner.model, "module", runner.model)
-        origin = _training_facts(runner._load_from, checkpoint)
+        origin = _training_facts(runner._load_from, checkpoint=checkpoint)
         for line in fit_start(weights, model=model, dataset=dataset, origin=origin):
             print_log(f"{runner._load_from}: {line}", logger="current")
         state.clear()
