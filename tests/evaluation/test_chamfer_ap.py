@@ -7,7 +7,7 @@ from gsmap.evaluation.core.chamfer_ap import (
     match_chamfer,
     nearest_by_chamfer,
 )
-from gsmap.evaluation.core.chamfer_kernels import chamfer_distance, resampled
+from gsmap.evaluation.core.chamfer_kernels import chamfer_distance, resample_lines
 from gsmap.evaluation.core.matches import MatchTable
 from gsmap.evaluation.core.report import format_table
 from gsmap.structures.elements import MapElements
@@ -268,7 +268,7 @@ def test_compiled_resampling_equals_the_plain_one_bit_by_bit(dim, num_points):
     points = np.concatenate(lines)
     offsets = np.cumsum([0, *map(len, lines)])
     plain = resample_all(points, offsets, num_points)  # (N, P, D)
-    rows = resampled(points, offsets, num_points)
+    rows = resample_lines(points, offsets, num_points)
     assert rows.shape == (3, len(lines) * num_points)
     np.testing.assert_array_equal(rows[:dim].T.reshape(plain.shape), plain)
     assert not rows[dim:].any()

@@ -1,4 +1,4 @@
-"""Metrics of maps: AP, topology, whole maps, uncertainty, and what compares results."""
+"""Metrics of maps: AP, topology, whole maps, uncertainty, and the comparison of results."""
 
 from gsmap.utils.lazy import lazy_names
 

@@ -1,4 +1,4 @@
 """Analysis of results: intervals, groups, distances, calibration, consistency, the prior."""
 
 DISTANCE = "distance"
-"""The option that asks for AP at distances from the vehicle."""
+"""Option of ``--by`` that computes AP in bands of distance from the vehicle."""

@@ -1,1 +1,1 @@
-"""Matching of samples, AP_chamfer and AP_raster, reports, and the files that are scored."""
+"""Matching of samples, AP_chamfer and AP_raster, reports, and result files."""

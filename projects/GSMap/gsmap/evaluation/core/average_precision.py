@@ -1,22 +1,41 @@
-"""Average precision from ranked hits: the area, 101-point and 10-point definitions, calibration."""
+"""Average precision of ranked predictions, and the calibration of their scores.
+
+Three definitions of AP are in use: the area under the precision envelope (VOC 2010, MapTR), its
+mean at 101 recalls (COCO, MapVR), and its mean at ten recalls (methods with AP per sample).
+"""
 
 import numpy as np
 
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray
 
-_RECALL_POINTS = np.linspace(0.0, 1.0, 101)
+_RECALL_POINTS = np.linspace(0.0, 1.0, num=101)
 
 
 def precision_recall(hits: BoolArray, num_gts: int) -> tuple[FloatArray, FloatArray]:
-    """Return recall and precision after each prediction, in descending order of score. 2 x (N,)"""
-    found = np.cumsum(hits, dtype=np.float64)
-    return found / max(num_gts, 1), found / np.arange(1, len(found) + 1)
+    """Compute recall and precision after each prediction.
+
+    Args:
+        hits: Whether each prediction matches, in descending order of score. (N,)
+        num_gts: Number of ground truths.
+
+    Returns:
+        Recall and precision in [0, 1]. 2 x (N,)
+    """
+    true_positives = np.cumsum(hits, dtype=np.float64)
+    recall = true_positives / max(num_gts, 1)
+    precision = true_positives / np.arange(1, len(true_positives) + 1)
+    return recall, precision
 
 
 def area_ap(hits: BoolArray, num_gts: int) -> float:
-    """Return the area under the monotone precision envelope (VOC 2010, as MapTR computes it).
+    """Compute the area under the monotone precision envelope (VOC 2010), as MapTR does.
 
-    ``hits`` (N,) are in descending order of score; without ground truths the result is 0.
+    Args:
+        hits: Whether each prediction matches, in descending order of score. (N,)
+        num_gts: Number of ground truths.
+
+    Returns:
+        AP in [0, 1]; 0 without ground truths.
     """
     if num_gts == 0:
         return 0.0
@@ -26,52 +45,76 @@ def area_ap(hits: BoolArray, num_gts: int) -> float:
 
 
 def interpolated_ap(hits: BoolArray, num_gts: int) -> float:
-    """Return the mean of the precision envelope at 101 recalls (COCO).
+    """Compute the mean of the precision envelope at 101 recalls (COCO).
 
-    ``hits`` (N,) are in descending order of score; without ground truths the result is -1.
+    Args:
+        hits: Whether each prediction matches, in descending order of score. (N,)
+        num_gts: Number of ground truths.
+
+    Returns:
+        AP in [0, 1]; -1 without ground truths.
     """
     if num_gts == 0:
         return -1.0
-    found = np.cumsum(hits, dtype=np.float64)
+    true_positives = np.cumsum(hits, dtype=np.float64)
     # COCO adds the spacing of 1 to the denominator, so a perfect class gives 1 - 2e-16
-    precision = found / (np.arange(1, len(found) + 1) + np.spacing(1.0))
+    precision = true_positives / (np.arange(1, len(true_positives) + 1) + np.spacing(1.0))
     envelope = np.maximum.accumulate(precision[::-1])[::-1]
-    at = np.searchsorted(found / num_gts, _RECALL_POINTS, side="left")
-    return float(np.append(envelope, 0.0)[at].mean())
+    ranks = np.searchsorted(true_positives / num_gts, _RECALL_POINTS, side="left")
+    return float(np.append(envelope, 0.0)[ranks].mean())
 
 
 def ten_point_ap(hits: BoolArray, num_gts: int) -> float:
-    """Return the mean of the precision envelope at the recalls 0.1, 0.2, ... 1.
+    """Compute the mean of the precision envelope at the recalls 0.1, 0.2, ... 1.
 
-    ``hits`` (N,) are in the order in which predictions count; ``num_gts`` is > 0. (A
-    released evaluator compares recalls in float32, in which 7 of 10 are less than 0.7; here they
-    are equal.)
+    A released evaluator compares recalls in float32, where 7 of 10 is less than 0.7. Here they are
+    equal.
+
+    Args:
+        hits: Whether each prediction matches, in the order in which predictions count. (N,)
+        num_gts: Number of ground truths, > 0.
+
+    Returns:
+        AP in [0, 1].
     """
     _, precision = precision_recall(hits, num_gts)
     envelope = np.maximum.accumulate(precision[::-1])[::-1]
-    needed = -(-np.arange(1, 11) * num_gts // 10)  # hits, rounded up
-    at = np.searchsorted(np.cumsum(hits), needed, side="left")
-    return float(np.append(envelope, 0.0)[at].mean())
+    min_true_positives = -(-np.arange(1, 11) * num_gts // 10)  # rounded up
+    ranks = np.searchsorted(np.cumsum(hits), min_true_positives, side="left")
+    return float(np.append(envelope, 0.0)[ranks].mean())
 
 
 def reliability(scores: FloatArray, hits: BoolArray) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Compare scores in [0, 1] with the share of predictions that match, in ten equal bins.
+    """Compare scores with the share of predictions that match, in ten equal bins.
 
-    Mean score, share of matches and number of predictions of each bin that is not empty.
-    2 x (N,) -> 3 x (<= 10,)
+    Args:
+        scores: Confidence of each prediction in [0, 1]. (N,)
+        hits: Whether each prediction matches. (N,)
+
+    Returns:
+        Mean score, share of matches, and number of predictions of each bin that is not empty.
+        3 x (<= 10,)
     """
     bins = np.clip((scores * 10).astype(np.int64), 0, 9)
     _, bins, counts = np.unique(bins, return_inverse=True, return_counts=True)
-    total, found = np.bincount(bins, weights=scores), np.bincount(bins, weights=hits)
-    return total / counts, found / counts, counts
+    score_sums = np.bincount(bins, weights=scores)
+    hit_sums = np.bincount(bins, weights=hits)
+    return score_sums / counts, hit_sums / counts, counts
 
 
 def calibration_error(scores: FloatArray, hits: BoolArray) -> float:
-    """Return the expected calibration error: the mean gap between score and share of matches.
+    """Compute the expected calibration error over ten bins.
 
-    In [0, 1], of ten bins; -1 without predictions. 2 x (N,)
+    It is the mean gap between score and share of matches, weighted by the predictions of each bin.
+
+    Args:
+        scores: Confidence of each prediction in [0, 1]. (N,)
+        hits: Whether each prediction matches. (N,)
+
+    Returns:
+        Error in [0, 1]; -1 without predictions.
     """
     if not len(scores):
         return -1.0
-    mean_score, share, counts = reliability(scores, hits)
-    return float(np.sum(np.abs(mean_score - share) * counts) / len(scores))
+    mean_score, hit_share, counts = reliability(scores, hits)
+    return float(np.sum(np.abs(mean_score - hit_share) * counts) / len(scores))

@@ -1,4 +1,4 @@
-"""What the metrics keep of one sample: scores and matches, never masks or points."""
+"""Matches of predictions with ground truth: of one sample, and of all samples in one table."""
 
 from array import array
 from collections.abc import Iterable, Mapping, Sequence
@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 
-import gsmap.utils.compilation  # noqa: F401 - says that kernels are compiled
+import gsmap.utils.compilation  # noqa: F401 - reports that kernels are compiled
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 from gsmap.utils.errors import InputError
 
-_COLUMNS = {  # of a table, with the codes of their numbers
+_COLUMNS = {  # type codes of the columns of a table
     "length": "q",
     "labels": "q",
     "scores": "d",
@@ -24,21 +24,22 @@ _COLUMNS = {  # of a table, with the codes of their numbers
 
 @dataclass(frozen=True)
 class FrameMatches:
-    """The matches of one sample's predictions: those that count, in descending order of score.
+    """Matches of the predictions of one sample, in descending order of score.
 
-    Equal scores keep the order in which they were given.
+    Predictions that a metric leaves out have no entry. Equal scores keep the order of the input.
 
     Args:
         token: Name of the sample.
-        pred_index: Position among the predictions that were given. (N,)
+        pred_index: Index of each prediction in the input of the metric. (N,)
         labels: Class index. (N,)
-        scores: Confidence. (N,)
-        matched_gt: Position of the matched ground truth among those given, or -1. (N, T)
-        quality: Chamfer distance in metres of the match (NaN without one at any threshold), or IoU
-            of the match at the loosest threshold (NaN without one). (N,)
+        scores: Confidence in [0, 1]. (N,)
+        matched_gt: Index of the matched ground truth in the input of the metric at each threshold,
+            or -1. (N, T)
+        quality: AP_chamfer: distance of the match in metres, NaN without a match at any threshold.
+            AP_raster: IoU of the match at the loosest threshold, NaN without one. (N,)
         num_gts: Number of ground truths of each class. (C,)
         class_iou: IoU of all predictions of a class with all its ground truths, NaN if the sample
-            has neither; only AP_raster fills it. (C,)
+            has neither; only AP_raster has it. (C,)
     """
 
     token: str
@@ -51,34 +52,34 @@ class FrameMatches:
     class_iou: FloatArray | None = None
 
     def if_two_sided(self) -> "FrameMatches":
-        """Return this, or the matches of an empty sample if it lacks either side."""
+        """Return these matches, or the matches of an empty sample if a side has no element."""
         if len(self.labels) and self.num_gts.any():
             return self
-        none = slice(0, 0)
+        no_rows = slice(0, 0)
         return FrameMatches(
-            self.token,
-            self.pred_index[none],
-            self.labels[none],
-            self.scores[none],
-            self.matched_gt[none],
-            self.quality[none],
-            np.zeros_like(self.num_gts),
+            token=self.token,
+            pred_index=self.pred_index[no_rows],
+            labels=self.labels[no_rows],
+            scores=self.scores[no_rows],
+            matched_gt=self.matched_gt[no_rows],
+            quality=self.quality[no_rows],
+            num_gts=np.zeros_like(self.num_gts),
         )
 
 
 @dataclass(frozen=True)
 class ClassDetections:
-    """The predictions of one class over all samples, in descending order of score.
+    """Predictions of one class over all samples, in descending order of score.
 
     Args:
         thresholds: Thresholds of a match, ascending: metres for AP_chamfer, IoU for AP_raster. (T,)
-        scores: Confidence. (N,)
+        scores: Confidence in [0, 1]. (N,)
         hits: Whether the prediction matches, at each threshold. (N, T)
         quality: As in ``FrameMatches``. (N,)
-        ranks: Rank of the prediction among those of its class and sample, from 0. (N,)
+        ranks: Rank of the prediction within its class and sample, from 0. (N,)
         num_gts: Number of ground truths.
-        samples: Number of the prediction's sample, in the order of the tokens. (N,)
-        gts_of_sample: Number of ground truths of each sample, in that order. (S,)
+        samples: Index of the prediction's sample, in the order of the tokens. (N,)
+        gts_of_sample: Number of ground truths of each sample, in the order of the tokens. (S,)
     """
 
     thresholds: Sequence[float]
@@ -91,13 +92,17 @@ class ClassDetections:
     gts_of_sample: IntArray
 
     def at(self, thresholds: Sequence[float]) -> "ClassDetections":
-        """Return the same predictions at some of the thresholds."""
+        """Return the detections at some of the thresholds."""
         columns = [list(self.thresholds).index(threshold) for threshold in thresholds]
         return replace(self, thresholds=tuple(thresholds), hits=self.hits[:, columns])
 
 
 def checked_classes(classes: Iterable[str]) -> tuple[str, ...]:
-    """Return names of classes; ValueError if they are none, or one text in place of several."""
+    """Return names of classes as a tuple.
+
+    Raises:
+        ValueError: If there is no name, or one text in place of several names.
+    """
     names = tuple(classes)
     if isinstance(classes, str) or not all(isinstance(name, str) for name in names) or not names:
         raise InputError(
@@ -109,20 +114,23 @@ def checked_classes(classes: Iterable[str]) -> tuple[str, ...]:
 def check_pair(
     predictions: MapElements, ground_truth: MapElements, classes: Sequence[str], token: str
 ) -> None:
-    """Raise ValueError unless predictions have scores and all labels are -1 (no class) or known.
+    """Check the labels of both sides of a sample, and that predictions have scores.
 
     Args:
-        predictions: Elements of a sample.
-        ground_truth: Elements of the same sample.
-        classes: Names that labels count.
-        token: The sample's name, for the error.
+        predictions: Predicted elements of the sample.
+        ground_truth: Annotated elements of the sample.
+        classes: Names of the classes; labels index into them, -1 is no class.
+        token: Name of the sample, for the message.
+
+    Raises:
+        ValueError: If a label is below -1 or beyond the classes, or predictions have no scores.
     """
-    for what, elements in (("prediction", predictions), ("ground truth", ground_truth)):
+    for kind, elements in (("prediction", predictions), ("ground truth", ground_truth)):
         beyond = (elements.labels < -1) | (elements.labels >= len(classes))
         if beyond.any():
             index = beyond.argmax()
             raise InputError(
-                f"sample {token!r}: {what} {index} has the label {elements.labels[index]}, beyond "
+                f"sample {token!r}: {kind} {index} has the label {elements.labels[index]}, beyond "
                 f"the {len(classes)} classes {', '.join(classes)}."
             )
     if len(predictions) and predictions.scores is None:
@@ -135,58 +143,71 @@ def ranked_predictions(
     min_score: float = -np.inf,
     max_num: int | None = None,
 ) -> IntArray:
-    """Return which predictions count, in descending order of score, at most N of each class. (n,)
+    """Rank the predictions of one sample that count in a metric.
+
+    Lines of two points or more with a known class count.
 
     Args:
-        predictions: Elements with scores; lines of known classes count.
-        num_classes: How many classes are known.
-        min_score: The least score that counts.
-        max_num: N; all by default.
+        predictions: Elements with scores. N in number.
+        num_classes: Number of classes C; labels in [0, C) are known.
+        min_score: Smallest score that counts, in [0, 1].
+        max_num: Largest number of predictions of each class; all by default.
+
+    Returns:
+        Indices into ``predictions``, in descending order of score. (n,), n <= N
     """
     scores = predictions.confidence
     rows = np.flatnonzero((predictions.num_points >= 2) & (scores >= min_score))
     rows = rows[np.argsort(-scores[rows], kind="stable")]
     labels = predictions.labels[rows]
-    counted = [np.flatnonzero(labels == label)[:max_num] for label in range(num_classes)]
-    return rows[np.sort(np.concatenate(counted))]
+    ranks_of_classes = []
+    for label in range(num_classes):
+        ranks_of_class = np.flatnonzero(labels == label)
+        ranks_of_classes.append(ranks_of_class[:max_num])
+    return rows[np.sort(np.concatenate(ranks_of_classes))]
 
 
 class MatchTable:
-    """The matches of many samples: what the figures need of them, in few bytes.
+    """Matches of many samples in compact columns.
 
-    No figure depends on repeats, order or processes: a token counts once, and equal scores keep
-    the order of the tokens, then the order within the sample. (The reference evaluators leave it to
-    an unstable sort, in AP_chamfer, or to the order of the file, in AP_raster.)
+    Figures do not depend on repeated samples, their order or the number of processes: a token
+    counts once, and equal scores keep the order of the tokens, then the order within the sample.
+    The reference evaluators resolve equal scores by an unstable sort (AP_chamfer) or by the order
+    of the file (AP_raster).
+
+    Args:
+        matches: Matches to add.
     """
 
     def __init__(self, matches: Iterable[FrameMatches] = ()) -> None:
-        self._number: dict[str, int] = {}  # of each token
+        self._index_of: dict[str, int] = {}  # by token
         self._columns = {name: array(code) for name, code in _COLUMNS.items()}
         for record in matches:
             self.add(record)
 
     def __len__(self) -> int:
-        return len(self._number)
+        return len(self._index_of)
 
     def add(self, record: FrameMatches) -> None:
-        """Add the matches of a sample; those of a token that is known are left out."""
-        if record.token in self._number:
+        """Add the matches of a sample; a token that the table already has is ignored."""
+        if record.token in self._index_of:
             return
-        self._number[record.token] = len(self)
+        self._index_of[record.token] = len(self)
         values = vars(record) | {"length": len(record.labels), "hits": record.matched_gt >= 0}
         for name, column in self._columns.items():
             if values[name] is not None:
-                column.frombytes(np.asarray(values[name], column.typecode).tobytes())
+                cells = np.asarray(values[name], dtype=column.typecode)
+                column.frombytes(cells.tobytes())
 
     @property
     def tokens(self) -> list[str]:
-        """The tokens of all samples, in their order. (S,)"""
-        return sorted(self._number)
+        """Tokens of all samples, sorted. (S,)"""
+        return sorted(self._index_of)
 
     @property
     def _order(self) -> IntArray:
-        """The samples in the order of their tokens. (S,)"""
-        return np.array([self._number[token] for token in self.tokens], np.int64)
+        """Index of each sample in the columns, in the order of the tokens. (S,)"""
+        return np.array([self._index_of[token] for token in self.tokens], dtype=np.int64)
 
     def class_iou(self, label: int) -> FloatArray:
         """Return ``FrameMatches.class_iou`` of one class in all samples. (S,)"""
@@ -196,57 +217,73 @@ class MatchTable:
     def detections(self, thresholds: Mapping[str, Sequence[float]]) -> dict[str, ClassDetections]:
         """Rank the predictions of each class over all samples by score.
 
-        ``thresholds`` are those of each class, by its name, in the order of the labels. C x (T,)
+        Args:
+            thresholds: Thresholds of each class by its name, in the order of the labels. C x (T,)
+
+        Returns:
+            Detections of each class by its name.
         """
         columns = {name: np.asarray(column) for name, column in self._columns.items()}
+        num_thresholds = len(next(iter(thresholds.values())))
+        order = self._order
+
         lengths = columns["length"]
-        order, starts = self._order, np.cumsum(lengths) - lengths
-        lengths = lengths[order]
-        shifts = starts[order] - (np.cumsum(lengths) - lengths)
-        by_token = np.repeat(shifts, lengths) + np.arange(lengths.sum())
-        frame = np.repeat(np.arange(len(self)), lengths)
-        labels, scores = columns["labels"][by_token], columns["scores"][by_token]
-        hits = columns["hits"].reshape(-1, len(next(iter(thresholds.values())))) > 0
+        starts = np.cumsum(lengths) - lengths  # first row of each sample in the columns
+        sorted_lengths = lengths[order]
+        sorted_starts = np.cumsum(sorted_lengths) - sorted_lengths
+        shifts = starts[order] - sorted_starts
+        rows_by_token = np.repeat(shifts, sorted_lengths) + np.arange(sorted_lengths.sum())
+
+        samples = np.repeat(np.arange(len(self)), sorted_lengths)
+        labels = columns["labels"][rows_by_token]
+        scores = columns["scores"][rows_by_token]
+        hits = columns["hits"].reshape(-1, num_thresholds) > 0
         num_gts = columns["num_gts"].reshape(-1, len(thresholds))[order]
-        found = {}
-        for label, (name, of_class) in enumerate(thresholds.items()):
-            rows = np.flatnonzero(labels == label)
-            ranks = np.arange(len(rows)) - np.searchsorted(frame[rows], frame[rows])
-            best = np.argsort(-scores[rows], kind="stable")
-            rows = rows[best]
-            places = by_token[rows]
-            found[name] = ClassDetections(
-                of_class,
-                scores[rows],
-                hits[places],
-                columns["quality"][places],
-                ranks[best],
-                int(num_gts[:, label].sum()),
-                frame[rows],
-                num_gts[:, label],
+        detections = {}
+        for label, (name, class_thresholds) in enumerate(thresholds.items()):
+            places = np.flatnonzero(labels == label)
+            first_of_sample = np.searchsorted(samples[places], samples[places])
+            ranks = np.arange(len(places)) - first_of_sample
+            by_score = np.argsort(-scores[places], kind="stable")
+            places = places[by_score]
+            rows = rows_by_token[places]
+            detections[name] = ClassDetections(
+                thresholds=class_thresholds,
+                scores=scores[places],
+                hits=hits[rows],
+                quality=columns["quality"][rows],
+                ranks=ranks[by_score],
+                num_gts=int(num_gts[:, label].sum()),
+                samples=samples[places],
+                gts_of_sample=num_gts[:, label],
             )
-        return found
+        return detections
 
 
 @njit(cache=True)
 def assign(quality: FloatArray, thresholds: FloatArray) -> IntArray:
-    """Match greedily: each prediction takes its best free ground truth, the later one of equals.
+    """Match greedily: each prediction takes the best ground truth that is still free.
+
+    Among equally good ground truths, the last one is taken.
 
     Args:
-        quality: How well each pair fits, predictions in descending order of score. (N, K)
+        quality: Quality of each pair; predictions in descending order of score. (N, K)
         thresholds: Smallest quality of a match, inclusive, for each prediction. (N, T)
 
     Returns:
-        The matched ground truth, or -1. (N, T)
+        Index of the matched ground truth, or -1. (N, T)
     """
-    matched = np.full(thresholds.shape, -1)
+    matched_gt = np.full(thresholds.shape, -1)
     for t in range(thresholds.shape[1]):
-        taken = np.zeros(quality.shape[1], np.bool_)
+        is_taken = np.zeros(quality.shape[1], dtype=np.bool_)
         for i in range(len(quality)):
-            best, match = thresholds[i, t], -1
+            best_quality = thresholds[i, t]
+            best_gt = -1
             for k in range(quality.shape[1]):
-                if not taken[k] and quality[i, k] >= best:
-                    best, match = quality[i, k], k
-            if match >= 0:
-                taken[match], matched[i, t] = True, match
-    return matched
+                if not is_taken[k] and quality[i, k] >= best_quality:
+                    best_quality = quality[i, k]
+                    best_gt = k
+            if best_gt >= 0:
+                is_taken[best_gt] = True
+                matched_gt[i, t] = best_gt
+    return matched_gt

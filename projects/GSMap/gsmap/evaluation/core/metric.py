@@ -1,4 +1,4 @@
-"""What a metric of ``--eval`` is, what it keeps of a sample, and how it is found by its name."""
+"""Base class of the metrics of ``--eval``, their settings, their registry and their tables."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -24,6 +24,7 @@ _CORE = {
     "chamfer": "gsmap.evaluation.core.chamfer_ap",
     "raster": "gsmap.evaluation.core.raster_ap",
 }
+_PER_PREDICTION = ("labels", "pred_index", "scores", "matched_gt", "quality")
 
 
 class _Sides(NamedTuple):
@@ -33,22 +34,28 @@ class _Sides(NamedTuple):
 
 
 class Sample(_Sides):
-    """Token, predictions (N,) and ground truth (K,) of a sample, in metres in its frame."""
+    """Predictions and ground truth of one sample, in metres in the annotation frame.
+
+    Args:
+        token: Name of the sample.
+        predictions: Predicted elements, with scores. N in number.
+        ground_truth: Annotated elements. K in number.
+    """
 
     @cached_property
     def shared(self) -> dict[Any, Any]:
-        """Intermediate results that several metrics need, by the rules that they follow from."""
+        """Cache of intermediate results that several metrics need, by the rules behind them."""
         return {}
 
 
 @dataclass(frozen=True)
 class SampleValues:
-    """Arrays that a metric keeps of a sample where it ranks no predictions.
+    """Arrays of one sample, for a metric that ranks no predictions.
 
     Args:
         token: Name of the sample.
-        values: The arrays, by name: of one shape in all samples, or with a first axis that an empty
-            sample has none of.
+        values: Arrays by name. The shape of an array is equal in all samples, or its first axis
+            varies and is 0 in an empty sample.
     """
 
     token: str
@@ -56,11 +63,11 @@ class SampleValues:
 
 
 Matches = FrameMatches | SampleValues
-"""What a metric keeps of a sample."""
+"""Record of one sample that a metric keeps."""
 
 
 class ValueTable:
-    """The arrays of many samples, in the order of their tokens; a token counts once."""
+    """Arrays of many samples, in the order of their tokens; a token counts once."""
 
     def __init__(self) -> None:
         self._records: dict[str, SampleValues] = {}
@@ -69,35 +76,35 @@ class ValueTable:
         return len(self._records)
 
     def add(self, record: SampleValues) -> None:
-        """Add the arrays of a sample; those of a token that is known are left out."""
+        """Add the arrays of a sample; a token that the table already has is ignored."""
         self._records.setdefault(record.token, record)
 
     @property
     def tokens(self) -> list[str]:
-        """The tokens of all samples, in their order. (S,)"""
+        """Tokens of all samples, sorted. (S,)"""
         return sorted(self._records)
 
     def column(self, name: str) -> list[npt.NDArray[Any]]:
-        """Return the arrays of one name. (S,)"""
+        """Return the array of one name of each sample. (S,)"""
         return [self._records[token].values[name] for token in self.tokens]
 
 
 @dataclass(frozen=True)
 class MetricSettings:
-    """What a command or a config says of its metrics, from which each takes what it needs.
+    """Settings of a command or a config, from which each metric takes its rules.
 
     Args:
         classes: Names of the classes; a label is an index into them.
-        thresholds: Of distances in metres; None for each metric's default.
-        dim: Coordinates that distances count: 2 or 3.
+        thresholds: Thresholds of metrics by distance, in metres; None for each metric's default.
+        dim: Number of coordinates that distances count: 2 or 3.
         resample_predictions: Whether predictions are resampled.
         resample_ground_truth: Whether ground truth is resampled.
-        grid: Extent of the map; None if it is not known.
-        polygon_classes: The classes that are areas; names that do not occur are allowed.
-        min_score: Least score of a prediction that counts; None for each metric's default.
+        grid: Extent of the map in metres; None if unknown.
+        polygon_classes: Names of the classes that are areas; unknown names are allowed.
+        min_score: Smallest score of a prediction that counts; None for each metric's default.
 
     Raises:
-        ValueError: If there is no class, or a class is no name.
+        ValueError: If ``classes`` is empty or contains a value that is not a text.
     """
 
     classes: tuple[str, ...]
@@ -114,7 +121,11 @@ class MetricSettings:
 
     @property
     def canvas(self) -> BEVGrid:
-        """The extent of the map; ValueError if it is not known."""
+        """Extent of the map in metres.
+
+        Raises:
+            ValueError: If it is unknown.
+        """
         if self.grid is None:
             raise InputError("metrics of masks or of shrunk maps need the range of the map.")
         return self.grid
@@ -122,23 +133,26 @@ class MetricSettings:
     @property
     def areas(self) -> tuple[int, ...]:
         """Labels of the classes that are areas."""
-        named = enumerate(self.classes)
-        return tuple(label for label, name in named if name in self.polygon_classes)
+        labels = []
+        for label, name in enumerate(self.classes):
+            if name in self.polygon_classes:
+                labels.append(label)
+        return tuple(labels)
 
 
 class Metric(ABC):
-    """A metric, found by its name (`register_metric`).
+    """Base class of a metric, which ``register_metric`` makes available by its name.
 
-    A class for each metric, with its rules as attributes. Objects are picklable.
+    Rules of a metric are attributes of its class. Objects can be pickled.
 
     Attributes:
-        name: What ``--eval`` calls it, and what the keys of its figures begin with.
-        beside: Metrics that are reported together with it.
-        ranks: Whether it ranks the predictions of all samples: `match` returns `FrameMatches`, and
-            reports have ``detections``, of which intervals, groups and curves are made.
-        has_curves: Whether precision-recall curves describe it.
-        takes_min_score: Whether it heeds `MetricSettings.min_score`.
-        classes: Names of the classes.
+        name: Name of the metric in ``--eval`` and prefix of the keys of its figures.
+        beside: Names of metrics that are reported together with this one.
+        ranks: Whether the metric ranks predictions over all samples. If so, `match` returns
+            `FrameMatches` and reports have ``detections``, for intervals, groups and curves.
+        has_curves: Whether precision-recall curves describe the metric.
+        takes_min_score: Whether the metric uses `MetricSettings.min_score`.
+        classes: Names of the classes; a label is an index into them.
     """
 
     name: ClassVar[str]
@@ -151,24 +165,24 @@ class Metric(ABC):
     @classmethod
     @abstractmethod
     def of(cls, settings: MetricSettings) -> "Metric":
-        """Return the metric by the settings of a command or config."""
+        """Create the metric from the settings of a command or config."""
 
     @abstractmethod
     def match(self, sample: Sample) -> Matches:
-        """Return what the metric needs of a sample, in few bytes: never masks or points."""
+        """Compare both sides of a sample and return a small record, without masks or points."""
 
     @abstractmethod
     def reports(self, table: Any) -> list[MetricReport]:
         """Compute the figures of all samples.
 
         Args:
-            table: What `match` has returned: a `MatchTable` of `FrameMatches`, a `ValueTable` of
+            table: Records of `match`: a `MatchTable` of `FrameMatches`, or a `ValueTable` of
                 `SampleValues`.
         """
 
     @property
     def counts_heights(self) -> bool:
-        """Whether it measures distances in space."""
+        """Whether distances are in space rather than in the plane."""
         return False
 
 
@@ -177,26 +191,30 @@ _REGISTERED: dict[str, type[Metric]] = {}
 
 
 def register_metric(metric: MetricClass) -> MetricClass:
-    """Make a metric known by its name; a class decorator.
+    """Register a metric under its name; a class decorator.
 
     Raises:
-        ValueError: If another metric has that name.
+        ValueError: If another metric has this name.
     """
-    known = _REGISTERED.setdefault(metric.name, metric)
-    if (known.__module__, known.__qualname__) != (metric.__module__, metric.__qualname__):
-        raise InputError(f"{known.__module__} has a metric {metric.name!r}: choose another name.")
+    registered = _REGISTERED.setdefault(metric.name, metric)
+    first_source = (registered.__module__, registered.__qualname__)
+    source = (metric.__module__, metric.__qualname__)
+    if first_source != source:
+        raise InputError(
+            f"{registered.__module__} has a metric {metric.name!r}: choose another name."
+        )
     _REGISTERED[metric.name] = metric
     return metric
 
 
 def metric_class(name: str) -> type[Metric]:
-    """Return the metric of a name.
+    """Return the class of a metric by its name.
 
-    Of a metric that no module has registered, the file is imported that has its name, or that of
-    its first words: ``chamfer_hard`` is in the file of ``chamfer``.
+    If no module has registered the name yet, the file is imported whose name equals the first words
+    of it: ``chamfer_hard`` is in the file of ``chamfer``.
 
     Raises:
-        ValueError: If there is none.
+        ValueError: If there is no metric of this name.
     """
     if name not in _REGISTERED:
         for stem, module in metric_files().items():
@@ -208,62 +226,70 @@ def metric_class(name: str) -> type[Metric]:
 
 
 def metric_files() -> dict[str, str]:
-    """Return the modules of the metrics that come with GSMap, by the names of their files.
+    """Return the modules of the metrics of GSMap, by the names of their files.
 
-    Those of a method are in its folder: ``models/<method>/metric.py``.
+    The metrics of a method are in ``models/<method>/metric.py``, under the name of the method.
     """
-    own = {path.stem: "metrics" for path in (PACKAGE / "evaluation/metrics").glob("[a-z]*.py")}
-    methods = sorted(path.parent.name for path in (PACKAGE / "models").glob("*/metric.py"))
-    return {
-        **_CORE,
-        **{name: f"gsmap.evaluation.{room}.{name}" for name, room in sorted(own.items())},
-        **{name: f"gsmap.models.{name}.metric" for name in methods},
-    }
+    modules = dict(_CORE)
+    for path in sorted((PACKAGE / "evaluation/metrics").glob("[a-z]*.py")):
+        modules[path.stem] = f"gsmap.evaluation.metrics.{path.stem}"
+    for path in sorted((PACKAGE / "models").glob("*/metric.py")):
+        method = path.parent.name
+        modules[method] = f"gsmap.models.{method}.metric"
+    return modules
 
 
 def metric_names() -> tuple[str, ...]:
-    """Return the names of all metrics, also of those that other modules have registered."""
+    """Return the names of all metrics, including those that other modules have registered."""
     for module in metric_files().values():
         import_module(module)
     return tuple(_REGISTERED)
 
 
 def new_table(matches: Matches) -> MatchTable | ValueTable:
-    """Return an empty table for what a metric keeps of samples."""
+    """Create an empty table for records like ``matches``."""
     return MatchTable() if isinstance(matches, FrameMatches) else ValueTable()
 
 
 def arrays_of(matches: Matches) -> dict[str, npt.NDArray[Any]]:
-    """Return the arrays of what a metric keeps of a sample, by name."""
+    """Return the arrays of the record of a sample, by name."""
     if isinstance(matches, SampleValues):
         return {name: np.asarray(values) for name, values in matches.values.items()}
-    columns = {name: value for name, value in vars(matches).items() if name != "token"}
-    return {name: np.asarray(value) for name, value in columns.items() if value is not None}
+    arrays = {}
+    for name, values in vars(matches).items():
+        if name != "token" and values is not None:
+            arrays[name] = np.asarray(values)
+    return arrays
 
 
 def matches_of(token: str, arrays: Mapping[str, npt.NDArray[Any]], like: Matches) -> Matches:
-    """Make again what a metric keeps of a sample, from its arrays.
+    """Create the record of a sample from its arrays.
 
     Args:
         token: Name of the sample.
-        arrays: The arrays, as `arrays_of` returns them.
-        like: What the metric keeps of an empty sample, with the names and shapes.
+        arrays: Arrays by name, as `arrays_of` returns them.
+        like: Record of an empty sample of the metric, with the expected names and shapes.
 
     Raises:
-        ValueError: If names or shapes are others.
+        ValueError: If names or shapes do not fit ``like``.
     """
-    wanted = arrays_of(like)
+    expected = {name: values.shape for name, values in arrays_of(like).items()}
     shapes = {name: values.shape for name, values in arrays.items()}
-    fitting = arrays.keys() == wanted.keys() and all(
-        shape[1:] == wanted[name].shape[1:]
-        and len(shape) == wanted[name].ndim
-        and (wanted[name].shape[:1] in ((), (0,)) or shape == wanted[name].shape)
-        for name, shape in shapes.items()
+    fits = shapes.keys() == expected.keys() and all(
+        _fits_shape(shapes[name], expected[name]) for name in expected
     )
-    if isinstance(like, SampleValues) and fitting:
+    if isinstance(like, SampleValues) and fits:
         return SampleValues(token, arrays)
-    per_prediction = ("labels", "pred_index", "scores", "matched_gt", "quality")
-    if not fitting or len({shapes[name][0] for name in per_prediction}) > 1:
-        known = {name: values.shape for name, values in wanted.items()}
-        raise InputError(f"shapes {shapes} where an empty sample has {known}")
+    if fits:
+        lengths = {shapes[name][0] for name in _PER_PREDICTION}
+        fits = len(lengths) == 1
+    if not fits:
+        raise InputError(f"shapes {shapes} where an empty sample has {expected}")
     return FrameMatches(token, **arrays)
+
+
+def _fits_shape(shape: tuple[int, ...], empty_shape: tuple[int, ...]) -> bool:
+    """Whether an array may have this shape; the first axis varies if an empty sample has none."""
+    if len(shape) != len(empty_shape) or shape[1:] != empty_shape[1:]:
+        return False
+    return empty_shape[:1] in ((), (0,)) or shape == empty_shape

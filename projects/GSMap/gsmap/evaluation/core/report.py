@@ -1,4 +1,4 @@
-"""The outcome of a metric: flat figures, the ranked predictions, and one table to read."""
+"""Reports of metrics: flat figures, ranked predictions, and tables for people."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,23 +12,25 @@ from gsmap.evaluation.core.matches import ClassDetections
 from gsmap.structures.elements import FloatArray
 from gsmap.utils.files import write_text
 
-UNDEFINED = -1.0  # as in COCO: the figure does not exist (a class without ground truth, no match)
+UNDEFINED = -1.0
+"""Value of a figure that does not exist (a class without ground truth, no match), as in COCO."""
 
 
 @dataclass(frozen=True)
 class MetricReport:
-    """Everything that one metric says about a result.
+    """Figures of one metric over all samples of a result.
 
     Args:
-        name: Of the metric, such as ``chamfer`` or ``raster``.
-        groups: Classes that share their thresholds and a mean, by the name of the group.
+        name: Name of the metric, such as ``chamfer`` or ``raster``.
+        groups: Classes with common thresholds and a common mean, by the name of the group.
         metrics: Figures by flat keys such as ``chamfer/divider/AP@0.5``; -1 marks a figure that
             does not exist. The keys are listed in docs/evaluation.md.
-        detections: The ranked predictions of each class, from which curves are drawn.
-        tokens: The samples, sorted.
-        sample_aps: Of a metric that is the mean over samples: the AP of each class in each sample,
-            NaN where it does not count. C x (S, T)
-        by_distance: Whether thresholds are distances, of which the last is the loosest; IoU if not.
+        detections: Ranked predictions of each class, for curves and intervals.
+        tokens: Tokens of the samples, sorted.
+        sample_aps: AP of each class in each sample, for a metric that is the mean over samples; NaN
+            where a sample does not count. C x (S, T)
+        by_distance: Whether thresholds are distances in metres, the last the loosest; IoUs, the
+            first the loosest, if False.
     """
 
     name: str
@@ -43,92 +45,135 @@ class MetricReport:
     def of_figures(
         cls, name: str, figures: Mapping[str, float], tokens: Sequence[str] = ()
     ) -> "MetricReport":
-        """Return the report of a metric that has figures alone.
+        """Create the report of a metric that ranks no predictions.
 
         Args:
-            name: Of the metric.
-            figures: By their keys, without the name.
-            tokens: The samples, sorted.
+            name: Name of the metric.
+            figures: Figures by their keys, without the name of the metric.
+            tokens: Tokens of the samples, sorted.
         """
-        flat = {f"{name}/{key}": float(value) for key, value in figures.items()}
-        return cls(name, {}, flat, {}, tokens)
+        metrics = {f"{name}/{key}": float(value) for key, value in figures.items()}
+        return cls(name, groups={}, metrics=metrics, detections={}, tokens=tokens)
 
 
 def flat_metrics(reports: Iterable[MetricReport]) -> dict[str, float]:
-    """Join the figures of several metrics under their flat keys."""
-    return {key: value for report in reports for key, value in report.metrics.items()}
-
-
-def write_figures(path: Path, reports: Iterable[MetricReport]) -> None:
-    """Write the figures of several metrics as flat JSON."""
-    write_text(path, json.dumps(flat_metrics(reports), indent=1) + "\n")
-
-
-def class_figures(found: ClassDetections, aps: Sequence[float], absent: float) -> dict[str, float]:
-    """Return the figures of one class that all metrics have, by the last part of their key.
-
-    Args:
-        found: Detections of the class.
-        aps: Its AP at each threshold. (T,)
-        absent: Recall of a class without ground truth.
-    """
+    """Join the figures of several reports in one dictionary."""
     figures: dict[str, float] = {}
-    for threshold, hits, ap in zip(found.thresholds, found.hits.T, aps, strict=True):
-        figures[f"AP@{threshold}"] = ap
-        figures[f"recall@{threshold}"] = hits.sum() / found.num_gts if found.num_gts else absent
-        figures[f"tp@{threshold}"] = float(hits.sum())
-        figures[f"calibration_error@{threshold}"] = calibration_error(found.scores, hits)
-    figures["AP"] = float(np.mean([figures[f"AP@{threshold}"] for threshold in found.thresholds]))
-    figures["num_gts"] = float(found.num_gts)
-    figures["num_preds"] = float(len(found.scores))
+    for report in reports:
+        figures.update(report.metrics)
     return figures
 
 
-def distance_figures(found: ClassDetections, aps: Sequence[float]) -> dict[str, float]:
-    """Return ``class_figures`` of a metric by distance, and the mean distance of matches."""
-    figures = class_figures(found, aps, absent=0.0)
-    for t, threshold in enumerate(found.thresholds):
-        errors = found.quality[found.hits[:, t]]
-        figures[f"error_m@{threshold}"] = float(errors.mean()) if len(errors) else UNDEFINED
+def write_figures(path: Path, reports: Iterable[MetricReport]) -> None:
+    """Write the figures of several reports as flat JSON."""
+    write_text(path, json.dumps(flat_metrics(reports), indent=1) + "\n")
+
+
+def class_figures(
+    detections: ClassDetections, aps: Sequence[float], absent: float
+) -> dict[str, float]:
+    """Compute the figures of one class that all metrics have in common.
+
+    Args:
+        detections: Predictions of the class.
+        aps: AP of the class at each threshold. (T,)
+        absent: Recall of a class without ground truth.
+
+    Returns:
+        Figures by the last part of their key, such as ``AP@0.5``.
+    """
+    num_gts = detections.num_gts
+    figures: dict[str, float] = {}
+    for t, threshold in enumerate(detections.thresholds):
+        hits = detections.hits[:, t]
+        error = calibration_error(detections.scores, hits)
+        figures[f"AP@{threshold}"] = aps[t]
+        figures[f"recall@{threshold}"] = hits.sum() / num_gts if num_gts else absent
+        figures[f"tp@{threshold}"] = float(hits.sum())
+        figures[f"calibration_error@{threshold}"] = error
+    figures["AP"] = float(np.mean(aps))
+    figures["num_gts"] = float(num_gts)
+    figures["num_preds"] = float(len(detections.scores))
+    return figures
+
+
+def distance_figures(detections: ClassDetections, aps: Sequence[float]) -> dict[str, float]:
+    """Compute ``class_figures`` and the mean distance of the matches at each threshold.
+
+    Args:
+        detections: Predictions of one class under a metric by distance.
+        aps: AP of the class at each threshold. (T,)
+
+    Returns:
+        Figures by the last part of their key, such as ``error_m@0.5``.
+    """
+    figures = class_figures(detections, aps, absent=0.0)
+    for t, threshold in enumerate(detections.thresholds):
+        errors_m = detections.quality[detections.hits[:, t]]
+        figures[f"error_m@{threshold}"] = float(errors_m.mean()) if len(errors_m) else UNDEFINED
     return figures
 
 
 def format_table(report: MetricReport) -> str:
-    """Return the table of a metric: a row per class, a column per threshold, the means below.
+    """Format the table of a metric: a row per class, a column per threshold, the means below.
 
-    Classes with the same thresholds stand together; the recall, the error and the calibration are
-    those at the loosest threshold. A metric that ranks no predictions has a row per figure.
+    Each group of classes has a table. Recall, error and calibration are at the loosest threshold.
+    A metric that ranks no predictions has a row per figure.
     """
     if not report.groups:
         return "\n".join(f"{key:<44} {value:.4f}" for key, value in report.metrics.items())
-    chamfer = report.by_distance
-    unit, quality = ("m", "error m") if chamfer else ("IoU", "mIoU")
     lines = [f"AP_{report.name}"]
-    for group, names in report.groups.items():
-        thresholds = report.detections[names[0]].thresholds
-        loosest = thresholds[-1 if chamfer else 0]
-        aps = ["AP", *(f"AP@{t}" for t in thresholds)]
-        error = f"error_m@{loosest}" if chamfer else "mIoU"
-        details = [f"recall@{loosest}", error, f"calibration_error@{loosest}"]
-        titles = ["AP", *(f"@{t} {unit}" for t in thresholds), "recall", quality, "calib. err."]
-        means = ["mAP", *aps[1:]] if chamfer else [f"{group}/{key}" for key in aps]
-        rows = {group: [*titles, "truths", "preds"]}
-        for name in names:
-            keys = [f"{name}/{key}" for key in (*aps, *details, "num_gts", "num_preds")]
-            rows[name] = [_cell(report, key) for key in keys]
-        rows["mean"] = [_cell(report, key) for key in means]
-        widths = [max(len(title), 6) + 2 for title in rows[group]]
-        for name, cells in rows.items():
-            aligned = (cell.rjust(w) for cell, w in zip(cells, widths, strict=False))
-            lines.append(name.ljust(max(map(len, rows))) + "".join(aligned))
-        lines.insert(-len(rows) + 1, "-" * len(lines[-2]))
-    absent = [name for name, found in report.detections.items() if not found.num_gts]
+    for group in report.groups:
+        lines += _group_lines(report, group)
+    absent = [name for name, ranked in report.detections.items() if not ranked.num_gts]
     if absent and len(absent) < len(report.detections) and not report.sample_aps:
         lines.append(f"without ground truth, and in no mean: {', '.join(absent)}")
-    lines.append(f"mAP_{report.name} = {report.metrics[f'{report.name}/mAP']:.6f}")
+    mean_ap = report.metrics[f"{report.name}/mAP"]
+    lines.append(f"mAP_{report.name} = {mean_ap:.6f}")
     return "\n".join(lines)
 
 
+def _group_lines(report: MetricReport, group: str) -> list[str]:
+    """Format the table of one group of classes."""
+    names = report.groups[group]
+    thresholds = report.detections[names[0]].thresholds
+    ap_keys = ["AP"] + [f"AP@{threshold}" for threshold in thresholds]
+    if report.by_distance:
+        unit = "m"
+        loosest = thresholds[-1]
+        error_title = "error m"
+        error_key = f"error_m@{loosest}"
+        mean_keys = ["mAP", *ap_keys[1:]]
+    else:
+        unit = "IoU"
+        loosest = thresholds[0]
+        error_title = "mIoU"
+        error_key = "mIoU"
+        mean_keys = [f"{group}/{key}" for key in ap_keys]
+
+    threshold_titles = [f"@{threshold} {unit}" for threshold in thresholds]
+    titles = ["AP", *threshold_titles, "recall", error_title, "calib. err.", "truths", "preds"]
+    class_keys = [*ap_keys, f"recall@{loosest}", error_key, f"calibration_error@{loosest}"]
+    class_keys += ["num_gts", "num_preds"]
+    rows = {group: titles}
+    for name in names:
+        rows[name] = [_cell(report, f"{name}/{key}") for key in class_keys]
+    rows["mean"] = [_cell(report, key) for key in mean_keys]
+
+    name_width = max(len(name) for name in rows)
+    widths = [max(len(title), 6) + 2 for title in titles]
+    lines = []
+    for name, cells in rows.items():
+        line = name.ljust(name_width)
+        for cell, width in zip(cells, widths, strict=False):  # the means have no details
+            line += cell.rjust(width)
+        lines.append(line)
+    lines.insert(1, "-" * len(lines[-2]))
+    return lines
+
+
 def _cell(report: MetricReport, key: str) -> str:
+    """Format one figure; ``-`` if it does not exist."""
     value = report.metrics[f"{report.name}/{key}"]
-    return "-" if value == UNDEFINED else f"{value:.{0 if '/num_' in key else 4}f}"
+    decimals = 0 if "/num_" in key else 4
+    return "-" if value == UNDEFINED else f"{value:.{decimals}f}"

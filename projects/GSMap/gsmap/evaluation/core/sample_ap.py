@@ -1,11 +1,14 @@
-"""AP per sample of older methods: lines drawn as masks, then the mean over samples.
+"""AP per sample of older methods: lines are drawn to masks, and AP is averaged over samples.
 
-Rules (those of both released evaluators): the lines of a class and sample are drawn into one mask
-of 0.15 m pixels in the order of the file, so a later line hides what it crosses. The distance of
-two lines is the mean of both mean distances from a pixel of one to the nearest of the other. The
-closest pair below the threshold matches first, whatever its score. Predictions are then counted in
-the order of RISING score, and precision is taken at ten recalls. A sample with either predictions
-or ground truth of the class counts, one without both does not.
+Rules, equal to the evaluators that HDMapNet and BeMapNet released:
+
+- The lines of a class in a sample are drawn to one mask of 0.15 m pixels in the order of the file,
+  so that a later line hides the pixels that it crosses.
+- The distance of two lines is the mean of both directed mean distances from the pixels of one line
+  to the nearest pixel of the other.
+- The closest pair below the threshold matches first, whatever its score.
+- Predictions count in the order of *rising* score, and precision is taken at ten recalls.
+- A sample without predictions and ground truth of a class does not count for the class.
 """
 
 from collections.abc import Mapping
@@ -16,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-import gsmap.utils.compilation  # noqa: F401 - says that kernels are compiled
+import gsmap.utils.compilation  # noqa: F401 - reports that kernels are compiled
 from gsmap.evaluation.core.average_precision import ten_point_ap
 from gsmap.evaluation.core.matches import (
     ClassDetections,
@@ -33,23 +36,24 @@ from gsmap.utils.errors import InputError
 
 PIXEL_M = 0.15
 _FAR_PX = 2.0**20  # farther points are pulled in, so that they fit the integers of the drawing
-_NO_PIXEL = 1e6  # distance in pixels where a column has none, beyond any canvas
+_NO_PIXEL = 1e6  # distance in pixels in a column without a pixel of the line, beyond any canvas
 MaskArray = npt.NDArray[np.int32]
 GapArray = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class SampleAP(Metric):
-    """AP per sample; a method's own is a subclass in its folder.
+    """AP per sample; the metric of each method is a subclass in its folder.
 
     Attributes:
         line_px: Thickness of lines in pixels.
-        report_thresholds: Thresholds of a match in metres, by the name of the figures.
+        report_thresholds: Largest distances of a match in metres, by the name of the report.
 
     Args:
         classes: Names of the classes; a label is an index into them.
-        grid: Extent of the canvas; its raster is not used.
-        min_score: Predictions with a lower score are left out. The released evaluators count all.
+        grid: Extent of the canvas in metres; its raster is not used.
+        min_score: Smallest score of a prediction that counts, in [0, 1]. The released evaluators
+            count all predictions.
 
     Raises:
         ValueError: If a value is out of its range.
@@ -71,17 +75,23 @@ class SampleAP(Metric):
 
     @classmethod
     def of(cls, settings: MetricSettings) -> "SampleAP":
-        """Return the metric by the settings of a command or config."""
-        return cls(settings.classes, settings.canvas, settings.min_score or 0.0)
+        """Create the metric from the settings of a command or config."""
+        min_score = settings.min_score or 0.0
+        return cls(classes=settings.classes, grid=settings.canvas, min_score=min_score)
 
     @property
     def thresholds(self) -> tuple[float, ...]:
-        """All thresholds, ascending."""
-        return tuple(sorted({t for own in self.report_thresholds.values() for t in own}))
+        """Thresholds of all reports in metres, ascending."""
+        thresholds: set[float] = set()
+        for report_thresholds in self.report_thresholds.values():
+            thresholds.update(report_thresholds)
+        return tuple(sorted(thresholds))
 
     def match(self, sample: Sample) -> FrameMatches:
         """Match the predictions of one sample with its ground truth (`match_sample_ap`)."""
-        return match_sample_ap(sample.predictions, sample.ground_truth, self, sample.token)
+        return match_sample_ap(
+            sample.predictions, sample.ground_truth, config=self, token=sample.token
+        )
 
     def reports(self, table: MatchTable) -> list[MetricReport]:
         """Compute the mean of AP over the samples (`sample_ap_reports`)."""
@@ -90,46 +100,51 @@ class SampleAP(Metric):
     @property
     def size_px(self) -> tuple[int, int]:
         """Columns (along x) and rows (along y) of the canvas."""
-        columns, rows = (int(np.ceil(extent / PIXEL_M - 1e-6)) for extent in self.grid.extent_m)
+        x_m, y_m = self.grid.extent_m
+        columns = int(np.ceil(x_m / PIXEL_M - 1e-6))
+        rows = int(np.ceil(y_m / PIXEL_M - 1e-6))
         return columns, rows
 
 
 def draw_numbers(elements: MapElements, label: int, config: SampleAP) -> MaskArray:
-    """Draw the lines of a class into one mask, each with its number; later ones hide earlier ones.
+    """Draw the lines of a class to one mask of element indices; later lines hide earlier ones.
 
-    Points are cut to whole pixels toward zero, counted from the corner of least x and y.
+    Coordinates are truncated to whole pixels toward zero, counted from the corner of smallest x
+    and y.
 
     Args:
-        elements: N elements; those of fewer than two points are not drawn.
-        label: The class.
-        config: The metric's settings.
+        elements: Elements in metres; elements of fewer than two points are not drawn.
+        label: Label of the class.
+        config: Rules of the metric.
 
     Returns:
-        Index of the element that a pixel belongs to, or -1. (H, W)
+        Index of the element at each pixel, or -1. (H, W)
     """
-    import cv2  # AP_chamfer and AP_raster do without it
+    import cv2  # AP_chamfer and AP_raster do not need it
 
     columns, rows = config.size_px
-    mask = np.zeros((rows, columns), np.int32)
+    mask = np.zeros((rows, columns), dtype=np.int32)
     points = elements.with_coordinates(2).points
-    pixels = (points - (config.grid.x_range[0], config.grid.y_range[0])) / PIXEL_M
+    origin = (config.grid.x_range[0], config.grid.y_range[0])
+    pixels = (points - origin) / PIXEL_M
     pixels = np.clip(pixels, -_FAR_PX, _FAR_PX).astype(np.int32)
-    for i in np.flatnonzero((elements.labels == label) & (elements.num_points >= 2)).tolist():
+    is_drawn = (elements.labels == label) & (elements.num_points >= 2)
+    for i in np.flatnonzero(is_drawn).tolist():
         line = pixels[elements.offsets[i] : elements.offsets[i + 1]]
         cv2.polylines(mask, [line], isClosed=False, color=(i + 1,), thickness=config.line_px)
     return mask - 1
 
 
 @dataclass(frozen=True)
-class _Pixels:
-    """The pixels of all elements of a mask.
+class _MaskPixels:
+    """Pixels of the n elements that are visible in a mask, numbered from 0.
 
     Args:
-        mask: Number of the element that a pixel belongs to, or -1. (H, W)
-        indices: What the elements are called outside, by their numbers. (n,)
-        rows: Rows of all pixels that belong to one. (M,)
-        columns: Their columns. (M,)
-        owners: Numbers of their elements, ascending. (M,)
+        mask: Number of the element at each pixel, or -1. (H, W)
+        indices: Index of each element in the sample. (n,)
+        rows: Row of each pixel. (M,)
+        columns: Column of each pixel. (M,)
+        owners: Number of the element of each pixel, ascending. (M,)
     """
 
     mask: MaskArray
@@ -139,136 +154,158 @@ class _Pixels:
     owners: IntArray
 
     @classmethod
-    def of(cls, mask: MaskArray) -> "_Pixels":
-        """Number the elements of a mask anew, without those that have no pixel."""
+    def of(cls, mask: MaskArray) -> "_MaskPixels":
+        """List the pixels of a mask of element indices."""
         rows, columns = np.nonzero(mask >= 0)
         indices, owners = np.unique(mask[rows, columns], return_inverse=True)
-        numbered = np.full(mask.shape, -1, np.int32)
-        numbered[rows, columns] = owners
+        numbers = np.full(mask.shape, fill_value=-1, dtype=np.int32)
+        numbers[rows, columns] = owners
         order = np.argsort(owners, kind="stable")
-        return cls(numbered, indices.astype(np.int64), rows[order], columns[order], owners[order])
+        return cls(
+            mask=numbers,
+            indices=indices.astype(np.int64),
+            rows=rows[order],
+            columns=columns[order],
+            owners=owners[order],
+        )
 
     @property
     def count(self) -> int:
-        """How many elements there are."""
+        """Number of elements n."""
         return len(self.indices)
 
-    def bounds(self, along: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return the least and the largest of the rows, or of the columns, of each. 2 x (n,)"""
-        starts = np.searchsorted(self.owners, np.arange(self.count))
-        values = along.astype(np.float64)
+    def bounds(self, coordinates: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return the smallest and the largest row, or column, of each element. 2 x (n,)"""
+        values = coordinates.astype(np.float64)
         if not self.count:
             return values, values
+        starts = np.searchsorted(self.owners, np.arange(self.count))
         return np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
 
 
 @njit(cache=True)
-def _fill_gaps(gap: GapArray, mask: MaskArray, number: int) -> None:
-    """Write the distance in pixels to the nearest one of an element in the same column. (H, W)"""
+def _fill_gaps(gaps: GapArray, mask: MaskArray, number: int) -> None:
+    """Write the distance of each pixel to the nearest pixel of an element in its column. (H, W)"""
     height, width = mask.shape
-    gap[0] = _NO_PIXEL
+    gaps[0] = _NO_PIXEL
     for r in range(height):
-        above = gap[max(r - 1, 0)]
+        above = gaps[max(r - 1, 0)]
         for c in range(width):
-            gap[r, c] = 0.0 if mask[r, c] == number else above[c] + 1
+            gaps[r, c] = 0.0 if mask[r, c] == number else above[c] + 1
     for r in range(height - 2, -1, -1):
         for c in range(width):
-            gap[r, c] = min(gap[r, c], gap[r + 1, c] + 1)
+            gaps[r, c] = min(gaps[r, c], gaps[r + 1, c] + 1)
 
 
 @njit(cache=True)
-def _nearest(gaps: GapArray, column: int) -> float:
-    """Return the distance in pixels to the nearest one of an element, from gaps of a row. (W,)"""
-    best, step = gaps[column] ** 2, 1
-    while step * step < best and step < len(gaps):
+def _distance_from_gaps(gaps: GapArray, column: int) -> float:
+    """Compute the distance in pixels to the nearest pixel of an element.
+
+    Args:
+        gaps: Distances within each column, at the row of the pixel. (W,)
+        column: Column of the pixel.
+    """
+    best_sq = gaps[column] ** 2
+    step = 1
+    while step * step < best_sq and step < len(gaps):
         if column >= step:
-            best = min(best, step * step + gaps[column - step] ** 2)
+            best_sq = min(best_sq, step * step + gaps[column - step] ** 2)
         if column + step < len(gaps):
-            best = min(best, step * step + gaps[column + step] ** 2)
+            best_sq = min(best_sq, step * step + gaps[column + step] ** 2)
         step += 1
-    return float(np.sqrt(best))
+    return float(np.sqrt(best_sq))
 
 
 @njit(cache=True)
 def _mean_distances(
-    mask: MaskArray, wanted: BoolArray, rows: IntArray, columns: IntArray, owners: IntArray
+    mask: MaskArray, is_near: BoolArray, rows: IntArray, columns: IntArray, owners: IntArray
 ) -> FloatArray:
-    """Return the mean distance from the pixels of other elements to each element of a mask.
+    """Compute the mean distance from the pixels of other elements to each element of a mask.
 
     Args:
-        mask: Number of the element that a pixel belongs to, or -1. (H, W)
-        wanted: Which pairs to measure; the others are infinitely far. (N, m)
-        rows: Rows of all pixels of the other elements. (M,)
-        columns: Their columns. (M,)
-        owners: Numbers of the elements that they belong to. (M,)
+        mask: Number of the element at each pixel, or -1. (H, W)
+        is_near: Whether to measure each pair. (N, m)
+        rows: Row of each pixel of the other elements. (M,)
+        columns: Column of each pixel of the other elements. (M,)
+        owners: Number of the other element of each pixel. (M,)
 
     Returns:
-        Mean distances in pixels. (N, m)
+        Mean distances in pixels, infinite where they are not measured. (N, m)
     """
-    sums, counts = np.zeros(wanted.shape), np.zeros(wanted.shape[1])
+    sums = np.zeros(is_near.shape)
+    counts = np.zeros(is_near.shape[1])
     for j in owners:
         counts[j] += 1
-    gap = np.empty(mask.shape, np.float32)
-    for i in range(len(wanted)):
-        if not wanted[i].any():
+    gaps = np.empty(mask.shape, dtype=np.float32)
+    for i in range(len(is_near)):
+        if not is_near[i].any():
             continue
-        _fill_gaps(gap, mask, i)
+        _fill_gaps(gaps, mask=mask, number=i)
         for p in range(len(rows)):
-            if wanted[i, owners[p]]:
-                sums[i, owners[p]] += _nearest(gap[rows[p]], columns[p])
-    return np.where(wanted, sums / counts, np.inf)
+            j = owners[p]
+            if is_near[i, j]:
+                sums[i, j] += _distance_from_gaps(gaps[rows[p]], column=columns[p])
+    return np.where(is_near, sums / counts, np.inf)
 
 
-def _box_distances(first: _Pixels, second: _Pixels) -> FloatArray:
-    """Return the distance of the boxes around every two elements, in pixels. (n, k)"""
-    total = np.zeros((first.count, second.count))
-    for one, other in ((first.rows, second.rows), (first.columns, second.columns)):
-        (low, high), (other_low, other_high) = first.bounds(one), second.bounds(other)
-        apart = np.maximum(other_low - high[:, None], low[:, None] - other_high)
-        total += np.maximum(apart, 0.0) ** 2
-    return np.sqrt(total)
+def _squared_gaps(first: _MaskPixels, second: _MaskPixels, axis: str) -> FloatArray:
+    """Compute the squared gap in pixels between every two elements along one axis. (n, k)"""
+    first_low, first_high = first.bounds(getattr(first, axis))
+    second_low, second_high = second.bounds(getattr(second, axis))
+    gaps = np.maximum(second_low - first_high[:, None], first_low[:, None] - second_high)
+    return np.maximum(gaps, 0.0) ** 2
 
 
 def line_distances(
-    found: MaskArray, true: MaskArray, limit_m: float = np.inf
+    pred_mask: MaskArray, gt_mask: MaskArray, limit_m: float = np.inf
 ) -> tuple[FloatArray, IntArray, IntArray]:
-    """Return the distance of every two lines of two masks.
+    """Compute the distance of every prediction from every ground truth that has a pixel.
 
     Args:
-        found: Index of the prediction that a pixel belongs to, or -1. (H, W)
-        true: Index of the ground truth, likewise. (H, W)
-        limit_m: Pairs that cannot be closer are not measured to the end.
+        pred_mask: Index of the prediction at each pixel, or -1. (H, W)
+        gt_mask: Index of the ground truth at each pixel, or -1. (H, W)
+        limit_m: Limit in metres; pairs that cannot be closer are not measured.
 
     Returns:
-        Distances in metres, infinite beyond the limit (n, k); the indices of the predictions that
-        have a pixel (n,) and of the ground truths that have one (k,).
+        Distances in metres, infinite where they are not measured (n, k); indices of the predictions
+        with a pixel (n,); and indices of the ground truths with a pixel (k,).
     """
-    pred, gt = _Pixels.of(found), _Pixels.of(true)
-    near = _box_distances(gt, pred) * PIXEL_M < limit_m  # (k, n)
-    from_pred = _mean_distances(gt.mask, near, pred.rows, pred.columns, pred.owners).T
-    near = from_pred * PIXEL_M / 2 < limit_m  # (n, k)
-    from_gt = _mean_distances(pred.mask, near, gt.rows, gt.columns, gt.owners)
+    pred = _MaskPixels.of(pred_mask)
+    gt = _MaskPixels.of(gt_mask)
+    box_distances = np.sqrt(
+        _squared_gaps(gt, pred, axis="rows") + _squared_gaps(gt, pred, axis="columns")
+    )  # (k, n)
+    is_near = box_distances * PIXEL_M < limit_m
+    from_pred = _mean_distances(
+        gt.mask, is_near=is_near, rows=pred.rows, columns=pred.columns, owners=pred.owners
+    ).T  # (n, k)
+    is_near = from_pred * PIXEL_M / 2 < limit_m
+    from_gt = _mean_distances(
+        pred.mask, is_near=is_near, rows=gt.rows, columns=gt.columns, owners=gt.owners
+    )
     return (from_pred + from_gt) / 2 * PIXEL_M, pred.indices, gt.indices
 
 
 def closest_pairs(distance_m: FloatArray, limit_m: float) -> IntArray:
-    """Pair the closest of two sides again and again while they are below a limit.
+    """Pair rows with columns greedily, the closest pair first.
 
     Args:
-        distance_m: Distance of every pair. (n, k)
-        limit_m: What it must be below.
+        distance_m: Distance of every pair in metres. (n, k)
+        limit_m: Distance in metres that pairs must be below.
 
     Returns:
-        Partner of each row, or -1. (n,)
+        Column of each row, or -1. (n,)
     """
-    free, partner = distance_m.copy(), np.full(len(distance_m), -1)
-    while free.size:
-        i, j = np.unravel_index(free.argmin(), free.shape)
-        if not free[i, j] < limit_m:
+    remaining = distance_m.copy()
+    partners = np.full(len(distance_m), fill_value=-1)
+    while remaining.size:
+        row, column = np.unravel_index(remaining.argmin(), remaining.shape)
+        if not remaining[row, column] < limit_m:
             break
-        partner[i] = j
-        free[i], free[:, j] = np.inf, np.inf
-    return partner
+        partners[row] = column
+        remaining[row] = np.inf
+        remaining[:, column] = np.inf
+    return partners
 
 
 def match_sample_ap(
@@ -276,90 +313,127 @@ def match_sample_ap(
 ) -> FrameMatches:
     """Match the predictions of one sample with its ground truth by the distance of their masks.
 
-    Only elements that have a pixel left count, on both sides.
+    Elements of either side without a visible pixel do not count.
 
     Args:
         predictions: Elements with scores.
-        ground_truth: Elements at full resolution.
-        config: The metric's settings.
-        token: The sample's name.
+        ground_truth: Annotated elements at full resolution.
+        config: Rules of the metric.
+        token: Name of the sample.
 
     Raises:
-        ValueError: As of `check_pair`.
+        ValueError: As for `check_pair`.
     """
-    check_pair(predictions, ground_truth, config.classes, token)
+    check_pair(predictions, ground_truth, classes=config.classes, token=token)
     thresholds = np.array(config.thresholds)
-    partner = np.full(len(predictions), -1)
-    quality = np.full(len(predictions), np.nan)
-    visible = np.zeros(len(predictions), np.bool_)
-    num_gts = np.zeros(len(config.classes), np.int64)
-    chosen = np.flatnonzero(predictions.confidence >= config.min_score)
+    limit_m = thresholds[-1]
+    partners = np.full(len(predictions), fill_value=-1)
+    quality = np.full(len(predictions), fill_value=np.nan)
+    is_visible = np.zeros(len(predictions), dtype=np.bool_)
+    num_gts = np.zeros(len(config.classes), dtype=np.int64)
+    confident = np.flatnonzero(predictions.confidence >= config.min_score)
+    confident_predictions = predictions.select(confident)
     for label in range(len(config.classes)):
-        masks = (
-            draw_numbers(predictions.select(chosen), label, config),
-            draw_numbers(ground_truth, label, config),
-        )
-        distance, drawn, true = line_distances(*masks, thresholds[-1])
-        own = chosen[drawn]
-        matched = closest_pairs(distance, thresholds[-1])
-        hits = matched >= 0
-        visible[own], num_gts[label] = True, len(true)
-        partner[own[hits]] = true[matched[hits]]
-        quality[own[hits]] = distance[hits, matched[hits]]
-    rows = np.flatnonzero(visible)
+        pred_mask = draw_numbers(confident_predictions, label=label, config=config)
+        gt_mask = draw_numbers(ground_truth, label=label, config=config)
+        distance, pred_rows, gts = line_distances(pred_mask, gt_mask, limit_m=limit_m)
+        preds = confident[pred_rows]
+        matched = closest_pairs(distance, limit_m)
+        is_match = matched >= 0
+        is_visible[preds] = True
+        num_gts[label] = len(gts)
+        partners[preds[is_match]] = gts[matched[is_match]]
+        quality[preds[is_match]] = distance[is_match, matched[is_match]]
+    rows = np.flatnonzero(is_visible)
     rows = rows[np.argsort(-predictions.confidence[rows], kind="stable")]
-    matched_gt = np.where(quality[rows, None] < thresholds, partner[rows, None], -1)
-    labels, scores = predictions.labels[rows], predictions.confidence[rows]
-    return FrameMatches(token, rows, labels, scores, matched_gt, quality[rows], num_gts)
+    within = quality[rows, None] < thresholds  # (n, T)
+    return FrameMatches(
+        token=token,
+        pred_index=rows,
+        labels=predictions.labels[rows],
+        scores=predictions.confidence[rows],
+        matched_gt=np.where(within, partners[rows, None], -1),
+        quality=quality[rows],
+        num_gts=num_gts,
+    )
 
 
-def sample_aps(found: ClassDetections) -> FloatArray:
-    """Return the AP of a class in each sample, NaN where it has neither side. (S, T)
+def sample_aps(detections: ClassDetections) -> FloatArray:
+    """Compute the AP of a class in each sample.
 
-    Predictions count in the order of rising score, as released; of equal scores matches go first.
+    Predictions count in the order of rising score, as released; matches come first among equal
+    scores.
+
+    Args:
+        detections: Predictions of the class in all samples.
+
+    Returns:
+        AP in [0, 1]; NaN for a sample without predictions and ground truth. (S, T)
     """
-    gts = found.gts_of_sample
-    numbers = np.bincount(found.samples, minlength=len(gts))
-    aps = np.where((numbers + gts > 0)[:, None], np.zeros(len(found.thresholds)), np.nan)
-    ends = np.cumsum(numbers)
-    for t, hits in enumerate(found.hits.T):
-        ordered = hits[np.lexsort((~hits, found.scores, found.samples))]
-        some = np.bincount(found.samples, hits, len(gts)) > 0
-        for s in np.flatnonzero(some).tolist():
-            aps[s, t] = ten_point_ap(ordered[ends[s] - numbers[s] : ends[s]], int(gts[s]))
+    num_gts = detections.gts_of_sample
+    num_samples = len(num_gts)
+    scores = detections.scores
+    samples = detections.samples
+    num_preds = np.bincount(samples, minlength=num_samples)
+    aps = np.full((num_samples, len(detections.thresholds)), fill_value=np.nan)
+    aps[num_preds + num_gts > 0] = 0.0
+    ends = np.cumsum(num_preds)
+    starts = ends - num_preds
+    for t, hits in enumerate(detections.hits.T):
+        sorted_hits = hits[np.lexsort((~hits, scores, samples))]
+        hits_of_sample = np.bincount(samples, weights=hits, minlength=num_samples)
+        for s in np.flatnonzero(hits_of_sample > 0).tolist():
+            hits_in_sample = sorted_hits[starts[s] : ends[s]]
+            aps[s, t] = ten_point_ap(hits_in_sample, num_gts=int(num_gts[s]))
     return aps
 
 
 def _mean(values: FloatArray) -> float:
-    """Return the mean of the values that are defined."""
+    """Compute the mean of the values that are defined."""
     defined = values[~np.isnan(values)]
     return float(defined.mean()) if len(defined) else UNDEFINED
 
 
 def sample_ap_reports(matches: MatchTable, config: SampleAP) -> list[MetricReport]:
-    """Compute the mean of AP over the samples, at each set of thresholds of the method.
+    """Compute the mean of AP over the samples, for each report of the method.
 
-    Samples without predictions and ground truth of a class do not count for it; a class that
-    occurs nowhere is left out of the means.
+    Samples without predictions and ground truth of a class do not count for the class. A class
+    that occurs in no sample is left out of the means.
+
+    Args:
+        matches: Matches of all samples by the rules of ``config``.
+        config: Rules of the metric.
     """
-    classes = config.classes
-    everything = matches.detections(dict.fromkeys(classes, config.thresholds))
+    all_thresholds = dict.fromkeys(config.classes, config.thresholds)
+    all_detections = matches.detections(all_thresholds)
     reports = []
     for name, thresholds in config.report_thresholds.items():
-        detections = {of_class: found.at(thresholds) for of_class, found in everything.items()}
-        aps = {of_class: sample_aps(found) for of_class, found in detections.items()}
+        detections: dict[str, ClassDetections] = {}
+        aps: dict[str, FloatArray] = {}
         metrics: dict[str, float] = {}
-        means = np.full((len(classes), len(thresholds)), np.nan)
-        for row, (of_class, found) in enumerate(detections.items()):
-            own = [_mean(values) for values in aps[of_class].T]
-            metrics |= {f"{of_class}/{k}": v for k, v in distance_figures(found, own).items()}
-            metrics[f"{of_class}/num_samples"] = float((~np.isnan(aps[of_class][:, 0])).sum())
-            means[row] = [np.nan if ap == UNDEFINED else ap for ap in own]
+        means = np.full((len(config.classes), len(thresholds)), fill_value=np.nan)
+        for row, class_name in enumerate(all_detections):
+            ranked = all_detections[class_name].at(thresholds)
+            class_aps = sample_aps(ranked)
+            class_means = [_mean(values) for values in class_aps.T]
+            for key, value in distance_figures(ranked, class_means).items():
+                metrics[f"{class_name}/{key}"] = value
+            num_samples = (~np.isnan(class_aps[:, 0])).sum()
+            metrics[f"{class_name}/num_samples"] = float(num_samples)
+            means[row] = np.where(np.equal(class_means, UNDEFINED), np.nan, class_means)
+            detections[class_name] = ranked
+            aps[class_name] = class_aps
         for t, threshold in enumerate(thresholds):
             metrics[f"AP@{threshold}"] = _mean(means[:, t])
         metrics["mAP"] = _mean(means.mean(axis=1))
         metrics["num_samples"] = float(len(matches))
-        flat = {f"{name}/{key}": value for key, value in metrics.items()}
-        groups = {"class": classes}
-        reports.append(MetricReport(name, groups, flat, detections, matches.tokens, aps))
+        report = MetricReport(
+            name=name,
+            groups={"class": config.classes},
+            metrics={f"{name}/{key}": value for key, value in metrics.items()},
+            detections=detections,
+            tokens=matches.tokens,
+            sample_aps=aps,
+        )
+        reports.append(report)
     return reports

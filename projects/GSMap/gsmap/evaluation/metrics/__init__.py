@@ -1,1 +1,1 @@
-"""Further metrics of ``--eval``, each in a file with its name."""
+"""Further metrics of ``--eval``; a metric is in the file of its name."""
