@@ -1,10 +1,11 @@
-"""Convert Argoverse 2 logs to an annotation file: seven ring cameras, ego frame, 60 x 30 m."""
+"""Conversion of Argoverse 2 logs to an annotation file (seven ring cameras, ego frame)."""
 
 import argparse
 from collections.abc import Collection, Iterable, Sequence
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import shapely
 
@@ -22,7 +23,7 @@ from mapdata.argoverse2.samples import (
     Argoverse2Options,
     LogSamples,
     read_log,
-    spread_over_split,
+    thin_out_split,
     usable_times,
 )
 from mapdata.command_line import (
@@ -37,33 +38,42 @@ from mapdata.summary import ConversionSummary
 
 
 def convert_argoverse2(options: Argoverse2Options) -> ConversionSummary:
-    """Convert the logs of a split to one annotation file, which appears when it is whole.
+    """Convert the logs of a split to one annotation file.
 
-    A log that cannot be read does not stop the others: it is left out and the summary says why.
+    The file appears only once it is complete. A log that cannot be read is left out, and the
+    summary names the reason; the remaining logs are converted.
+
+    Args:
+        options: Options of the conversion.
+
+    Returns:
+        Counts of the samples and map elements in the file, and of the problems.
 
     Raises:
-        FileNotFoundError: If the split or a log asked for is missing.
-        RuntimeError: If no sample is left (a shard may have none), or a worker process dies; then
-            nothing is written.
-        OSError: If the file cannot be written, for example on a full disk; nothing is left behind.
+        FileNotFoundError: If the split or a requested log is missing.
+        RuntimeError: If no sample is left (allowed for a shard), or a worker process dies. Nothing
+            is written then.
+        OSError: If the file cannot be written, for example on a full disk. No partial file remains.
     """
     summary = ConversionSummary(options.classes)
     target = options.path_of("av2", options.split)
-    wanted = asked_split(options, "av2")
-    if wanted is None:
-        log_dirs = find_logs(options.root, options.split, options.logs)
+    split_list = asked_split(options, "av2")
+    if split_list is None:
+        identity = OFFICIAL
+        log_dirs = find_logs(options.root, options.split, logs=options.logs)
     else:
-        log_dirs = _listed_logs(wanted, options, summary)
-    log_dirs = _drop_listed(log_dirs, options.keep_map_changes, summary)
-    identity = OFFICIAL if wanted is None else wanted.identity
-    passed = _passed_over(log_dirs, options)
-    meta, log_dirs = _meta(options, log_dirs, identity), options.shard.part(log_dirs)
+        identity = split_list.identity
+        log_dirs = _listed_logs(split_list, options, summary=summary)
+    log_dirs = _remove_unfit_logs(log_dirs, options.keep_map_changes, summary=summary)
+    excluded_times = _excluded_times(log_dirs, options)
+    meta = _meta(options, log_dirs, identity=identity)
+    log_dirs = options.shard.part(log_dirs)
+    jobs = [(log_dir, excluded_times.get(log_dir.name, ())) for log_dir in log_dirs]
+    convert_log = partial(_try_log, options=options)
     offsets_ns: list[int] = []
-    bar = Progress(log_dirs, desc=f"av2 {options.split}", unit="logs")
-    with bar as logs, AnnotationWriter(target, meta, options.shard) as writer:
-        workers = min(options.workers, max(len(log_dirs), 1))
-        jobs = [(log_dir, passed.get(log_dir.name, ())) for log_dir in log_dirs]
-        results = ordered_map(partial(_try_log, options=options), jobs, workers)
+    progress = Progress(log_dirs, desc=f"av2 {options.split}", unit="logs")
+    with progress as logs, AnnotationWriter(target, meta, shard=options.shard) as writer:
+        results = ordered_map(convert_log, jobs, workers=_worker_count(options, log_dirs))
         for log_dir, result in zip(logs, results, strict=True):
             if isinstance(result, str):
                 summary.add_problem(f"log left out: {result}", log_dir.name)
@@ -71,110 +81,166 @@ def convert_argoverse2(options: Argoverse2Options) -> ConversionSummary:
             for sample in result.samples:
                 writer.write(sample)
                 summary.add_sample(options.split, sample)
-            for reason, count in result.left_out.items():
-                summary.add_problem(f"sample left out: {reason}", log_dir.name, count)
-            for reason, numbers in result.elements.items():
-                for number in numbers:
-                    summary.add_problem(reason.rstrip("."), f"{number} of {log_dir.name}")
-            for kind, count in result.invalid.items():
-                reason = f"invalid polygon among the {kind} takes no part"
-                summary.add_problem(reason, log_dir.name, count)
-            named = ((s.timestamp_ns, s.lidar.path) for s in result.samples if s.lidar is not None)
-            offsets_ns += [abs(int(Path(path).stem) - time_ns) for time_ns, path in named]
+                if sample.lidar is not None:
+                    sweep_ns = int(Path(sample.lidar.path).stem)
+                    offsets_ns.append(abs(sweep_ns - sample.timestamp_ns))
+            _add_problems(summary, log_dir.name, result=result)
         if not len(writer) and not options.shard.count:
             raise WorkError(f"no sample is left for {target}:\n{summary.text()}")
     note = f"LiDAR sweep named by {len(offsets_ns)} of {len(writer)} samples"
-    away = f", at most {max(offsets_ns) / 1e6:.0f} ms away" if offsets_ns else ""
-    summary.notes += [note + away, f"written to {writer.path}"]
+    if offsets_ns:
+        note += f", at most {max(offsets_ns) / 1e6:.0f} ms away"
+    summary.notes.append(note)
+    summary.notes.append(f"written to {writer.path}")
     return summary
 
 
 def _listed_logs(
-    wanted: SplitList, options: Argoverse2Options, summary: ConversionSummary
+    split_list: SplitList, options: Argoverse2Options, summary: ConversionSummary
 ) -> list[Path]:
-    """Return the logs of a list, wherever they are: published lists mix the official folders."""
-    if options.split not in wanted.scenes:
+    """Find the logs of one part of a split list in any of the official folders.
+
+    Published lists mix logs of ``train``, ``val`` and ``test``.
+    """
+    if options.split not in split_list.scenes:
         raise InputError(
-            f"split {wanted.name!r} has no part {options.split!r}: name one of "
-            f"{', '.join(wanted.scenes)} with --split."
+            f"split {split_list.name!r} has no part {options.split!r}: name one of "
+            f"{', '.join(split_list.scenes)} with --split."
         )
-    by_name = {log.name: log for log in find_all_logs(options.root)}
-    with naming(options.split_file or f"split {wanted.name!r}", "list each log in one split"):
-        part_of, absent = resolve_scenes(wanted.scenes, {name: name for name in by_name})
-    listed = set(wanted.scenes[options.split])
-    if missing := listed.intersection(absent):
-        where, allowed = str(options.root), options.allow_missing
-        summary.notes.append(wanted.missing_note(missing, len(listed), where, allowed))
-    found = [by_name[name] for name in sorted(listed.intersection(part_of))]
-    chosen = [log for log in found if not options.logs or log.name.startswith(tuple(options.logs))]
-    if not chosen:
-        raise FileNotFoundError(f"no log of split {wanted.name!r} as asked for in {options.root}.")
-    return chosen
+    log_by_name = {log.name: log for log in find_all_logs(options.root)}
+    names = {name: name for name in log_by_name}
+    source = options.split_file or f"split {split_list.name!r}"
+    with naming(source, "list each log in one split"):
+        part_by_name, absent = resolve_scenes(split_list.scenes, names)
+    listed = set(split_list.scenes[options.split])
+    missing = listed.intersection(absent)
+    if missing:
+        note = split_list.missing_note(
+            missing,
+            len(listed),
+            where=str(options.root),
+            allowed=options.allow_missing,
+        )
+        summary.notes.append(note)
+    log_dirs = []
+    for name in sorted(listed.intersection(part_by_name)):
+        if not options.logs or name.startswith(tuple(options.logs)):
+            log_dirs.append(log_by_name[name])
+    if not log_dirs:
+        raise FileNotFoundError(
+            f"no log of split {split_list.name!r} as asked for in {options.root}."
+        )
+    return log_dirs
 
 
-def _passed_over(log_dirs: list[Path], options: Argoverse2Options) -> dict[str, set[int]]:
-    """Return the times of each log that samples of the whole split leave out, by its name."""
+def _worker_count(options: Argoverse2Options, log_dirs: Sequence[Path]) -> int:
+    """Number of processes: at most one per log."""
+    return min(options.workers, max(len(log_dirs), 1))
+
+
+def _excluded_times(log_dirs: list[Path], options: Argoverse2Options) -> dict[str, set[int]]:
+    """Times in nanoseconds, by log, at which thinning out the whole split drops the sample."""
     if options.thin_over == "log":
         return {}
     assert options.rate_hz is not None  # checked by the options
-    workers = min(options.workers, max(len(log_dirs), 1))
-    found = ordered_map(partial(usable_times, options=options), log_dirs, workers)
-    names = [log_dir.name for log_dir in log_dirs]
-    return spread_over_split(dict(zip(names, found, strict=True)), options.rate_hz)
+    read_times = partial(usable_times, options=options)
+    results = ordered_map(read_times, log_dirs, workers=_worker_count(options, log_dirs))
+    times = {}
+    for log_dir, log_times in zip(log_dirs, results, strict=True):
+        times[log_dir.name] = log_times
+    return thin_out_split(times, options.rate_hz)
 
 
 def _try_log(job: tuple[Path, Collection[int]], options: Argoverse2Options) -> LogSamples | str:
-    """Read a log; return the reason where that fails (a bug of ours still stops everything).
+    """Read a log, or return the reason why its files cannot be read.
 
-    The job is its folder, with the times that are passed over.
+    Only errors of the input are caught; any other error stops the conversion.
+
+    Args:
+        job: Folder of the log, and the times in nanoseconds to leave out.
+        options: Options of the conversion.
     """
-    log_dir, passed_ns = job
+    log_dir, excluded_ns = job
     try:
-        return read_log(log_dir, options, passed_ns=passed_ns)
+        return read_log(log_dir, options, excluded_ns=excluded_ns)
     except (OSError, ValueError, shapely.errors.ShapelyError) as error:
         return str(error)
 
 
-def _drop_listed(
+def _add_problems(summary: ConversionSummary, log_id: str, result: LogSamples) -> None:
+    """Count the samples, map elements and polygons of a log that are left out."""
+    for reason, count in result.left_out.items():
+        summary.add_problem(f"sample left out: {reason}", log_id, count=count)
+    for reason, numbers in result.elements.items():
+        for number in numbers:
+            summary.add_problem(reason.rstrip("."), f"{number} of {log_id}")
+    for kind, count in result.invalid.items():
+        reason = f"invalid polygon among the {kind} takes no part"
+        summary.add_problem(reason, log_id, count=count)
+
+
+def _remove_unfit_logs(
     log_dirs: Sequence[Path], keep_map_changes: bool, summary: ConversionSummary
 ) -> list[Path]:
-    """Leave out the logs that are known to be unfit, and count them."""
+    """Remove the logs that are known to be unfit, and count them in the summary."""
+    broken = "its map or sensor data cannot be used (known to fail)"
     changed = "its map was changed on purpose and contradicts the images (Argoverse 2's own note)"
-    left_out = dict.fromkeys(BROKEN_LOGS, "its map or sensor data cannot be used (known to fail)")
-    if not keep_map_changes:
-        left_out |= dict.fromkeys(MAP_CHANGE_LOGS, f"{changed}; --keep-map-changes keeps it")
-    for name in (log_dir.name for log_dir in log_dirs):
-        if name in left_out:
-            summary.add_problem(f"log left out: {left_out[name]}", name)
-        elif name in MAP_CHANGE_LOGS:
+    fit_logs = []
+    for log_dir in log_dirs:
+        name = log_dir.name
+        has_map_change = name in MAP_CHANGE_LOGS
+        if name in BROKEN_LOGS:
+            summary.add_problem(f"log left out: {broken}", name)
+            continue
+        if has_map_change and not keep_map_changes:
+            summary.add_problem(f"log left out: {changed}; --keep-map-changes keeps it", name)
+            continue
+        if has_map_change:
             summary.add_problem(f"log kept, but {changed}", name)
-    return [log_dir for log_dir in log_dirs if log_dir.name not in left_out]
+        fit_logs.append(log_dir)
+    return fit_logs
 
 
 def _meta(options: Argoverse2Options, log_dirs: Iterable[Path], identity: str) -> AnnotationMeta:
-    """Describe the file: what it holds, and what it was made from."""
-    sizes = {
-        f"{log_dir.name}/{path.name}": path.stat().st_size
-        for log_dir in log_dirs
-        for path in (*sorted(log_dir.glob("map/*.json")), *sorted(log_dir.glob("*.feather")))
+    """Describe the content of the annotation file and its sources.
+
+    Args:
+        options: Options of the conversion.
+        log_dirs: Folders of all logs of the split.
+        identity: Name and digest of the split list.
+    """
+    sizes = {}
+    for log_dir in log_dirs:
+        maps = sorted(log_dir.glob("map/*.json"))
+        tables = sorted(log_dir.glob("*.feather"))
+        for path in maps + tables:
+            sizes[f"{log_dir.name}/{path.name}"] = path.stat().st_size
+    choices: dict[str, Any] = {
+        "at": options.at,
+        "rate_hz": options.rate_hz,
+        "compat": options.compat,
     }
-    versions = {name: version(name) for name in ("av2", "shapely")}
-    made_with = {name: getattr(options, name) for name in ("at", "rate_hz", "compat")}
     if options.thin_over != "log":
-        made_with["thin_over"] = options.thin_over
+        choices["thin_over"] = options.thin_over
+    choices["num_sweeps"] = options.max_sweeps
+    choices[SPLIT_LIST] = identity
     return options.meta(
         "av2",
         "ego",
         options.split,
         dim=options.dim,
         source_fingerprint=fingerprint(sizes),
-        versions={**versions, "geos": ".".join(map(str, shapely.geos_version))},
-        options={**made_with, "num_sweeps": options.max_sweeps, SPLIT_LIST: identity},
+        versions={
+            "av2": version("av2"),
+            "shapely": version("shapely"),
+            "geos": ".".join(map(str, shapely.geos_version)),
+        },
+        options=choices,
     )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the converter's options to a parser."""
+    """Add the options of ``tools/create_data.py av2`` to a parser."""
     add = parser.add_argument
     add_log_options(parser, "10hz of train, 2.5hz of val and test, as published")
     add(
@@ -193,14 +259,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="rules of the ground truth (default: %(default)s)",
     )  # fmt: skip
     add("--centerline", action="store_true", help="add the class centerline")
-    what = "keep the four logs whose map was changed on purpose"
-    add("--keep-map-changes", action="store_true", help=what)
+    add(
+        "--keep-map-changes", action="store_true",
+        help="keep the four logs whose map was changed on purpose",
+    )  # fmt: skip
     add_split_options(parser, split_names("av2"))
     add_file_options(parser, "ego", max_sweeps=0)
 
 
 def run(arguments: argparse.Namespace) -> str:
-    """Convert as the command line asks and return the summary."""
-    classes = (*CLASSES, "centerline") if arguments.centerline else CLASSES
+    """Convert with the options of a command line and return the summary as text."""
+    classes: tuple[str, ...] = CLASSES
+    if arguments.centerline:
+        classes = (*CLASSES, "centerline")
     options = options_from(Argoverse2Options, arguments, classes=classes)
     return convert_argoverse2(options).text()

@@ -1,4 +1,4 @@
-"""The folder of one Argoverse 2 log: poses, calibration, and when each sensor fired."""
+"""Folder of one Argoverse 2 log: poses, calibration and times of the sensors."""
 
 from collections.abc import Sequence
 from functools import cached_property
@@ -17,7 +17,7 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.files import SUFFIX as PARTIAL
 from gsmap.utils.inputs import heed_input
 
-# The order of MapTR's family: camera embeddings of its checkpoints depend on it.
+# Camera order of MapTR and its successors; the camera embeddings of checkpoints depend on it.
 RING_CAMERAS = (
     "ring_front_center", "ring_front_right", "ring_front_left", "ring_rear_right", "ring_rear_left",
     "ring_side_right", "ring_side_left",
@@ -27,11 +27,11 @@ MAX_LIDAR_OFFSET_NS = int(SynchronizationDB.MAX_LIDAR_ANYCAM_TIMESTAMP_DIFF)  # 
 
 POSES = "city_SE3_egovehicle.feather"
 
-# their maps or sensor data cannot be used
+# logs with an unusable map or unusable sensor data
 BROKEN_LOGS = (
     "01bb304d-7bd8-35f8-bbef-7086b688e35e", "453e5558-6363-38e3-bf9b-42b5ba0a6f1d",
 )  # fmt: skip
-# by Argoverse 2's own note
+# logs whose map was changed on purpose, as listed by Argoverse 2
 MAP_CHANGE_LOGS = (
     "75e8adad-50a6-3245-8726-5e612db3d165", "54bc6dbc-ebfb-3fba-b5b3-57f88b4b79ca",
     "af170aac-8465-3d7b-82c5-64147e94af7d", "6e106cf8-f6dd-38f6-89c8-9be7a71e7275",
@@ -39,7 +39,11 @@ MAP_CHANGE_LOGS = (
 
 
 def _read_feather(path: Path) -> Any:
-    """Read a table; ``ArrowException`` if it is damaged, which might end the process later."""
+    """Read a table as a pandas data frame.
+
+    The full validation raises an ``ArrowException`` for damaged tables that could otherwise crash
+    the process later.
+    """
     heed_input(path)
     table = feather.read_table(path, memory_map=False)
     table.validate(full=True)
@@ -47,18 +51,23 @@ def _read_feather(path: Path) -> Any:
 
 
 class Argoverse2Log:
-    """One log's folder, named by its id, read on demand."""
+    """Content of one log's folder. Attributes are read on first use and cached.
+
+    Args:
+        log_dir: Folder of the log, named by the id of the log.
+    """
 
     def __init__(self, log_dir: Path) -> None:
-        self.log_dir, self.log_id = log_dir, log_dir.name
+        self.log_dir = log_dir
+        self.log_id = log_dir.name
 
     @cached_property
     def poses(self) -> dict[int, np.ndarray]:
-        """The vehicle's poses in the city by time, which ascends. each (4, 4)
+        """Transforms from the vehicle to the city, by ascending time in nanoseconds. Each (4, 4).
 
         Raises:
-            FileNotFoundError: If there is no table of them.
-            ValueError: If it is damaged or a pose is not finite.
+            FileNotFoundError: If the pose table is missing.
+            ValueError: If the table is damaged, or a pose is not finite.
         """
         path = self.log_dir / POSES
         if not path.is_file():
@@ -68,69 +77,87 @@ class Argoverse2Log:
             table = table.drop_duplicates("timestamp_ns").sort_values("timestamp_ns")
             quaternions = table[["qw", "qx", "qy", "qz"]].to_numpy(np.float64)
             translations = table[["tx_m", "ty_m", "tz_m"]].to_numpy(np.float64)
-            good = np.abs(np.linalg.norm(quaternions, axis=1) - 1) < 1e-3
-            good &= np.isfinite(translations).all(1)
-            if not good.all() or len(table) == 0:
-                raise InputError(f"it holds {int((~good).sum())} bad of {len(table)} poses")
+            is_valid = np.abs(np.linalg.norm(quaternions, axis=1) - 1) < 1e-3
+            is_valid &= np.isfinite(translations).all(axis=1)
+            if not is_valid.all() or len(table) == 0:
+                raise InputError(f"it holds {int((~is_valid).sum())} bad of {len(table)} poses")
             times = table["timestamp_ns"].to_numpy(np.int64).tolist()
-        return dict(zip(times, map(rigid, quat_to_mat(quaternions), translations), strict=True))
+        rotations = quat_to_mat(quaternions)  # (n, 3, 3)
+        poses = {}
+        for time, rotation, translation in zip(times, rotations, translations, strict=True):
+            poses[time] = rigid(rotation, translation)
+        return poses
 
     @cached_property
     def city(self) -> str:
-        """Short name of the city, such as ``PIT``; empty if the map's file name does not tell."""
-        names = [path.name for path in (self.log_dir / "map").glob("log_map_archive_*____*.json")]
-        return names[0].split("____")[1].split("_")[0] if names else ""
+        """Short name of the city, such as ``PIT``; empty if the map's file name has none."""
+        for path in (self.log_dir / "map").glob("log_map_archive_*____*.json"):
+            suffix = path.name.split("____")[1]  # "PIT_city_47117.json"
+            return suffix.split("_")[0]
+        return ""
 
     @cached_property
     def calibration(self) -> dict[str, PinholeCamera]:
-        """The calibrated ring cameras by name; empty if the log has no calibration."""
+        """Calibrated ring cameras by name; empty if the log has no calibration."""
         folder = self.log_dir / "calibration"
-        paths = [folder / "intrinsics.feather", folder / "egovehicle_SE3_sensor.feather"]
-        if not all(path.is_file() for path in paths):
+        intrinsics_path = folder / "intrinsics.feather"
+        extrinsics_path = folder / "egovehicle_SE3_sensor.feather"
+        if not intrinsics_path.is_file() or not extrinsics_path.is_file():
             return {}
+        cameras = {}
         with naming(folder, "download the log again"):
-            intrinsics, _ = map(_read_feather, paths)
-            names = [name for name in RING_CAMERAS if name in set(intrinsics["sensor_name"])]
-            return {name: PinholeCamera.from_feather(self.log_dir, name) for name in names}
+            intrinsics = _read_feather(intrinsics_path)
+            _read_feather(extrinsics_path)  # validates the table, which av2 reads without a check
+            calibrated_names = set(intrinsics["sensor_name"])
+            for name in RING_CAMERAS:
+                if name in calibrated_names:
+                    cameras[name] = PinholeCamera.from_feather(self.log_dir, name)
+        return cameras
 
     @cached_property
     def lidar_timestamps_ns(self) -> np.ndarray:
-        """Times of the LiDAR sweeps, ascending. (n,)"""
+        """Ascending times of the LiDAR sweeps in nanoseconds. (n,)"""
         return _timestamps(self.log_dir / "sensors/lidar", ".feather")
 
     @cached_property
     def image_timestamps_ns(self) -> dict[str, np.ndarray]:
-        """Times of each ring camera's images, ascending. each (n,)"""
+        """Ascending times of the images in nanoseconds, by name of the ring camera. Each (n,)."""
         folder = self.log_dir / "sensors/cameras"
         return {name: _timestamps(folder / name, ".jpg") for name in RING_CAMERAS}
 
 
 def closest_ns(timestamps_ns: np.ndarray, wanted_ns: int, tolerance_ns: int) -> int | None:
-    """Return the time that is closest to a wanted one.
+    """Find the time closest to a target time.
 
     Args:
         timestamps_ns: Ascending times in nanoseconds. (n,)
-        wanted_ns: The wanted time in nanoseconds.
-        tolerance_ns: Largest distance in nanoseconds; beyond it the result is None.
+        wanted_ns: Target time in nanoseconds.
+        tolerance_ns: Largest distance from the target time in nanoseconds.
+
+    Returns:
+        The closest time in nanoseconds; None if no time is within the tolerance.
     """
     if len(timestamps_ns) == 0:
         return None
     after = int(np.searchsorted(timestamps_ns, wanted_ns))
     candidates = timestamps_ns[max(after - 1, 0) : after + 1]
-    best = int(candidates[np.abs(candidates - wanted_ns).argmin()])
-    return best if abs(best - wanted_ns) <= tolerance_ns else None
+    closest = int(candidates[np.abs(candidates - wanted_ns).argmin()])
+    return closest if abs(closest - wanted_ns) <= tolerance_ns else None
 
 
 def find_logs(root: Path, split: str, logs: Sequence[str] = ()) -> list[Path]:
-    """Return the folders of a split's logs, sorted.
+    """Find the logs of a split.
 
     Args:
-        root: Data root. The split is a folder in it or in its folder ``sensor``.
+        root: Data root, which holds the folder of the split, directly or below ``sensor``.
         split: ``train``, ``val`` or ``test``.
-        logs: First characters of the ids of the logs to take; empty takes all.
+        logs: Ids, or first characters of ids, of the logs to take; empty takes all.
+
+    Returns:
+        Folders of the logs, sorted.
 
     Raises:
-        FileNotFoundError: If there is no such split, or no log that begins as asked.
+        FileNotFoundError: If the split is missing, or no log begins with one of ``logs``.
     """
     folder = _split_folder(root, split)
     if folder is None:
@@ -139,44 +166,70 @@ def find_logs(root: Path, split: str, logs: Sequence[str] = ()) -> list[Path]:
             "folder that holds train, val and test of the Argoverse 2 sensor data set "
             "(https://www.argoverse.org/av2.html#download-link)."
         )
-    found = _logs_of(folder)
+    log_dirs = _logs_of(folder)
     for prefix in logs:
-        if not any(path.name.startswith(prefix) for path in found):
+        if not any(path.name.startswith(prefix) for path in log_dirs):
             raise FileNotFoundError(f"no log in {folder} begins with {prefix!r}.")
-    if not found:
+    if not log_dirs:
         raise FileNotFoundError(f"no Argoverse 2 log in {folder}.")
-    return [path for path in found if not logs or path.name.startswith(tuple(logs))]
+    if not logs:
+        return log_dirs
+    return [path for path in log_dirs if path.name.startswith(tuple(logs))]
 
 
 def find_all_logs(root: Path) -> list[Path]:
-    """Return the logs of all official splits that are there; FileNotFoundError without any."""
-    folders = [_split_folder(root, split) for split in ("train", "val", "test")]
-    found = [log for folder in folders if folder is not None for log in _logs_of(folder)]
-    if not found:
+    """Find the logs of all official splits below a data root.
+
+    Raises:
+        FileNotFoundError: If there is no log.
+    """
+    log_dirs = []
+    for split in ("train", "val", "test"):
+        folder = _split_folder(root, split)
+        if folder is not None:
+            log_dirs += _logs_of(folder)
+    if not log_dirs:
         raise FileNotFoundError(f"no Argoverse 2 log in the folders train, val and test of {root}.")
-    return found
+    return log_dirs
 
 
 def _split_folder(root: Path, split: str) -> Path | None:
-    """Return the folder of an official split, None without."""
-    return next((f for f in (root / split, root / "sensor" / split) if f.is_dir()), None)
+    """Folder of an official split; None if it is missing."""
+    for folder in (root / split, root / "sensor" / split):
+        if folder.is_dir():
+            return folder
+    return None
 
 
 def _logs_of(folder: Path) -> list[Path]:
-    """Return the logs in a folder, sorted."""
-    holding = {path.parent for part in ("map", POSES) for path in folder.glob(f"*/{part}")}
-    return sorted(path for path in holding if path.suffix != PARTIAL)
+    """Sorted subfolders with a map or a pose table, without partial downloads."""
+    log_dirs = set()
+    for part in ("map", POSES):
+        for path in folder.glob(f"*/{part}"):
+            if path.parent.suffix != PARTIAL:
+                log_dirs.add(path.parent)
+    return sorted(log_dirs)
 
 
 def logs_in(folder: Path) -> list[Path]:
-    """Return the logs at or up to three folders below a folder (``sensor/val/LOG``)."""
-    found = (sorted(folder.glob("*/" * depth + POSES)) for depth in range(4))
-    return [path.parent for path in next(filter(None, found), [])]
+    """Find the logs in a folder or at most three levels below it, as in ``sensor/val/LOG``.
+
+    Returns:
+        Folders of the logs at the highest level that has logs, sorted; empty without any.
+    """
+    for depth in range(4):
+        pose_tables = sorted(folder.glob("*/" * depth + POSES))
+        if pose_tables:
+            return [path.parent for path in pose_tables]
+    return []
 
 
 def _timestamps(folder: Path, suffix: str) -> np.ndarray:
-    """Return the times in the names of a folder's files, ascending; none if there is no folder."""
+    """Ascending times from the file names in a folder; empty if the folder is missing. (n,)"""
     if not folder.is_dir():
         return np.empty(0, dtype=np.int64)
-    stems = (path.stem for path in folder.iterdir() if path.suffix == suffix)
-    return np.array(sorted(int(stem) for stem in stems if stem.isdigit()), dtype=np.int64)
+    times = []
+    for path in folder.iterdir():
+        if path.suffix == suffix and path.stem.isdigit():
+            times.append(int(path.stem))
+    return np.array(sorted(times), dtype=np.int64)

@@ -1,7 +1,7 @@
 """Local vector maps from the map of one Argoverse 2 log, by the rules of MapTRv2 or of MapTR.
 
-Whatever does not depend on the vehicle's pose is done once per log; a frame then takes a few
-vectorised geometry calls. ``docs/data.md`` states both sets of rules.
+Geometry that does not depend on the pose of the vehicle is prepared once per log; each frame then
+takes a few vectorised geometry calls. ``docs/data.md`` lists both sets of rules.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import shapely
-from av2.map.lane_segment import LaneMarkType
+from av2.map.lane_segment import LaneMarkType, LaneSegment
 from av2.map.map_api import ArgoverseStaticMap
 
 from gsmap.datasets.annotations.record import RANGES
@@ -23,16 +23,25 @@ from mapdata.argoverse2.rules import (
     merge_until_stable,
 )
 from mapdata.crossings import EDGE_MARGIN_M, cut_rings, open_outlines
-from mapdata.lane_graph import ROUND_DECIMALS, LanePaths, link_lanes
+from mapdata.lane_graph import ROUND_DECIMALS, LaneLinks, LanePaths, link_lanes
 from mapdata.local_map import GeometryLayer, LocalPatch, rings_of, vertices_of
 
 COMPAT_MODES = ("maptrv2", "maptr")
 MAP_CLASSES = ("divider", "ped_crossing", "boundary", "centerline")
-NO_LANE, OUTSIDE = -2, -1  # no neighbour; one that is not in the map
+NO_LANE = -2  # a lane without a neighbour on one side
+OUTSIDE = -1  # a neighbour that is not in the map
 
 
 def check_rules(classes: Collection[str], compat: str) -> None:
-    """Raise a ``ValueError`` unless the classes and the rules are known."""
+    """Check the names of the classes and of the rules.
+
+    Args:
+        classes: Class names, out of ``MAP_CLASSES``.
+        compat: Name of the rules, out of ``COMPAT_MODES``.
+
+    Raises:
+        ValueError: If a class or the rules are unknown.
+    """
     if compat not in COMPAT_MODES:
         raise InputError(f"compat must be one of {COMPAT_MODES}, got {compat!r}.")
     unknown = set(classes) - set(MAP_CLASSES)
@@ -41,22 +50,26 @@ def check_rules(classes: Collection[str], compat: str) -> None:
 
 
 def find_map(log_dir: Path) -> Path:
-    """Return the file of a log's vector map; an error if there is none, or several."""
-    found = sorted((log_dir / "map").glob("log_map_archive_*.json"))
-    if not found:
+    """Find the file of a log's vector map.
+
+    Raises:
+        FileNotFoundError: If the log has no map.
+        ValueError: If the log has several maps.
+    """
+    paths = sorted((log_dir / "map").glob("log_map_archive_*.json"))
+    if not paths:
         raise FileNotFoundError(f"no map/log_map_archive_*.json in {log_dir}: download it again.")
-    if len(found) > 1:
-        raise InputError(f"{len(found)} maps in {log_dir / 'map'}, expected one: {found}.")
-    return found[0]
+    if len(paths) > 1:
+        raise InputError(f"{len(paths)} maps in {log_dir / 'map'}, expected one: {paths}.")
+    return paths[0]
 
 
 class Argoverse2Map:
-    """A log's map, as the official API reads it, prepared for cutting out what the vehicle sees.
+    """Map of one log, prepared for extracting the elements around the vehicle at many poses.
 
     Args:
-        static_map: The map.
-        left_out: Numbers of the elements that its file holds and that cannot be used, by kind and
-            reason.
+        static_map: Map of the official API.
+        left_out: Ids of the unusable elements of the map's file, by kind and reason.
     """
 
     def __init__(
@@ -64,44 +77,67 @@ class Argoverse2Map:
     ) -> None:
         self.left_out = dict(left_out or {})
         lanes = static_map.get_scenario_lane_segments()
-        links = link_lanes([(s.id, s.predecessors, s.successors) for s in lanes])
-        self._lanes = GeometryLayer([shapely.Polygon(s.polygon_boundary) for s in lanes])
-        self._is_intersection = np.array([s.is_intersection for s in lanes], dtype=bool)
-        position = {s.id: i for i, s in enumerate(lanes)}
-        self._sides, self._beyond = [], []  # lines on the left and on the right, lanes beyond these
-        for side in ("left", "right"):
-            lines = [getattr(s, f"{side}_lane_boundary").xyz for s in lanes]
-            self._sides.append(LanePaths(lines, links))
-            ids = [getattr(s, f"{side}_neighbor_id") for s in lanes]
-            beyond = [NO_LANE if i is None else position.get(i, OUTSIDE) for i in ids]
-            self._beyond.append(np.array(beyond, dtype=np.int64))
-        centres = [static_map.get_lane_segment_centerline(s.id) for s in lanes]
-        self._centre = LanePaths([line.round(ROUND_DECIMALS) for line in centres], links)
-        markings = [m for s in lanes for m in (s.left_lane_marking, s.right_lane_marking)]
-        # an unknown mark counts as paint
-        painted = [m.polyline for m in markings if m.mark_type is not LaneMarkType.NONE]
-        self._marked = GeometryLayer([shapely.LineString(line) for line in painted])
-        crossings = static_map.get_scenario_ped_crossings()
-        rings = [np.vstack([c.edge1.xyz, c.edge2.xyz[::-1]]) for c in crossings]
-        self._crossings = GeometryLayer([shapely.Polygon(ring) for ring in rings])
+        links = link_lanes([(lane.id, lane.predecessors, lane.successors) for lane in lanes])
+        self._add_neighbours(lanes, links)
+        lane_polygons = []
+        centrelines = []
+        painted_lines = []
+        for lane in lanes:
+            lane_polygons.append(shapely.Polygon(lane.polygon_boundary))
+            centreline = static_map.get_lane_segment_centerline(lane.id)
+            centrelines.append(centreline.round(ROUND_DECIMALS))
+            for marking in (lane.left_lane_marking, lane.right_lane_marking):
+                if marking.mark_type is not LaneMarkType.NONE:  # an unknown mark counts as paint
+                    painted_lines.append(shapely.LineString(marking.polyline))
+        self._lanes = GeometryLayer(lane_polygons)
+        self._is_intersection = np.array([lane.is_intersection for lane in lanes], dtype=bool)
+        self._centre_paths = LanePaths(centrelines, links)
+        self._painted = GeometryLayer(painted_lines)
+        crossing_polygons = []
+        for crossing in static_map.get_scenario_ped_crossings():
+            ring = np.vstack([crossing.edge1.xyz, crossing.edge2.xyz[::-1]])
+            crossing_polygons.append(shapely.Polygon(ring))
+        self._crossings = GeometryLayer(crossing_polygons)
         areas = static_map.get_scenario_vector_drivable_areas()
         self._drivable = GeometryLayer([shapely.Polygon(area.xyz) for area in areas])
 
+    def _add_neighbours(self, lanes: Sequence[LaneSegment], links: LaneLinks) -> None:
+        """Prepare the left and the right lines of the lanes, and the lanes beyond these lines."""
+        position = {lane.id: i for i, lane in enumerate(lanes)}
+        self._side_paths = []  # left, right
+        self._neighbours = []  # left, right: position of each lane's neighbour. (lanes,)
+        for side in ("left", "right"):
+            lines = []
+            neighbours = []
+            for lane in lanes:
+                lines.append(getattr(lane, f"{side}_lane_boundary").xyz)
+                neighbour_id = getattr(lane, f"{side}_neighbor_id")
+                if neighbour_id is None:
+                    neighbours.append(NO_LANE)
+                else:
+                    neighbours.append(position.get(neighbour_id, OUTSIDE))
+            self._side_paths.append(LanePaths(lines, links))
+            self._neighbours.append(np.array(neighbours, dtype=np.int64))
+
     @classmethod
     def from_log(cls, log_dir: Path) -> "Argoverse2Map":
-        """Read the map in a log's folder.
+        """Read the map of a log.
+
+        Args:
+            log_dir: Folder of the log.
 
         Raises:
             FileNotFoundError: If the map is missing.
-            ValueError: If there are several, or it is damaged.
+            ValueError: If the log has several maps, or the map is damaged.
         """
         path = find_map(log_dir)
         with naming(path, "download it again"):
-            return cls(*read_map_file(path))
+            static_map, left_out = read_map_file(path)
+            return cls(static_map, left_out)
 
     @property
     def invalid_counts(self) -> dict[str, int]:
-        """How many invalid polygons of each kind the map holds; they take no part."""
+        """Number of invalid polygons of the map by kind; `extract` ignores them."""
         return {
             "lane segments": self._lanes.invalid_count,
             "crossings": self._crossings.invalid_count,
@@ -116,61 +152,90 @@ class Argoverse2Map:
         x_range: tuple[float, float] = RANGES["ego"][0],
         y_range: tuple[float, float] = RANGES["ego"][1],
     ) -> dict[str, list[np.ndarray]]:
-        """Return the vertices of the map elements around the vehicle, by class. each (n, 3)
+        """Extract the map elements around the vehicle.
 
         Args:
-            city_from_ego: Pose of the vehicle. (4, 4)
-            classes: Which of ``MAP_CLASSES`` to extract.
-            compat: ``maptrv2`` or ``maptr``: whose rules.
-            x_range: Smallest and largest x (forward) in the vehicle's frame, in metres.
-            y_range: Smallest and largest y (left) in the vehicle's frame, in metres.
+            city_from_ego: Transform from the vehicle to the city in metres. (4, 4)
+            classes: Classes to extract, out of ``MAP_CLASSES``.
+            compat: Rules of the ground truth, ``maptrv2`` or ``maptr``.
+            x_range: Smallest and largest x (forward) in metres, ego frame.
+            y_range: Smallest and largest y (left) in metres, ego frame.
+
+        Returns:
+            Vertices of each element in metres, ego frame, by class. Each (n, 3).
 
         Raises:
             ValueError: If a class or the rules are unknown, or the pose is malformed.
         """
         check_rules(classes, compat)
-        patch = LocalPatch(np.asarray(city_from_ego, dtype=np.float64), x_range, y_range)
+        pose = np.asarray(city_from_ego, dtype=np.float64)
+        patch = LocalPatch(pose, x_range=x_range, y_range=y_range)
         lanes = self._lanes.touching(patch)
-        maptr = compat == "maptr"
-        rules = {
-            "divider": self._painted_lines if maptr else self._dividers,
-            "ped_crossing": self._crossing_rings if maptr else self._merged_crossings,
-            "boundary": self._boundaries,
-            "centerline": self._centerlines,
-        }
-        return {name: vertices_of(rules[name](patch, lanes), 3) for name in classes}
+        elements = {}
+        for name in classes:
+            lines = self._lines_of_class(name, compat, patch=patch, lanes=lanes)
+            elements[name] = vertices_of(lines, dim=3)
+        return elements
+
+    def _lines_of_class(
+        self, name: str, compat: str, patch: LocalPatch, lanes: np.ndarray
+    ) -> np.ndarray:
+        """Lines of one class inside the patch, in metres, ego frame. (lines,)
+
+        Args:
+            name: Class out of ``MAP_CLASSES``.
+            compat: Rules out of ``COMPAT_MODES``.
+            patch: Patch around the vehicle.
+            lanes: Positions of the lanes that touch the patch, ascending. (n,)
+        """
+        if name == "boundary":
+            return self._boundaries(patch)
+        if name == "centerline":
+            return self._centerlines(patch, lanes)
+        if name == "divider":
+            return self._painted_lines(patch) if compat == "maptr" else self._dividers(patch, lanes)
+        return self._crossing_rings(patch) if compat == "maptr" else self._merged_crossings(patch)
 
     def _dividers(self, patch: LocalPatch, lanes: np.ndarray) -> np.ndarray:
         """Lines between neighbouring lanes outside intersections (MapTRv2)."""
         lanes = lanes[~self._is_intersection[lanes]]
-        left, right = (lanes[beyond[lanes] != NO_LANE] for beyond in self._beyond)
-        # two lanes share each line: it is taken once, from the lane on its right if that is in view
-        right = right[~np.isin(right, self._beyond[0][left])]
-        left = left[~np.isin(left, self._beyond[1][right])]
-        sides = zip(self._sides, (left, right), strict=True)
-        paths = [side.simplified(lanes.tolist()) for side, lanes in sides]
-        return drop_duplicates(clip_lines(np.concatenate(paths), patch))
+        left_neighbours, right_neighbours = self._neighbours
+        with_left_line = lanes[left_neighbours[lanes] != NO_LANE]
+        with_right_line = lanes[right_neighbours[lanes] != NO_LANE]
+        # Two neighbouring lanes share a line. It is taken once: from the lane on the right of the
+        # line if that lane is in the patch, else from the lane on the left.
+        is_shared = np.isin(with_right_line, left_neighbours[with_left_line])
+        with_right_line = with_right_line[~is_shared]
+        is_shared = np.isin(with_left_line, right_neighbours[with_right_line])
+        with_left_line = with_left_line[~is_shared]
+        left_paths, right_paths = self._side_paths
+        left_lines = left_paths.simplified(with_left_line.tolist())
+        right_lines = right_paths.simplified(with_right_line.tolist())
+        return drop_duplicates(clip_lines(np.concatenate([left_lines, right_lines]), patch))
 
     def _centerlines(self, patch: LocalPatch, lanes: np.ndarray) -> np.ndarray:
         """Paths along the middle of the lanes (MapTRv2)."""
-        return drop_duplicates(clip_lines(self._centre.simplified(lanes.tolist()), patch))
+        paths = self._centre_paths.simplified(lanes.tolist())
+        return drop_duplicates(clip_lines(paths, patch))
 
-    def _painted_lines(self, patch: LocalPatch, lanes: np.ndarray) -> np.ndarray:
-        """Every lane boundary that carries paint, joined where the lines meet (MapTR)."""
-        return merge_until_stable(clip_lines(self._marked.near(patch), patch))
+    def _painted_lines(self, patch: LocalPatch) -> np.ndarray:
+        """Painted lane boundaries, joined where the lines meet (MapTR)."""
+        return merge_until_stable(clip_lines(self._painted.near(patch), patch))
 
-    def _merged_crossings(self, patch: LocalPatch, lanes: np.ndarray) -> np.ndarray:
-        """Crossings, parallel neighbours united, open where the patch cuts them (MapTRv2)."""
+    def _merged_crossings(self, patch: LocalPatch) -> np.ndarray:
+        """Crossings with parallel neighbours united, open at the edge of the patch (MapTRv2)."""
         pieces, owner = clip_polygons(self._crossings.near(patch), patch)
-        return open_outlines(pieces, owner, patch)
+        return open_outlines(pieces, owner, patch=patch)
 
-    def _crossing_rings(self, patch: LocalPatch, lanes: np.ndarray) -> np.ndarray:
-        """Each crossing by itself, closed along the patch's edge (MapTR)."""
+    def _crossing_rings(self, patch: LocalPatch) -> np.ndarray:
+        """Ring of each crossing, closed along the edge of the patch (MapTR)."""
         pieces, _ = clip_polygons(self._crossings.near(patch), patch)
-        return cut_rings(rings_of(pieces), patch.box(EDGE_MARGIN_M))[0]
+        lines, _ = cut_rings(rings_of(pieces), patch.box(EDGE_MARGIN_M))
+        return lines
 
-    def _boundaries(self, patch: LocalPatch, lanes: np.ndarray) -> np.ndarray:
-        """Outline of the drivable area, without the patch's edge (MapTR and MapTRv2)."""
+    def _boundaries(self, patch: LocalPatch) -> np.ndarray:
+        """Outline of the drivable area without the edge of the patch (MapTR and MapTRv2)."""
         pieces, _ = clip_polygons(self._drivable.near(patch), patch)
         area = shapely.get_parts(shapely.union_all(pieces))
-        return cut_rings(rings_of(area), patch.box(-EDGE_MARGIN_M))[0]
+        lines, _ = cut_rings(rings_of(area), patch.box(-EDGE_MARGIN_M))
+        return lines

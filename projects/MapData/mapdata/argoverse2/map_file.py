@@ -1,4 +1,4 @@
-"""The file of a log's vector map, each of its elements checked by itself."""
+"""Reader of a log's vector map that checks each element of the file separately."""
 
 import json
 import math
@@ -15,7 +15,7 @@ from av2.map.pedestrian_crossing import PedestrianCrossing
 from gsmap.datasets.errors import naming
 from gsmap.utils.errors import InputError
 
-# by key of the file: how messages name an element, its class, and the least points of its lines
+# by key of the file: name in messages, constructor, and least number of points of each line
 _LAYERS: dict[str, tuple[str, Callable[[Any], Any], dict[str, int]]] = {
     "lane_segments": (
         "lane segment",
@@ -32,32 +32,33 @@ _LAYERS: dict[str, tuple[str, Callable[[Any], Any], dict[str, int]]] = {
 
 
 def read_map_file(path: Path) -> tuple[ArgoverseStaticMap, dict[str, list[str]]]:
-    """Read a map, without the elements that cannot be used.
+    """Read a vector map without its unusable elements.
 
     Args:
-        path: The file, ``log_map_archive_*.json``.
+        path: Map file, ``log_map_archive_*.json``.
 
     Returns:
-        The map, and the numbers of the elements that are left out, by kind and reason.
+        The map, and the ids of the unusable elements, by kind and reason.
 
     Raises:
-        ValueError: If the file is damaged, lacks a layer or has nothing usable in one.
+        ValueError: If the file is damaged, lacks a layer, or a layer has no usable element.
     """
     left_out: dict[str, list[str]] = defaultdict(list)
     with naming(path, "download it again"):
         content = json.loads(path.read_text(encoding="utf-8"))
         layers: dict[str, dict[int, Any]] = {}
-        for key, (name, make, lines) in _LAYERS.items():
+        for key, (name, from_dict, min_points) in _LAYERS.items():
             layers[key] = {}
-            records = content[key] if key != "pedestrian_crossings" else content.get(key, {})
-            for number, record in records.items():
+            may_be_absent = key == "pedestrian_crossings"
+            records = content.get(key, {}) if may_be_absent else content[key]
+            for element_id, record in records.items():
                 try:
                     with naming(name, "it is left out"):
-                        _check_lines(record, lines)
-                        layers[key][record["id"]] = make(record)
+                        _check_lines(record, min_points)
+                        layers[key][record["id"]] = from_dict(record)
                 except ValueError as error:
                     reason = str(error)
-                    left_out[reason].append(str(number))
+                    left_out[reason].append(str(element_id))
             if records and not layers[key]:
                 raise InputError(f"none of its {len(records)} {key} can be used: {reason}")
     static_map = ArgoverseStaticMap(
@@ -72,11 +73,16 @@ def read_map_file(path: Path) -> tuple[ArgoverseStaticMap, dict[str, list[str]]]
     return static_map, dict(left_out)
 
 
-def _check_lines(record: Any, lines: dict[str, int]) -> None:
-    """Raise a ``ValueError`` unless an element's lines have points enough, all finite."""
-    for key, least in lines.items():
+def _check_lines(record: Any, min_points: dict[str, int]) -> None:
+    """Raise a ``ValueError`` if a line of an element has too few points, or one is not finite."""
+    for key, least in min_points.items():
         points = record[key]
         if len(points) < least:
             raise InputError(f"its {key} has {len(points)} points, and needs {least}")
-        if not math.isfinite(sum([point[axis] for point in points for axis in "xyz"])):
+        total = 0  # finite only if all coordinates are
+        for point in points:
+            total += point["x"]
+            total += point["y"]
+            total += point["z"]
+        if not math.isfinite(total):
             raise InputError(f"its {key} holds NaN or infinity")

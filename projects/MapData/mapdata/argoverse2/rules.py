@@ -1,4 +1,4 @@
-"""Vectorised geometry rules (on shapely arrays) from which Argoverse 2 ground truth is made."""
+"""Geometry rules of the Argoverse 2 ground truth, vectorised over arrays of shapely geometries."""
 
 import numpy as np
 import shapely
@@ -10,60 +10,104 @@ DUPLICATE_BUFFER_M = 1.0
 
 
 def clip_lines(lines: np.ndarray, patch: LocalPatch) -> np.ndarray:
-    """Cut lines of the city with the patch and move the pieces to the vehicle's frame. (pieces,)"""
+    """Clip lines to the patch.
+
+    Args:
+        lines: Lines in metres, city frame. (n,)
+        patch: Patch to clip to.
+
+    Returns:
+        Pieces of the lines inside the patch, in metres, ego frame. (pieces,)
+    """
     return patch.to_frame(patch.lines_inside(lines))
 
 
 def clip_polygons(polygons: np.ndarray, patch: LocalPatch) -> tuple[np.ndarray, np.ndarray]:
-    """Cut valid polygons of the city with the patch and move the pieces to the vehicle's frame.
+    """Clip polygons to the patch.
 
-    Returns the valid pieces (pieces,), and which polygon each came from (pieces,).
+    Args:
+        polygons: Valid polygons in metres, city frame. (n,)
+        patch: Patch to clip to.
+
+    Returns:
+        Valid pieces of the polygons inside the patch, in metres, ego frame (pieces,), and the index
+        of the polygon of each piece (pieces,).
     """
-    pieces, owner = shapely.get_parts(
-        shapely.intersection(polygons, patch.polygon), return_index=True
-    )
-    keep = (shapely.get_type_id(pieces) == POLYGON) & shapely.is_valid(pieces)
-    pieces, owner = patch.to_frame(pieces[keep]), owner[keep]
-    keep = shapely.is_valid(pieces)
-    return pieces[keep], owner[keep]
+    clipped = shapely.intersection(polygons, patch.polygon)
+    pieces, owner = shapely.get_parts(clipped, return_index=True)
+    is_valid = (shapely.get_type_id(pieces) == POLYGON) & shapely.is_valid(pieces)
+    pieces = patch.to_frame(pieces[is_valid])
+    owner = owner[is_valid]
+    is_valid = shapely.is_valid(pieces)  # the transform may round a thin piece to an invalid one
+    return pieces[is_valid], owner[is_valid]
 
 
 def drop_duplicates(lines: np.ndarray) -> np.ndarray:
-    """Leave out each line that an earlier kept one covers: IoU >= 0.9 of their 2 m wide strips."""
+    """Remove lines that nearly coincide with an earlier line that is kept.
+
+    Two lines are duplicates if the IoU of their 2 m wide strips is at least 0.9.
+
+    Args:
+        lines: Lines in metres. (n,)
+
+    Returns:
+        The lines that are kept, in their order. (m,)
+    """
     strips = shapely.buffer(lines, DUPLICATE_BUFFER_M, cap_style="flat", join_style="mitre")
     area = shapely.area(strips)
     first, second = _possible_duplicates(shapely.bounds(strips), area)
     keep = np.ones(len(lines), dtype=bool)
-    starts = np.searchsorted(first, np.arange(len(lines) + 1))  # of the pairs of each line
+    # the pairs of line i are starts[i] to starts[i + 1]
+    starts = np.searchsorted(first, np.arange(len(lines) + 1))
     for i in np.flatnonzero(np.diff(starts)).tolist():
         if not keep[i]:
             continue
         others = second[starts[i] : starts[i + 1]]
-        others = others[keep[others]]  # what is dropped already needs no comparison
+        others = others[keep[others]]
         overlap = shapely.area(shapely.intersection(strips[i], strips[others]))
-        keep[others[overlap >= DUPLICATE_IOU * (area[i] + area[others] - overlap)]] = False
+        union = area[i] + area[others] - overlap
+        duplicates = others[overlap >= DUPLICATE_IOU * union]
+        keep[duplicates] = False
     return lines[keep]
 
 
 def _possible_duplicates(bounds: np.ndarray, area: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pairs i < j of strips whose boxes and areas allow an IoU of 0.9. each (pairs,)"""
+    """Find pairs of strips whose bounding boxes and areas allow an IoU of 0.9.
+
+    Args:
+        bounds: Smallest x and y and largest x and y of each strip, in metres. (n, 4)
+        area: Area of each strip in square metres. (n,)
+
+    Returns:
+        Index of the first and of the second strip of each pair, the first one smaller and
+        ascending. Each (pairs,).
+    """
     low = np.maximum(bounds[:, None, :2], bounds[None, :, :2])
     high = np.minimum(bounds[:, None, 2:], bounds[None, :, 2:])
     common = np.prod(np.maximum(high - low, 0.0), axis=-1)  # (n, n)
     common = np.minimum(common, np.minimum(area[:, None], area[None]))
     union = area[:, None] + area[None] - common
-    first, second = np.nonzero(np.triu((common >= DUPLICATE_IOU * union) & (union > 0), k=1))
+    is_possible = (common >= DUPLICATE_IOU * union) & (union > 0)
+    first, second = np.nonzero(np.triu(is_possible, k=1))
     return first, second
 
 
 def merge_until_stable(lines: np.ndarray) -> np.ndarray:
-    """Node lines where they meet and join them at their ends, until their number stays the same."""
+    """Node lines where they meet and join them at their ends until their number is stable.
+
+    Args:
+        lines: Lines in metres. (n,)
+
+    Returns:
+        The joined lines. (m,)
+    """
     merged = shapely.union_all(lines)
     count = shapely.get_num_geometries(merged)
     while count > 1:
-        before, merged = count, shapely.line_merge(merged)
+        previous_count = count
+        merged = shapely.line_merge(merged)
         count = shapely.get_num_geometries(merged)
-        if count in (1, before):
+        if count in (1, previous_count):
             break
         merged = shapely.union_all(merged)
         if shapely.get_num_geometries(merged) == 1:

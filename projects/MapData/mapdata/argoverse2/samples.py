@@ -1,8 +1,8 @@
-"""The samples of one Argoverse 2 log: when they are, what the sensors saw, what the map holds."""
+"""Samples of one Argoverse 2 log: times, sensor records and map elements."""
 
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
@@ -35,18 +35,32 @@ _NEEDS_NONE = "`create_data.py av2 --at poses:10` needs none"
 
 @dataclass(frozen=True)
 class Argoverse2Options(FileOptions):
-    """What to convert and how: the options of ``tools/create_data.py av2``.
+    """Options of a conversion of Argoverse 2 logs (``tools/create_data.py av2``).
 
-    Of ``rate_hz`` samples per second, None takes all. The default is as published: every LiDAR
-    sweep (10 Hz) of ``train``, every fourth of the others. ``poses:N`` of ``at`` needs no sensor
-    data. ``thin_over`` says over what samples thin out: each ``log`` alone, or the whole ``split``,
-    whose samples are sorted by time (`spread_over_split`).
+    Args:
+        split: ``train``, ``val`` or ``test``.
+        at: Times of the samples: ``lidar`` (LiDAR sweeps), ``cameras`` (images of the front
+            camera), ``auto`` (LiDAR sweeps if there are any, else images) or ``poses:N`` (every
+            N-th row of the pose table; needs no sensor data).
+        rate_hz: Samples per second; None keeps all. ``"published"`` is 10 Hz (every LiDAR sweep)
+            for ``train`` and 2.5 Hz (every fourth sweep) for the other splits.
+        thin_over: Samples that are thinned out together: the samples of one ``log``, or of the
+            whole ``split`` sorted by time (`thin_out_split`).
+        compat: Rules of the ground truth, ``maptrv2`` or ``maptr``.
+        dim: Coordinates per point, 2 or 3.
+        logs: Ids, or first characters of ids, of the logs to convert; empty converts all.
+        keep_map_changes: Whether to keep the logs whose map was changed on purpose.
+        x_range: Smallest and largest x (forward) of the ground truth, in metres, ego frame.
+        y_range: Smallest and largest y (left) of the ground truth, in metres, ego frame.
+
+    Raises:
+        ValueError: If an option is out of its domain, or options contradict each other.
     """
 
     _: KW_ONLY
     split: str = "val"
     at: str = "auto"
-    rate_hz: float | None = "published"  # type: ignore[assignment]  # a number once it is made
+    rate_hz: float | None = "published"  # type: ignore[assignment]  # a number after initialisation
     thin_over: str = "log"
     compat: str = "maptrv2"
     dim: int = 2
@@ -75,20 +89,20 @@ class Argoverse2Options(FileOptions):
 
     @property
     def pose_stride(self) -> int | None:
-        """N of ``poses:N``; None for the other choices."""
+        """N of ``at="poses:N"``; None for any other value of ``at``."""
         match = re.fullmatch(r"poses:([1-9]\d*)", self.at)
         return int(match[1]) if match else None
 
 
 @dataclass
 class LogSamples:
-    """A log's samples by time, and what is left out of it.
+    """Samples of one log, with counts of the unusable samples and map elements.
 
     Args:
-        samples: The samples.
-        left_out: Number of samples that are left out, by reason.
+        samples: Samples in ascending order of time.
+        left_out: Number of unusable samples, by reason.
         invalid: Number of invalid polygons of the map, by kind.
-        elements: Numbers of elements of the map that are left out, by kind and reason.
+        elements: Ids of the unusable elements of the map, by kind and reason.
     """
 
     samples: list[MapSample] = field(default_factory=list)
@@ -101,87 +115,113 @@ def read_log(
     log_dir: Path,
     options: Argoverse2Options,
     with_map: bool = True,
-    passed_ns: Collection[int] = (),
+    excluded_ns: Collection[int] = (),
 ) -> LogSamples:
-    """Make the samples of one log.
+    """Read the samples of one log.
 
     Args:
         log_dir: Folder of the log.
-        options: What a sample is: rate, frame, range, classes.
+        options: Options of the conversion.
         with_map: Whether to add the ground truth.
-        passed_ns: Times that are passed over, as `spread_over_split` says.
+        excluded_ns: Times in nanoseconds of samples to leave out (`thin_out_split`).
 
     Raises:
         FileNotFoundError: If the map or the poses are missing.
         ValueError: If a file is damaged, or sensor data that ``options.at`` needs are missing.
     """
-    log, result = Argoverse2Log(log_dir), LogSamples()
-    times = [time for time in sample_times(log, options).tolist() if time not in passed_ns]
-    log_map = Argoverse2Map.from_log(log_dir) if with_map else None
-    if log_map is not None:
-        result.invalid = +Counter(log_map.invalid_counts)  # those that are not zero
+    log = Argoverse2Log(log_dir)
+    result = LogSamples()
+    times_ns = sample_times(log, options)
+    log_map = None
+    if with_map:
+        log_map = Argoverse2Map.from_log(log_dir)
         result.elements = log_map.left_out
-    for timestamp_ns in times:
+        for kind, count in log_map.invalid_counts.items():
+            if count > 0:
+                result.invalid[kind] = count
+    for timestamp_ns in times_ns.tolist():
+        if timestamp_ns in excluded_ns:
+            continue
         try:
             with naming(log_dir, "download the log again"):
-                result.samples.append(_sample(log, log_map, timestamp_ns, options))
-        except _LeftOut as reason:
+                sample = _sample(log, log_map, timestamp_ns=timestamp_ns, options=options)
+        except _UnusableSample as reason:
             result.left_out[str(reason)] += 1
+        else:
+            result.samples.append(sample)
     return result
 
 
 def usable_times(log_dir: Path, options: Argoverse2Options) -> list[int]:
-    """Return when a log has a sample, in nanoseconds, ascending; nothing if it cannot be read."""
-    log = Argoverse2Log(log_dir)
-    times = []
-    try:
-        for timestamp_ns in sample_times(log, options).tolist():
-            with suppress(_LeftOut):
-                _sample(log, None, timestamp_ns, options)
-                times.append(timestamp_ns)
-    except (OSError, ValueError):  # the conversion itself says so
-        return []
-    return times
-
-
-def spread_over_split(times: Mapping[str, Sequence[int]], rate_hz: float) -> dict[str, set[int]]:
-    """Choose every N-th of all logs' samples, sorted by time, as MapTR and MapTRv2 do.
+    """List the times at which a log has a usable sample.
 
     Args:
-        times: When each log has samples, ascending, in nanoseconds.
-        rate_hz: Samples per second that stay; N is how often the usual step goes into its period.
+        log_dir: Folder of the log.
+        options: Options of the conversion.
 
     Returns:
-        The times that are passed over, by log.
+        Ascending times in nanoseconds; an empty list if the log cannot be read.
     """
-    steps = np.concatenate([np.zeros(0), *(np.diff(own) for own in times.values())])
-    every = max(round(1e9 / (rate_hz * np.median(steps))), 1) if len(steps) else 1
-    ordered = sorted((time, name) for name, own in times.items() for time in own)
-    passed: dict[str, set[int]] = {name: set() for name in times}
-    for number, (time, name) in enumerate(ordered):
-        if number % every:
-            passed[name].add(time)
-    return passed
+    log = Argoverse2Log(log_dir)
+    times_ns = []
+    try:
+        for timestamp_ns in sample_times(log, options).tolist():
+            with suppress(_UnusableSample):
+                _sample(log, None, timestamp_ns=timestamp_ns, options=options)
+                times_ns.append(timestamp_ns)
+    except (OSError, ValueError):  # the conversion of the log reports this error
+        return []
+    return times_ns
+
+
+def thin_out_split(times_ns: Mapping[str, Sequence[int]], rate_hz: float) -> dict[str, set[int]]:
+    """Thin out the samples of all logs together, as MapTR and MapTRv2 validate.
+
+    The samples of all logs are sorted by time, and every N-th of them is kept. N is the median
+    sampling rate divided by ``rate_hz``, rounded, at least 1.
+
+    Args:
+        times_ns: Ascending times of the samples in nanoseconds, by name of the log.
+        rate_hz: Samples per second to keep, > 0.
+
+    Returns:
+        Times in nanoseconds of the samples to leave out, by name of the log.
+    """
+    gaps_ns = [np.zeros(0)]
+    samples = []
+    for name, log_times in times_ns.items():
+        gaps_ns.append(np.diff(log_times))
+        samples += [(time, name) for time in log_times]
+    all_gaps_ns = np.concatenate(gaps_ns)
+    step = 1
+    if len(all_gaps_ns) > 0:
+        step = max(round(1e9 / (rate_hz * np.median(all_gaps_ns))), 1)
+    excluded_ns: dict[str, set[int]] = {name: set() for name in times_ns}
+    for number, (time, name) in enumerate(sorted(samples)):
+        if number % step != 0:
+            excluded_ns[name].add(time)
+    return excluded_ns
 
 
 def read_logs(
     log_dirs: list[Path], root: Path, rate_hz: float | None = 2.0
 ) -> tuple[list[MapSample], Counter[str]]:
-    """Read the samples of logs, in the frame ``ego``.
+    """Read the samples of several logs in the ego frame, without ground truth.
 
     Args:
-        log_dirs: The logs' folders.
-        root: Folder that paths are relative to.
-        rate_hz: Samples per second; None takes every sweep's or image's time.
+        log_dirs: Folders of the logs.
+        root: Folder that the paths of the samples are relative to.
+        rate_hz: Samples per second; None takes a sample per LiDAR sweep or image.
 
     Returns:
-        The samples, and how many were left out, by reason.
+        The samples, and the number of logs and samples that are left out, by reason.
 
     Raises:
-        ValueError: If no log has a sample; the message says why.
+        ValueError: If no log has a usable sample.
     """
     options = Argoverse2Options(root, rate_hz=rate_hz)
-    samples, left_out = [], Counter[str]()
+    samples = []
+    left_out = Counter[str]()
     for log_dir in log_dirs:
         try:
             result = read_log(log_dir, options, with_map=False)
@@ -189,110 +229,157 @@ def read_logs(
             left_out[f"{log_dir.name}: {error}"] += 1
             continue
         samples += result.samples
-        left_out.update({f"{log_dir.name}: {why}": n for why, n in result.left_out.items()})
+        for reason, count in result.left_out.items():
+            left_out[f"{log_dir.name}: {reason}"] += count
     if not samples:
         raise InputError(f"no sample can be read from {root}: {'; '.join(left_out) or 'no log'}.")
     return samples, left_out
 
 
 def sample_times(log: Argoverse2Log, options: Argoverse2Options) -> np.ndarray:
-    """Return when samples are, in nanoseconds, ascending; ValueError if sensor data lack. (n,)"""
+    """Compute the times of a log's samples.
+
+    With ``options.thin_over="split"`` the times are not thinned out yet.
+
+    Args:
+        log: The log.
+        options: Options of the conversion.
+
+    Returns:
+        Ascending times in nanoseconds. (n,)
+
+    Raises:
+        ValueError: If the calibration or the sensor data that ``options.at`` needs are missing.
+    """
     if options.pose_stride is not None:
         return np.array(list(log.poses))[:: options.pose_stride]
-    missing = [name for name in RING_CAMERAS if name not in log.calibration]
-    if missing:
-        which = ", ".join(missing) if log.calibration else "the ring cameras"
-        raise InputError(f"no calibration of {which} ({_NEEDS_NONE})")
-    times, kind = log.lidar_timestamps_ns, "LiDAR sweeps"
-    if options.at == "cameras" or (options.at == "auto" and len(times) == 0):
-        times, kind = log.image_timestamps_ns[RING_CAMERAS[0]], f"images of {RING_CAMERAS[0]}"
-    if len(times) == 0:
+    uncalibrated = [name for name in RING_CAMERAS if name not in log.calibration]
+    if uncalibrated:
+        cameras = ", ".join(uncalibrated) if log.calibration else "the ring cameras"
+        raise InputError(f"no calibration of {cameras} ({_NEEDS_NONE})")
+    times_ns = log.lidar_timestamps_ns
+    kind = "LiDAR sweeps"
+    if options.at == "cameras" or (options.at == "auto" and len(times_ns) == 0):
+        times_ns = log.image_timestamps_ns[RING_CAMERAS[0]]
+        kind = f"images of {RING_CAMERAS[0]}"
+    if len(times_ns) == 0:
         raise InputError(f"no {kind} ({_NEEDS_NONE})")
-    return times if options.thin_over == "split" else thin_out(times, options.rate_hz)
+    if options.thin_over == "split":
+        return times_ns
+    return thin_out(times_ns, options.rate_hz)
 
 
 def thin_out(times_ns: np.ndarray, rate_hz: float | None) -> np.ndarray:
-    """Keep the first of ascending times, then each that follows the latest kept after a period.
+    """Select times at a lower rate.
 
-    Half the sensor's own period is tolerated, so that 10 Hz with jitter thins out to every fourth
-    at 2.5 Hz, and what is already slower stays whole. Without a rate all stay. (n,) -> (m,)
+    The first time is kept, then each time that follows the latest kept one after at least a period
+    of ``rate_hz`` less half the median gap of ``times_ns``. With this tolerance a sensor of 10 Hz
+    with jitter is thinned out to every fourth time at 2.5 Hz, and a sensor slower than ``rate_hz``
+    keeps all times.
+
+    Args:
+        times_ns: Ascending times in nanoseconds. (n,)
+        rate_hz: Times per second to keep; None keeps all.
+
+    Returns:
+        The selected times in nanoseconds. (m,)
     """
     if len(times_ns) < 2 or rate_hz is None:
         return times_ns
-    least_gap = 1e9 / rate_hz - np.median(np.diff(times_ns)) / 2
-    kept = [int(times_ns[0])]
+    min_gap_ns = 1e9 / rate_hz - np.median(np.diff(times_ns)) / 2
+    selected_ns = [int(times_ns[0])]
     for time in times_ns[1:].tolist():
-        if time - kept[-1] >= least_gap:
-            kept.append(time)
-    return np.array(kept, dtype=np.int64)
+        if time - selected_ns[-1] >= min_gap_ns:
+            selected_ns.append(time)
+    return np.array(selected_ns, dtype=np.int64)
 
 
-class _LeftOut(Exception):
-    """A sample that cannot be made; the message is the reason, the same for all of its kind."""
+class _UnusableSample(Exception):
+    """Error for a sample that cannot be made; its message is a reason to count samples by."""
 
 
 def _sample(
     log: Argoverse2Log, log_map: Argoverse2Map | None, timestamp_ns: int, options: Argoverse2Options
 ) -> MapSample:
-    """Make the sample at a time, or raise ``_LeftOut``."""
+    """Make the sample at a time; ``_UnusableSample`` if a pose or an image is missing."""
     city_from_ego = log.poses.get(timestamp_ns)
     if city_from_ego is None:
-        raise _LeftOut("no pose at the sample's time")
+        raise _UnusableSample("no pose at the sample's time")
+    ego_from_city = np.linalg.inv(city_from_ego)
     sample = MapSample(
         token=f"{log.log_id}_{timestamp_ns}",
         scene=log.log_id,
         map_name=log.city,
         timestamp_ns=timestamp_ns,
-        cameras=list(_cameras(log, timestamp_ns, city_from_ego, options)),
+        cameras=_cameras(log, timestamp_ns, city_from_ego=city_from_ego, options=options),
         global_from_frame=city_from_ego,
-        lidar=_lidar(log, timestamp_ns, np.linalg.inv(city_from_ego), options),
+        lidar=_lidar(log, timestamp_ns, ego_from_city=ego_from_city, options=options),
     )
     if log_map is not None:
         with naming(find_map(log.log_dir), "download it again"):
-            found = log_map.extract(
-                city_from_ego, options.classes, options.compat, options.x_range, options.y_range
+            elements = log_map.extract(
+                city_from_ego,
+                options.classes,
+                compat=options.compat,
+                x_range=options.x_range,
+                y_range=options.y_range,
             )
-        sample.instances = [
-            MapInstance(label, points[:, : options.dim])
-            for label, name in enumerate(options.classes)
-            for points in found[name]
-        ]
+        sample.instances = []
+        for label, name in enumerate(options.classes):
+            for points in elements[name]:
+                sample.instances.append(MapInstance(label, points[:, : options.dim]))
     return sample
 
 
 def _cameras(
     log: Argoverse2Log, timestamp_ns: int, city_from_ego: np.ndarray, options: Argoverse2Options
-) -> Iterator[CameraRecord]:
-    """Yield the image of each calibrated camera closest in time."""
+) -> list[CameraRecord]:
+    """List the image of each calibrated camera that is closest in time.
+
+    The transforms to the cameras include the motion of the vehicle between the two times.
+    """
     folder = (log.log_dir / "sensors/cameras").relative_to(options.root).as_posix()
+    records = []
     for name, camera in log.calibration.items():
-        image_ns = closest_ns(log.image_timestamps_ns[name], timestamp_ns, MAX_CAMERA_OFFSET_NS)
-        city_from_ego_then = None if image_ns is None else log.poses.get(image_ns)
-        if city_from_ego_then is None:
+        camera_times_ns = log.image_timestamps_ns[name]
+        image_ns = closest_ns(camera_times_ns, timestamp_ns, tolerance_ns=MAX_CAMERA_OFFSET_NS)
+        city_from_ego_at_image = None if image_ns is None else log.poses.get(image_ns)
+        if city_from_ego_at_image is None:
             if options.pose_stride is None:
-                limit = MAX_CAMERA_OFFSET_NS / 1e6
-                raise _LeftOut(f"no image of {name} with a pose within {limit:.0f} ms")
+                limit_ms = MAX_CAMERA_OFFSET_NS / 1e6
+                raise _UnusableSample(f"no image of {name} with a pose within {limit_ms:.0f} ms")
             continue
-        path = f"{folder}/{name}/{image_ns}.jpg"
-        motion = np.linalg.inv(city_from_ego_then) @ city_from_ego
-        cam_from_frame = camera.ego_SE3_cam.inverse().transform_matrix @ motion
-        width, height, intrinsics = camera.width_px, camera.height_px, camera.intrinsics.K
-        yield CameraRecord(name, path, width, height, intrinsics, cam_from_frame)
+        motion = np.linalg.inv(city_from_ego_at_image) @ city_from_ego
+        record = CameraRecord(
+            name=name,
+            path=f"{folder}/{name}/{image_ns}.jpg",
+            width=camera.width_px,
+            height=camera.height_px,
+            intrinsics=camera.intrinsics.K,
+            cam_from_frame=camera.ego_SE3_cam.inverse().transform_matrix @ motion,
+        )
+        records.append(record)
+    return records
 
 
 def _lidar(
     log: Argoverse2Log, timestamp_ns: int, ego_from_city: np.ndarray, options: Argoverse2Options
 ) -> LidarRecord | None:
-    """Return the closest sweep and the ones before it; sweeps are stored in the ego frame."""
-    times = log.lidar_timestamps_ns
-    sweep_ns = closest_ns(times, timestamp_ns, MAX_LIDAR_OFFSET_NS)
+    """LiDAR sweep closest in time, with earlier sweeps; None without one that has a pose.
+
+    Argoverse 2 stores the points of a sweep in the ego frame at the time of the sweep.
+    """
+    times_ns = log.lidar_timestamps_ns
+    sweep_ns = closest_ns(times_ns, timestamp_ns, tolerance_ns=MAX_LIDAR_OFFSET_NS)
     if sweep_ns is None or sweep_ns not in log.poses:
         return None
     folder = log.log_dir.relative_to(options.root).as_posix()
-    last = int(np.searchsorted(times, sweep_ns))
-    sweep, *earlier = (
-        SweepRecord(f"{folder}/sensors/lidar/{time}.feather", time, ego_from_city @ log.poses[time])
-        for time in times[max(last - options.max_sweeps, 0) : last + 1][::-1].tolist()
-        if time in log.poses
-    )
-    return LidarRecord(sweep.path, sweep.frame_from_lidar, earlier)
+    last = int(np.searchsorted(times_ns, sweep_ns))
+    first = max(last - options.max_sweeps, 0)
+    sweeps = []
+    for time in reversed(times_ns[first : last + 1].tolist()):
+        if time in log.poses:
+            path = f"{folder}/sensors/lidar/{time}.feather"
+            sweeps.append(SweepRecord(path, time, frame_from_lidar=ego_from_city @ log.poses[time]))
+    closest = sweeps[0]
+    return LidarRecord(closest.path, closest.frame_from_lidar, sweeps=sweeps[1:])
