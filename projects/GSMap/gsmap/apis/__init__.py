@@ -1,4 +1,4 @@
-"""A trained model on recorded samples; ``map_inferencer.MapInferencer`` is the entry."""
+"""Inference with trained models, and their export. The entry is ``MapInferencer``."""
 
 from gsmap.utils.lazy import lazy_names
 

@@ -99,10 +99,10 @@ class StaticFrame(nn.Module):
         last_layer = model.map_head(outputs)[-1]
         samples = []
         for scores, references in zip(last_layer.scores, last_layer.references, strict=True):
-            samples.append(self._elements(scores, references=references))
+            samples.append(self._decode_elements(scores, references=references))
         return torch.stack(samples)
 
-    def _elements(self, scores: Tensor, references: Any) -> Tensor:
+    def _decode_elements(self, scores: Tensor, references: Any) -> Tensor:
         """Decode the best elements of one sample, and concatenate their fields.
 
         Args:
@@ -144,7 +144,7 @@ class StaticFrame(nn.Module):
 
 
 @dataclass
-class _Captured:
+class _Recording:
     """Recorded frame of one size.
 
     Attributes:
@@ -175,7 +175,7 @@ class FastFrames:
     frame: StaticFrame
     device: torch.device
     capture: bool = True
-    _graphs: "OrderedDict[Any, _Captured]" = field(default_factory=OrderedDict)
+    _graphs: "OrderedDict[Any, _Recording]" = field(default_factory=OrderedDict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def serves(self, batch: dict[str, Any]) -> bool:
@@ -238,8 +238,8 @@ class FastFrames:
         """
         preprocessor = self.frame.model.data_preprocessor
         shape = padded_size(image_size, preprocessor.pad_size_divisor)
-        padded = preprocessor._get_pad_shape(batch)
-        for sample, pad_shape in zip(batch["data_samples"], padded, strict=True):
+        pad_shapes = preprocessor._get_pad_shape(batch)
+        for sample, pad_shape in zip(batch["data_samples"], pad_shapes, strict=True):
             sample.set_metainfo({"batch_input_shape": shape, "pad_shape": pad_shape})
 
     def _run(self, inputs: Sequence[Tensor]) -> Tensor:
@@ -256,19 +256,19 @@ class FastFrames:
             return self.frame(*on_device).cpu()
         key = tuple((tensor.shape, tensor.dtype) for tensor in inputs)
         while True:
-            captured = self._graphs.get(key)
-            if captured is None:
-                captured = self._record(key, inputs=inputs)
-            for buffer, value in zip(captured.inputs, inputs, strict=True):
+            recording = self._graphs.get(key)
+            if recording is None:
+                recording = self._record(key, inputs=inputs)
+            for buffer, value in zip(recording.inputs, inputs, strict=True):
                 buffer.copy_(value, non_blocking=True)
-            captured.graph.replay()
+            recording.graph.replay()
             # The GPU computes in the meantime. A graph is valid only for unchanged weights.
-            if tensor_versions(self.frame.model) == captured.versions:
+            if tensor_versions(self.frame.model) == recording.versions:
                 self._graphs.move_to_end(key)
-                return captured.output.cpu()
+                return recording.output.cpu()
             del self._graphs[key]
 
-    def _record(self, key: Any, inputs: Sequence[Tensor]) -> _Captured:
+    def _record(self, key: Any, inputs: Sequence[Tensor]) -> _Recording:
         """Record a frame with the sizes of the inputs.
 
         Args:
@@ -295,7 +295,9 @@ class FastFrames:
                     f"without ({SWITCH}=False, --no-{SWITCH.replace('_', '-')})."
                 ) from error
         versions = tensor_versions(self.frame.model)
-        self._graphs[key] = _Captured(graph=graph, inputs=buffers, output=output, versions=versions)
+        self._graphs[key] = _Recording(
+            graph=graph, inputs=buffers, output=output, versions=versions
+        )
         return self._graphs[key]
 
     def _with_predictions(self, sample: "Det3DDataSample", elements: Tensor) -> "Det3DDataSample":
@@ -319,15 +321,15 @@ class FastFrames:
 
 @contextmanager
 def matrix_products(in_tf32: bool) -> Iterator[None]:
-    """Use TF32 for float32 matrix products on a GPU in a block.
+    """Context manager that selects TF32 for float32 matrix products on a GPU.
 
     Args:
         in_tf32: Whether to use TF32; if not, the precision is not changed.
     """
-    before = torch.get_float32_matmul_precision()
+    previous_precision = torch.get_float32_matmul_precision()
     if in_tf32:
         torch.set_float32_matmul_precision("high")
     try:
         yield
     finally:
-        torch.set_float32_matmul_precision(before)
+        torch.set_float32_matmul_precision(previous_precision)

@@ -26,7 +26,7 @@ class ResultLog:
         classes: Classes of the model; None allows any in the file.
 
     Raises:
-        RuntimeError: If another process writes the same result file.
+        RuntimeError: If another process writes the result file.
         ValueError: If ``OUT.unfinished`` has another format, is damaged, or has other frames. The
             file is not changed in this case.
 
@@ -74,7 +74,7 @@ class ResultLog:
         """
         self._file.seek(0)
         head = self._file.readline()
-        end = 0  # of the part that is kept, in bytes
+        end = 0  # end of the valid part, in bytes
         same_settings = head == self._head.encode()
         if head.endswith(b"\n"):
             self._require(isinstance(_parse_line(head), dict), line_number=1)
@@ -106,8 +106,8 @@ class ResultLog:
 
         Args:
             frame: Value of the line.
-            same_settings: Whether the settings of the file are those of the run; if not, frames of
-                any run are valid.
+            same_settings: Whether the file and the run have equal settings; if not, frames of any
+                run are valid.
         """
         if not isinstance(frame, dict) or not isinstance(frame.get("sample_token"), str):
             return False

@@ -36,7 +36,6 @@ AZIMUTHS_DEG = {
     "ring_rear_right": -153,
 }  # fmt: skip
 
-
 _GENERATOR_LABELS = "map_head.generator.label."  # changed only with weights of its detector
 # Prefixes of weights with a row for each class, and the number of rows before these.
 _CLASS_ROWS = {
@@ -50,8 +49,8 @@ _MAX_SAMPLES = 100  # number of samples that are searched for one with all camer
 def camera_rows(dataset: "VectorizedMapDataset", trained: Sequence[str]) -> list[int]:
     """Assign a camera of the model to each camera of a data set.
 
-    Equal names are assigned to each other. If a name is unknown to the model, all cameras are
-    assigned by their viewing direction (`similar_cameras`).
+    Cameras are assigned by name if the model has cameras of all these names, and by viewing
+    direction if not (`similar_cameras`).
 
     Args:
         dataset: The data set.
@@ -87,7 +86,7 @@ def similar_cameras(
     Args:
         sample: Sample with the poses of the cameras.
         frame: Annotation frame of the sample: ``"lidar"`` or ``"ego"``.
-        names: Names of the sample's cameras. An absent camera is taken to look ahead.
+        names: Names of the sample's cameras. An absent camera counts as a front camera.
         trained: Names of the model's cameras.
 
     Returns:
@@ -225,7 +224,7 @@ def _fit_cells(state: dict[str, Tensor], initial: Mapping[str, Tensor]) -> list[
 def _fit_queries(
     state: dict[str, Tensor], initial: Mapping[str, Tensor], model: nn.Module
 ) -> list[str]:
-    """Add initial queries to a checkpoint's, if a model with one query group has more of them.
+    """Append initial queries if the model has one group of queries and the checkpoint fewer.
 
     Args:
         state: Weights of the checkpoint; changed in place.
@@ -255,7 +254,7 @@ def _fit_classes(
     trained: Sequence[str] | None,
     names: Sequence[str],
 ) -> list[str]:
-    """Reorder the rows of classes by name; rows of classes without weights are initialised.
+    """Reorder the rows of classes by name. Classes without weights keep the model's initial rows.
 
     Args:
         state: Weights of the checkpoint; changed in place.
@@ -354,8 +353,8 @@ class RigFitHook(Hook):
 def _training_facts(path: Any, checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     """Facts about the training of a checkpoint, for `fit_start`.
 
-    They are read from the checkpoint's metadata, or for a named model without metadata from the
-    model's config. Facts of a wrong type are left out.
+    The source is the metadata of the checkpoint, or the config of a named model if its checkpoint
+    has no metadata. Facts of a wrong type are left out.
 
     Args:
         path: File of the checkpoint.
