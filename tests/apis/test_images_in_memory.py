@@ -8,7 +8,7 @@ import pytest
 import torch
 from inferencer_cases import drive, make_remembering, make_samples
 
-from gsmap.datasets.source import ground_from_frame, reframed
+from gsmap.datasets.source import change_frame, ground_from_frame
 from gsmap.structures.rigid import rigid
 from gsmap.structures.streams import Frame
 from gsmap.visualization.figure import figure_to_rgb
@@ -40,8 +40,8 @@ def test_images_in_memory_give_what_their_files_give(inferencer, tmp_path):
     torch.testing.assert_close(
         listed.pred_instances_3d.pts, expected.pred_instances_3d.pts, atol=1e-3, rtol=0
     )
-    vehicle = reframed(sample, "lidar", "ego")
-    (seen,) = inferencer([reframed(vehicle, "ego", "lidar")], tmp_path)
+    vehicle = change_frame(sample, "lidar", "ego")
+    (seen,) = inferencer([change_frame(vehicle, "ego", "lidar")], tmp_path)
     found = inferencer.predict_images(*in_memory(vehicle, tmp_path), frame="ego")
     torch.testing.assert_close(found.pred_instances_3d.pts, seen.pred_instances_3d.pts)
 
@@ -141,7 +141,7 @@ def test_a_live_map_is_in_the_frame_of_its_calibration(inferencer, tmp_path):
     found = inferencer.live(intrinsics, cam_from_vehicle, "vehicle")(images)
     x, y = in_lidar.points.T
     np.testing.assert_allclose(found.points, np.stack([y + 0.94, -x], 1), atol=1e-3)
-    vehicle = reframed(sample, "lidar", "ego")  # 0.31 m above the road, on the same axle
+    vehicle = change_frame(sample, "lidar", "ego")  # 0.31 m above the road, on the same axle
     found = inferencer.live(*in_memory(vehicle, tmp_path)[1:], "ego")(images)
     np.testing.assert_allclose(found.points, np.stack([y + 0.94, -x], 1), atol=1e-3)
 

@@ -11,7 +11,7 @@ from gsmap.apis.loading import load_model
 from gsmap.apis.map_inferencer import MapInferencer
 from gsmap.datasets.annotations.file import write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta
-from gsmap.datasets.source import Source, reframed
+from gsmap.datasets.source import Source, change_frame
 from gsmap.visualization.figure import figure_to_rgb
 
 
@@ -220,9 +220,9 @@ def test_cameras_of_other_names_and_number_take_the_embeddings_of_their_directio
 
 
 def test_samples_of_another_frame_are_seen_from_the_model_s(inferencer, tmp_path):
-    samples = [reframed(s, "lidar", "ego") for s in make_samples(tmp_path, 1)]
+    samples = [change_frame(s, "lidar", "ego") for s in make_samples(tmp_path, 1)]
     (found,) = inferencer(Source(samples, "ego", tmp_path))
-    (expected,) = inferencer([reframed(s, "ego", "lidar") for s in samples], tmp_path)
+    (expected,) = inferencer([change_frame(s, "ego", "lidar") for s in samples], tmp_path)
     torch.testing.assert_close(found.pred_instances_3d.pts, expected.pred_instances_3d.pts)
 
 

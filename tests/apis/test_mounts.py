@@ -19,7 +19,7 @@ from gsmap.apis.export import ExportedDetector, graph_metadata
 from gsmap.apis.map_inferencer import MapInferencer
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta
-from gsmap.datasets.source import Mount, ground_from_frame, reframed
+from gsmap.datasets.source import Mount, change_frame, ground_from_frame
 from gsmap.structures.rigid import invert_rigid, rigid
 from gsmap.utils.model_facts import MOUNT, RIG
 from mapdata.inputs import open_input
@@ -241,7 +241,7 @@ def test_the_cameras_of_the_training_travel_with_the_checkpoint(tmp_path):
 
 def test_two_roof_lidars_are_taken_for_one():
     sample = sample_of(None)
-    assert reframed(sample, "lidar", Mount("lidar", None, CASES["lidar"][1])) is sample
+    assert change_frame(sample, "lidar", Mount("lidar", None, CASES["lidar"][1])) is sample
 
 
 def test_models_of_generated_streets_say_so_once_on_other_recordings(tmp_path, caplog):

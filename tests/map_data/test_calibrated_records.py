@@ -9,7 +9,7 @@ import pytest
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import AnnotationMeta
-from gsmap.datasets.source import Mount, reframed
+from gsmap.datasets.source import Mount, change_frame
 from mapdata.custom import from_records
 from mapdata.folders.images import read_image_folder
 
@@ -73,7 +73,7 @@ def test_cameras_poses_and_images_are_those_of_infer(drive: Path, frame: str, ca
     assert "has no ego_from_frame" not in caplog.text
     source = read_image_folder(file, drive / "frames")
     mount = Mount(frame, meta.ground_z_m)
-    expected = [reframed(sample, "ego", mount) for sample in source.samples]
+    expected = [change_frame(sample, "ego", mount) for sample in source.samples]
     found = list(AnnotationFile(drive / "a.arrow"))
     assert len(found) == len(expected) == 2
     for sample, wanted in zip(found, expected, strict=True):

@@ -1,4 +1,4 @@
-"""The commands of ``tools/`` from any folder: ``gsmap train CONFIG``, ``gsmap infer INPUT ...``."""
+"""Entry point ``gsmap COMMAND ...``, which runs the scripts of ``tools/`` from any folder."""
 
 import ast
 import runpy
@@ -12,22 +12,27 @@ from gsmap.utils.shipped import shipped
 
 
 def _summary(tool: Path) -> str:
-    """Return the first line of a tool's docstring, without running it."""
-    text = ast.get_docstring(ast.parse(tool.read_text(encoding="utf-8"))) or ""
-    return text.split("\n")[0].partition(": ``")[0].rstrip(".")
+    """Return the first line of the docstring of a script without running the script."""
+    source = tool.read_text(encoding="utf-8")
+    docstring = ast.get_docstring(ast.parse(source)) or ""
+    first_line = docstring.split("\n")[0]
+    return first_line.partition(": ``")[0].rstrip(".")
 
 
 def _overview(tools: dict[str, Path]) -> str:
-    """Return the list of all commands."""
+    """Return the help text with all commands and their summaries."""
     width = max(map(len, tools))
-    lines = [f"  {name:{width}}  {_summary(tool)}" for name, tool in tools.items()]
-    usage = "usage: gsmap [--help | --version] COMMAND ..."
-    return "\n".join([usage, "", *lines, "", "gsmap COMMAND --help says more.\n"])
+    lines = ["usage: gsmap [--help | --version] COMMAND ...", ""]
+    for name, tool in tools.items():
+        lines.append(f"  {name:{width}}  {_summary(tool)}")
+    lines += ["", "gsmap COMMAND --help says more.\n"]
+    return "\n".join(lines)
 
 
 def main() -> None:
-    """Run the tool that the first word names, as ``python tools/NAME.py`` does."""
-    tools = {path.stem: path for path in sorted(shipped("tools").glob("*.py"))}
+    """Run the script named by the first argument, like ``python tools/NAME.py``."""
+    scripts = sorted(shipped("tools").glob("*.py"))
+    tools = {path.stem: path for path in scripts}
     name = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if name in ("-h", "--help"):
         sys.stdout.write(_overview(tools))
@@ -41,7 +46,7 @@ def main() -> None:
         CommandParser.program = f"gsmap {name}"
         del sys.argv[0]
         sys.argv[0] = str(tools[name])
-        sys.path.insert(0, str(tools[name].parent))  # as Python does for a script
+        sys.path.insert(0, str(tools[name].parent))  # like Python for a script
         runpy.run_path(sys.argv[0], run_name="__main__")
 
 

@@ -1,8 +1,9 @@
-"""The methods of the library: the one list that everything else reads.
+"""List of the methods in the library.
 
-A method is whole in ``gsmap/models/<name>``: its parts, its targets, the table of its state keys
-(``keys.py``) and its paper's numbers (``paper.json``). Beside it are only ``configs/<name>``,
-``tests/methods/<name>``, ``docs/methods/<name>.md`` and ``docs/methods/names/<name>.md``.
+The folder ``gsmap/models/<name>`` has all code of a method: modules, targets, the table of state
+keys (``keys.py``) and the numbers of the paper (``paper.json``). Other files of a method are in
+``configs/<name>``, ``tests/methods/<name>``, ``docs/methods/<name>.md`` and
+``docs/methods/names/<name>.md``.
 """
 
 from dataclasses import dataclass
@@ -14,12 +15,12 @@ from gsmap.utils.files import read_json
 
 @dataclass(frozen=True)
 class Method:
-    """A method.
+    """Method for map construction.
 
     Attributes:
-        name: Name of its folders and of its page.
-        title: Its name as its authors write it.
-        built_on: Names of the methods whose parts, key tables or configs it uses, all of them.
+        name: Name of the folders and of the documentation page.
+        title: Name in the spelling of the authors.
+        built_on: Names of all methods whose modules, key tables or configs the method uses.
     """
 
     name: str
@@ -28,17 +29,18 @@ class Method:
 
     @property
     def folder(self) -> Path:
-        """Its folder in ``gsmap/models``."""
+        """Folder of the method in ``gsmap/models``."""
         return Path(__file__).parent / "models" / self.name
 
     def paper(self) -> dict[str, Any]:
-        """Return the numbers of its paper and release, from ``paper.json``.
+        """Read the numbers of the paper and of the released code from ``paper.json``.
 
         Returns:
-            ``arxiv``, the paper's number; ``parameters``, trainable ones by config; ``settings``,
-            published values by config and path; ``heads``, by config the queries of each group,
-            weights of losses and auxiliary heads by name, weights of costs in order; ``tables``,
-            as ``configs/tables.json`` has those of several methods.
+            Dictionary with ``arxiv``, the number of the paper at arXiv; ``parameters``, the number
+            of trainable parameters of each config; ``settings``, the published values by config
+            and path of the setting; ``heads``, for each config the number of queries of each
+            group, the weights of losses and auxiliary heads by name, and the weights of matching
+            costs in order; and ``tables``, tables in the format of ``configs/tables.json``.
         """
         return read_json(self.folder / "paper.json")
 

@@ -1,10 +1,11 @@
-"""Stands in for mmcv's compiled operators (``mmcv._ext``) where mmcv was installed without them.
+"""Replacement of the compiled operators of mmcv (``mmcv._ext``) for an mmcv without them.
 
-``mmcv-lite`` is mmcv's Python without its compiled module, but mmdet and mmdet3d import
-``mmcv.ops``, which asks that module for every operator. GSMap uses two of them, the hard
-voxelisation of LiDAR and the deformable convolution, and torch does both here. Every other name is
-a function that says, when it is called, which operator is missing and how to get it.
-``gsmap/__init__.py`` puts `MmcvExtFinder` in place.
+``mmcv-lite`` is mmcv without the compiled module, but mmdet and mmdet3d import ``mmcv.ops``, which
+imports every operator from that module. GSMap uses two operators, the hard voxelisation of LiDAR
+points and the modulated deformable convolution, which are implemented with torch. All other
+operators are functions that raise an error with the name of the operator and the command that
+installs it.
+``gsmap/__init__.py`` adds `MmcvExtFinder` to ``sys.meta_path``.
 """
 
 from __future__ import annotations
@@ -22,21 +23,32 @@ if TYPE_CHECKING:
 
 
 class MmcvExtFinder:
-    """Finds this file as ``mmcv._ext``; at the end of ``sys.meta_path``, where a compiled one wins.
+    """Import finder that loads this file as the module ``mmcv._ext``.
 
-    It costs nothing until mmcv is imported.
+    The last entry of ``sys.meta_path``, so that a compiled ``mmcv._ext`` has priority.
     """
 
     @staticmethod
     def find_spec(
         name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """Return where the module ``name`` is, if it is ``mmcv._ext``."""
-        return spec_from_file_location(name, __file__) if name == "mmcv._ext" else None
+        """Find the module ``mmcv._ext``.
+
+        Args:
+            name: Full name of the module.
+            path: Search path of the parent package. Not used.
+            target: Module to reload. Not used.
+
+        Returns:
+            Specification of this file as a module, or None for all other names.
+        """
+        if name != "mmcv._ext":
+            return None
+        return spec_from_file_location(name, __file__)
 
 
 def get_compiling_cuda_version() -> str:
-    """Return what mmcv says where its operators were built without CUDA."""
+    """Return the CUDA version in the words of an mmcv that was built without CUDA."""
     return "not available"
 
 
@@ -53,46 +65,81 @@ def hard_voxelize_forward(
     voxel_num: Tensor,
     **_: Any,
 ) -> None:
-    """Fill mmcv's output tensors; their sizes are the largest numbers of voxels and of points."""
+    """Group points by voxel and write the results to the output tensors of mmcv.
+
+    Args:
+        points: Points x, y, z in metres and further channels. (n, C)
+        voxel_size: Sides of a voxel along x, y, z in metres. (3,)
+        coors_range: Smallest x, y, z in metres, then largest x, y, z. (6,)
+        voxels: Output: points of each voxel. (max_voxels, max_points, C)
+        coors: Output: cell z, y, x of each voxel. (max_voxels, 3)
+        num_points_per_voxel: Output: number of points of each voxel. (max_voxels,)
+        voxel_num: Output: number of voxels. ()
+    """
     from gsmap.ops.hard_voxelization import hard_voxelize
 
-    found = hard_voxelize(points, voxel_size, coors_range, *voxels.shape[:2])
-    for out, values in zip((voxels, coors, num_points_per_voxel), found, strict=True):
-        out[: len(values)] = values
-    voxel_num.fill_(len(found[0]))
+    max_voxels, max_points = voxels.shape[:2]
+    voxel_points, cells, counts = hard_voxelize(
+        points, voxel_size, extent=coors_range, max_voxels=max_voxels, max_points=max_points
+    )
+    num_voxels = len(voxel_points)
+    voxels[:num_voxels] = voxel_points
+    coors[:num_voxels] = cells
+    num_points_per_voxel[:num_voxels] = counts
+    voxel_num.fill_(num_voxels)
 
 
 def modulated_deform_conv_forward(*tensors: Tensor, **geometry: Any) -> None:
-    """Fill mmcv's output tensor."""
+    """Compute a modulated deformable convolution into the output tensor of mmcv.
+
+    Args:
+        tensors: Images, weight, bias, ones, offset, mask, output and columns, in the order of mmcv.
+        geometry: Settings of the convolution under the names of mmcv.
+    """
     images, weight, bias, _ones, offset, mask, output, _columns = tensors
-    output.copy_(_deform_conv((images, weight, bias, offset, mask), geometry))
+    inputs = (images, weight, bias, offset, mask)
+    output.copy_(_deform_conv(inputs, geometry))
 
 
 def modulated_deform_conv_backward(*tensors: Tensor, **geometry: Any) -> None:
-    """Fill mmcv's gradients of images, weight, bias, offset and mask."""
+    """Compute the gradients of a modulated deformable convolution into the tensors of mmcv.
+
+    Args:
+        tensors: Images, weight, bias, ones, offset, mask and columns; then the gradients of images,
+            weight, bias, offset and mask, which are written; then the gradient of the output.
+        geometry: Settings of the convolution under the names of mmcv.
+    """
     import torch
 
     images, weight, bias, _ones, offset, mask, _columns, *grads, grad_output = tensors
-    inputs = [t.detach().requires_grad_() for t in (images, weight, bias, offset, mask)]
+    inputs = []
+    for tensor in (images, weight, bias, offset, mask):
+        inputs.append(tensor.detach().requires_grad_())
     with torch.enable_grad():
-        out = _deform_conv(inputs, geometry)
-    found = torch.autograd.grad(out, inputs, grad_output, materialize_grads=True)
-    for grad, values in zip(grads, found, strict=True):
+        output = _deform_conv(inputs, geometry)
+    input_grads = torch.autograd.grad(
+        output, inputs, grad_outputs=grad_output, materialize_grads=True
+    )
+    for grad, values in zip(grads, input_grads, strict=True):
         grad.copy_(values)
 
 
 def _deform_conv(inputs: Sequence[Tensor], geometry: dict[str, Any]) -> Tensor:
-    """Convolve images, weight, bias, offset and mask with mmcv's names of the settings."""
+    """Convolve (images, weight, bias, offset, mask) with the settings of mmcv in ``geometry``."""
     from gsmap.ops.modulated_deform_conv import modulated_deform_conv
 
     images, weight, bias, offset, mask = inputs
-    stride, pad, dilation = (
-        (geometry[f"{name}_h"], geometry[f"{name}_w"]) for name in ("stride", "pad", "dilation")
-    )
-    groups, deform_groups = geometry["group"], geometry["deformable_group"]
-    own = bias if geometry["with_bias"] else None
     return modulated_deform_conv(
-        images, weight, own, offset, mask, stride, pad, dilation, groups, deform_groups
+        images,
+        weight,
+        bias=bias if geometry["with_bias"] else None,
+        offset=offset,
+        mask=mask,
+        stride=(geometry["stride_h"], geometry["stride_w"]),
+        padding=(geometry["pad_h"], geometry["pad_w"]),
+        dilation=(geometry["dilation_h"], geometry["dilation_w"]),
+        groups=geometry["group"],
+        deform_groups=geometry["deformable_group"],
     )
 
 

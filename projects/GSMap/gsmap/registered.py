@@ -1,4 +1,4 @@
-"""Importing this module registers everything that GSMap adds to mmdet3d's registries."""
+"""Registration of all GSMap classes in the registries of mmdet3d, on import of this module."""
 
 from importlib import import_module
 from pkgutil import iter_modules
@@ -24,7 +24,7 @@ MODULES = (
     "gsmap.visualization.map_visualization_hook",
     "gsmap.visualization.map_visualizer",
 )
-FOLDERS = (  # every module of these is imported, and of the methods' folders
+FOLDERS = (  # all modules of these folders are imported
     "gsmap.datasets.transforms",
     "gsmap.models.encoders",
     "gsmap.models.base",
@@ -37,5 +37,6 @@ with collection_paused():
     for name in MODULES:
         import_module(name)
     for folder in FOLDERS:
-        for module in iter_modules(import_module(folder).__path__, f"{folder}."):
+        package = import_module(folder)
+        for module in iter_modules(package.__path__, prefix=f"{folder}."):
             import_module(module.name)

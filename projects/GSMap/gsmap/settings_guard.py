@@ -1,11 +1,16 @@
-"""Keeps files of the working folder from setting up libraries, and slow imports from others.
+"""Import hooks against settings files in the working folder and against slow imports.
 
-matplotlib and numba read ``matplotlibrc`` and ``.numba_config.yaml`` of the working folder when
-they are imported, and numba again when it compiles; numba's can name a folder of compiled kernels,
-which are pickles. OpenCV prepends its folder to ``LD_LIBRARY_PATH`` so that an empty part is left,
-by which every program that is started later looks for libraries in the working folder first. That
-folder may be a stranger's data set. mmdet imports scikit-learn, which takes as long as torch, for
-a tracker and a head of two-dimensional boxes. ``gsmap/__init__.py`` puts `SettingsGuard` in place.
+The working folder may hold files of unknown origin, such as a downloaded data set. Some libraries
+read settings there:
+
+* matplotlib reads ``matplotlibrc`` and numba reads ``.numba_config.yaml`` on import. Numba reads
+  it again when it compiles. The file may name a folder of compiled kernels, which are pickles.
+* OpenCV prepends a folder to ``LD_LIBRARY_PATH`` and leaves an empty entry there. Because of the
+  empty entry, all programs started later load libraries from the working folder first.
+
+mmdet imports scikit-learn for a tracker and for a head of two-dimensional boxes. The import takes
+as long as the import of torch, so it is deferred. ``gsmap/__init__.py`` adds `SettingsGuard` to
+``sys.meta_path``.
 """
 
 import os
@@ -23,31 +28,32 @@ _LIBRARIES = "LD_LIBRARY_PATH"
 
 @contextmanager
 def _without_relative_files(module: ModuleType) -> Iterator[None]:
-    """Let no file exist under a relative path while a module is imported."""
+    """Hide all files with relative paths from ``os.path.exists`` during the import of a module."""
     exists = os.path.exists
 
-    def exists_elsewhere(path: Any) -> bool:
-        return (isinstance(path, int) or os.path.isabs(path)) and exists(path)
+    def absolute_path_exists(path: Any) -> bool:
+        is_relative = not isinstance(path, int) and not os.path.isabs(path)
+        return not is_relative and exists(path)
 
-    os.path.exists = exists_elsewhere
+    os.path.exists = absolute_path_exists
     try:
         yield
     finally:
         os.path.exists = exists
-    if "_config_fname" in vars(module):  # numba's, which it reads again
+    if "_config_fname" in vars(module):  # settings of numba, which are read again later
         vars(module)["_config_fname"] = os.devnull
 
 
 @contextmanager
-def _with_library_path_kept(_: ModuleType) -> Iterator[None]:
-    """Leave the places where the system looks for libraries as they were."""
-    before = os.environ.get(_LIBRARIES)
+def _with_unchanged_library_path(_: ModuleType) -> Iterator[None]:
+    """Restore the environment variable ``LD_LIBRARY_PATH`` after the import of a module."""
+    library_path = os.environ.get(_LIBRARIES)
     try:
         yield
     finally:
         os.environ.pop(_LIBRARIES, None)
-        if before is not None:
-            os.environ[_LIBRARIES] = before
+        if library_path is not None:
+            os.environ[_LIBRARIES] = library_path
 
 
 _SKLEARN = (
@@ -59,32 +65,36 @@ _SKLEARN = (
 
 
 class _DeferredModule(ModuleType):
-    """Stands for a module whose names are only called: each is looked up when it is called."""
+    """Placeholder of a module with functions and classes that are imported when they are called."""
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
         if name.startswith("__"):
             raise AttributeError(name)
-        return lambda *args, **options: getattr(import_module(self.__name__), name)(
-            *args, **options
-        )
+
+        def call(*args: Any, **options: Any) -> Any:
+            module = import_module(self.__name__)
+            function = getattr(module, name)
+            return function(*args, **options)
+
+        return call
 
 
 @contextmanager
-def _with_sklearn_deferred(_: ModuleType) -> Iterator[None]:
-    """Import scikit-learn only when a name is called that a module takes from it."""
+def _with_deferred_sklearn(_: ModuleType) -> Iterator[None]:
+    """Replace scikit-learn by placeholders during the import of a module that uses it."""
     if _SKLEARN[0] in sys.modules:
         yield
         return
-    deferred = {name: _DeferredModule(name) for name in _SKLEARN}
-    for name, module in deferred.items():
+    placeholders = {name: _DeferredModule(name) for name in _SKLEARN}
+    for name, placeholder in placeholders.items():
         if "." in name:
-            parent, child = name.rsplit(".", 1)
-            setattr(deferred[parent], child, module)
-    sys.modules.update(deferred)
+            parent, child = name.rsplit(".", maxsplit=1)
+            setattr(placeholders[parent], child, placeholder)
+    sys.modules.update(placeholders)
     try:
         yield
     finally:
-        for name in deferred:
+        for name in placeholders:
             del sys.modules[name]
 
 
@@ -92,23 +102,33 @@ _Guard = Callable[[ModuleType], AbstractContextManager[None]]
 _GUARDS: dict[str, _Guard] = {
     "matplotlib": _without_relative_files,
     "numba.core.config": _without_relative_files,
-    "cv2": _with_library_path_kept,
-    "mmdet.models.task_modules.tracking.interpolation": _with_sklearn_deferred,
-    "mmdet.models.dense_heads.paa_head": _with_sklearn_deferred,
+    "cv2": _with_unchanged_library_path,
+    "mmdet.models.task_modules.tracking.interpolation": _with_deferred_sklearn,
+    "mmdet.models.dense_heads.paa_head": _with_deferred_sklearn,
 }
 
 
 class SettingsGuard:
-    """Finds these libraries as Python does, and imports them guarded; first in ``sys.meta_path``.
+    """Import finder that imports the libraries of this module under a guard.
 
-    Libraries that were imported before ``gsmap`` stay as they are.
+    The first entry of ``sys.meta_path``. Libraries that were imported before ``gsmap`` are not
+    guarded.
     """
 
     @staticmethod
     def find_spec(
         name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """Return how the module ``name`` is imported, if it needs a guard."""
+        """Find a module that needs a guard.
+
+        Args:
+            name: Full name of the module.
+            path: Search path of the parent package; None for ``sys.path``.
+            target: Module to reload, or None.
+
+        Returns:
+            Specification with a guarded loader, or None for all other modules.
+        """
         if name not in _GUARDS:
             return None
         spec = PathFinder.find_spec(name, path, target)
@@ -118,18 +138,18 @@ class SettingsGuard:
 
 
 class _GuardedLoader(Loader):
-    """A loader that imports under a guard, and then gives its place to the one that it wraps."""
+    """Loader that runs a module under a guard and then restores the original loader."""
 
     def __init__(self, loader: Loader, guard: _Guard) -> None:
         self._loader = loader
         self._guard = guard
 
     def create_module(self, spec: ModuleSpec) -> ModuleType | None:
-        """Return what the wrapped loader does."""
+        """Create the module with the original loader."""
         return self._loader.create_module(spec)
 
     def exec_module(self, module: ModuleType) -> None:
-        """Run the module under its guard."""
+        """Run the code of the module under the guard."""
         module.__loader__ = self._loader
         if module.__spec__ is not None:
             module.__spec__.loader = self._loader

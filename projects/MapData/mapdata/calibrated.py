@@ -10,7 +10,7 @@ import numpy as np
 
 from gsmap.datasets.annotations.record import AnnotationMeta, MapSample
 from gsmap.datasets.errors import naming
-from gsmap.datasets.source import Mount, ground_from_frame, reframed
+from gsmap.datasets.source import Mount, change_frame, ground_from_frame
 from gsmap.utils.errors import InputError
 from mapdata.folders.images import read_vehicle
 from mapdata.folders.rig import RigCamera, RigFrame, rig_samples
@@ -116,7 +116,7 @@ def _in_frame(sample: MapSample, record: Mapping[str, Any], meta: AnnotationMeta
     else:
         mounted = replace(sample, ego_from_frame=np.asarray(mounting, np.float64))
         mount = Mount(meta.frame, ground_z_m, ground_from_frame(mounted, meta.frame, ground_z_m))
-    return reframed(sample, "ego", mount)
+    return change_frame(sample, "ego", mount)
 
 
 def _distortion(camera: RigCamera) -> dict[str, Any]:

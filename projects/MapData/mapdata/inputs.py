@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from gsmap.datasets.source import Source, annotated
+from gsmap.datasets.source import Source, open_annotations
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import is_hidden
 from mapdata.argoverse2.log import logs_in
@@ -54,7 +54,7 @@ def open_input(path: str | Path, options: InputOptions | None = None) -> Source:
     if path.is_dir():
         return _open_folder(path, options)
     if path.suffix == ".arrow":
-        return annotated(path, options.data_root)
+        return open_annotations(path, options.data_root)
     if path.suffix == ".pkl":
         root = options.data_root or path.parent
         samples = read_info_file(path, root, options.allow_missing_cameras)

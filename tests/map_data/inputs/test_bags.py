@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from bag_cases import Recorder, options, record, starting_at_0
 
-from gsmap.datasets.source import ground_from_frame, reframed
+from gsmap.datasets.source import change_frame, ground_from_frame
 from gsmap.structures.elements import MapElements
 from gsmap.structures.rigid import invert_rigid
 from mapdata.bag_topics import camera_topics, parse_topics
@@ -23,8 +23,10 @@ def assert_recorded(source, drive, root):
     assert source.has_poses
     assert [s.timestamp_ns for s in source.samples] == [s.timestamp_ns for s in drive]
     # in ROS' static transforms a camera stands where it stood first, the vehicle's motion apart
-    nominal = reframed(reframed(drive[0], "lidar", "ego"), "ego", "lidar")
-    found = {camera.name: camera for camera in reframed(source.samples[0], "ego", "lidar").cameras}
+    nominal = change_frame(change_frame(drive[0], "lidar", "ego"), "ego", "lidar")
+    found = {
+        camera.name: camera for camera in change_frame(source.samples[0], "ego", "lidar").cameras
+    }
     assert set(found) == {camera.name for camera in drive[0].cameras}
     for camera in nominal.cameras:
         other = found[camera.name]
@@ -207,8 +209,8 @@ def test_a_calibration_file_stands_for_infos_and_transforms(drive, minicity_root
     assert not source.has_poses
     (sample,) = source.samples
     assert {camera.name for camera in sample.cameras} == set(cameras)
-    found = {camera.name: camera for camera in reframed(sample, "ego", "lidar").cameras}
-    for camera in reframed(reframed(drive[0], "lidar", "ego"), "ego", "lidar").cameras:
+    found = {camera.name: camera for camera in change_frame(sample, "ego", "lidar").cameras}
+    for camera in change_frame(change_frame(drive[0], "lidar", "ego"), "ego", "lidar").cameras:
         other = found["rear" if camera.name == "CAM_BACK" else camera.name]
         np.testing.assert_allclose(other.intrinsics, camera.intrinsics)
         np.testing.assert_allclose(other.cam_from_frame, camera.cam_from_frame, atol=1e-6)

@@ -12,7 +12,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from gsmap.datasets.annotations.file import AnnotationFile
-from gsmap.datasets.source import ground_from_frame, reframed
+from gsmap.datasets.source import change_frame, ground_from_frame
 from gsmap.structures.frames import FRAME_VIEWS
 from gsmap.structures.rigid import invert_rigid
 from mapdata.argoverse2.log import Argoverse2Log
@@ -54,8 +54,8 @@ def test_a_nuscenes_root_gives_the_samples_of_its_annotation_files(minicity_root
 
 def test_another_frame_sees_the_same_cameras_and_ground(town):
     sample = next(iter(town.values()))
-    ego = reframed(sample, "lidar", "ego")
-    back = reframed(ego, "ego", "lidar")
+    ego = change_frame(sample, "lidar", "ego")
+    back = change_frame(ego, "ego", "lidar")
     assert ego.instances is None
     spot = np.array([7.0, 2.0, 0.0, 1.0])  # on the ground, ahead and to the left
     for frame, seen in (("lidar", sample), ("ego", ego), ("lidar", back)):
@@ -133,12 +133,12 @@ def test_a_folder_of_images_gives_the_cameras_that_its_calibration_says(
     assert not source.has_poses
     assert [s.timestamp_ns for s in source.samples] == [0, 10**8]
     assert source.samples[1].cameras[0].path == "CAM_FRONT/001.jpg"
-    same_cameras(reframed(source.samples[1], "ego", "lidar"), reframed_nominal(samples[1]))
+    same_cameras(change_frame(source.samples[1], "ego", "lidar"), reframed_nominal(samples[1]))
 
 
 def reframed_nominal(sample):
     """Return a sample in the nominal LiDAR frame instead of its own."""
-    return reframed(reframed(sample, "lidar", "ego"), "ego", "lidar")
+    return change_frame(change_frame(sample, "lidar", "ego"), "ego", "lidar")
 
 
 def test_angles_times_and_poses_of_a_folder(tmp_path):

@@ -11,7 +11,7 @@ from mmengine.config import Config
 from gsmap.checkpoints.building import building
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta, MapSample
-from gsmap.datasets.source import Mount, Source, reframed
+from gsmap.datasets.source import Mount, Source, change_frame
 
 if TYPE_CHECKING:
     from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
@@ -47,7 +47,7 @@ def open_dataset(
         ann_file = samples.path
     else:
         samples = [
-            reframed(sample, source.frame, wanted=mount, ground_z_m=source.ground_z_m)
+            change_frame(sample, source.frame, wanted=mount, ground_z_m=source.ground_z_m)
             for sample in samples
         ]
         meta = _annotation_meta(cfg, samples=samples, mount=mount, has_poses=source.has_poses)

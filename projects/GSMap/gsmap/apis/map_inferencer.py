@@ -31,7 +31,7 @@ from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import MapSample
 from gsmap.datasets.elements import elements_of_predictions
 from gsmap.datasets.memory import Cameras
-from gsmap.datasets.source import Source, annotated
+from gsmap.datasets.source import Source, open_annotations
 from gsmap.evaluation.core.results_json import vectors_of
 from gsmap.structures.elements import MapElements
 from gsmap.utils.errors import InputError
@@ -205,7 +205,7 @@ class MapInferencer:
         root = None if data_root is None else Path(data_root)
         mount = self.model.mount
         if isinstance(source, str | Path):
-            source = annotated(source, root)
+            source = open_annotations(source, root)
         if isinstance(source, Source):
             self._warn_about_real_images(source)
         else:

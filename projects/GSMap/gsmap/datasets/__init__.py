@@ -1,4 +1,4 @@
-"""Annotation files, the data set, its transforms and samplers."""
+"""Annotation files, data set, transforms and samplers."""
 
 from gsmap.utils.lazy import lazy_names
 

@@ -1,4 +1,4 @@
-"""``MapElements`` out of the records and fields that hold a sample's map."""
+"""Conversion of map annotations and predictions to ``MapElements``."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -11,42 +11,72 @@ from gsmap.structures.elements import MapElements
 
 
 def _array(values: Any) -> npt.NDArray[Any]:
-    """Return a tensor on any device, or an array-like, as an array."""
-    return np.asarray(values.detach().cpu() if hasattr(values, "detach") else values)
+    """Convert a tensor on any device, or an array-like, to an array."""
+    if hasattr(values, "detach"):
+        values = values.detach().cpu()
+    return np.asarray(values)
 
 
 def _polylines(instances: Any) -> Any:
-    """Return ``pts`` (N, P, 2), of each the first ``num_pts`` (N,) if they differ in number."""
+    """Return ``pts`` (N, P, 2), or the first ``num_pts`` points of each element if it has them."""
     points = _array(instances["pts"])
     if "num_pts" not in instances:
         return points
-    return [
-        line[:number] for line, number in zip(points, _array(instances["num_pts"]), strict=True)
-    ]
+    polylines = []
+    for line, num_points in zip(points, _array(instances["num_pts"]), strict=True):
+        polylines.append(line[:num_points])
+    return polylines
 
 
 def elements_of_instances(instances: Sequence[MapInstance]) -> MapElements:
-    """Convert the ``instances`` of an annotation record."""
-    return MapElements.from_polylines([i.points for i in instances], [i.label for i in instances])
+    """Convert the ``instances`` of an annotation record to map elements."""
+    polylines = []
+    labels = []
+    for instance in instances:
+        polylines.append(instance.points)
+        labels.append(instance.label)
+    return MapElements.from_polylines(polylines, labels=labels)
 
 
 def elements_of_truth(info: Mapping[str, Any]) -> MapElements:
-    """Convert ``eval_ann_info``: ``polylines``, K x (n, 2 or 3) in metres, and ``labels`` (K,)."""
-    return MapElements.from_polylines([_array(p) for p in info["polylines"]], info["labels"])
+    """Convert the ground truth of a sample, ``eval_ann_info``, to map elements.
+
+    Args:
+        info: ``polylines`` in metres in the annotation frame, K x (n, 2 or 3), and ``labels`` (K,).
+    """
+    polylines = [_array(polyline) for polyline in info["polylines"]]
+    return MapElements.from_polylines(polylines, labels=info["labels"])
 
 
 def elements_of_targets(instances: Any) -> MapElements:
-    """Convert ``gt_instances_3d``: ``pts`` in metres (K, P, 2) and ``labels_3d`` (K,)."""
-    return MapElements.from_polylines(_polylines(instances), _array(instances["labels_3d"]))
+    """Convert the training targets of a sample, ``gt_instances_3d``, to map elements.
+
+    Args:
+        instances: ``pts`` in metres in the annotation frame (K, P, 2) and ``labels_3d`` (K,).
+    """
+    labels = _array(instances["labels_3d"])
+    return MapElements.from_polylines(_polylines(instances), labels=labels)
 
 
 def elements_of_predictions(instances: Any) -> MapElements:
-    """Convert ``pred_instances_3d``; ValueError if a point or a score is not finite.
+    """Convert the predictions of a sample, ``pred_instances_3d``, to map elements.
 
-    It has ``pts`` (N, P, 2) in metres, ``labels_3d`` (N,), ``scores_3d`` (N,), where elements have
-    points of any number ``num_pts`` (N,), and, where there are
-    Gaussians, ``scales`` (N, P, 2) in metres and ``rotations`` (N, P).
+    Args:
+        instances: ``pts`` in metres in the annotation frame (N, P, 2), ``labels_3d`` (N,) and
+            ``scores_3d`` (N,). If the elements have different numbers of points, also ``num_pts``
+            (N,). If the method predicts Gaussians, also ``scales`` in metres (N, P, 2) and
+            ``rotations`` in radians (N, P).
+
+    Raises:
+        ValueError: If a point or a score is not finite.
     """
-    labels, scores = (_array(instances[k]) for k in ("labels_3d", "scores_3d"))
-    gaussians = {k: _array(instances[k]) for k in ("scales", "rotations") if k in instances}
-    return MapElements.from_polylines(_polylines(instances), labels, scores, **gaussians)
+    gaussians = {}
+    for key in ("scales", "rotations"):
+        if key in instances:
+            gaussians[key] = _array(instances[key])
+    return MapElements.from_polylines(
+        _polylines(instances),
+        labels=_array(instances["labels_3d"]),
+        scores=_array(instances["scores_3d"]),
+        **gaussians,
+    )

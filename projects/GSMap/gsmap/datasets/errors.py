@@ -1,4 +1,4 @@
-"""What may be wrong with the files of a data set, said with their names."""
+"""Errors in the files of a data set, with the name of the file."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,14 +11,14 @@ from gsmap.utils.faults import is_of_the_machine
 
 
 class BrokenSampleError(InputError):
-    """A sample cannot be used because one of its files is missing, damaged or empty.
+    """Sample with a file that is missing, damaged or empty.
 
-    The data set raises it on, or skips and counts the sample, as its option ``broken_samples``
-    says.
+    With ``broken_samples="raise"``, the data set raises the error; with ``"skip"``, it skips and
+    counts the sample.
     """
 
 
-_UNEXPECTED = (
+_CONTENT_ERRORS = (
     LookupError, TypeError, ValueError, AttributeError, ArithmeticError, AssertionError,
     RecursionError, pa.ArrowException, shapely.errors.ShapelyError,
 )  # fmt: skip
@@ -26,22 +26,30 @@ _UNEXPECTED = (
 
 @contextmanager
 def naming(what: object, remedy: str) -> Iterator[None]:
-    """Say whose content is meant, and what to do, where reading it meets with something unexpected.
+    """Context manager that adds the name of a file and a remedy to errors about its content.
+
+    Errors of the system, such as a lack of memory, and errors with the name pass unchanged.
+
+    Args:
+        what: Path or name of the data, with which the message begins.
+        remedy: Advice to the user, with which the message ends.
 
     Raises:
-        ValueError: In place of what indexing, arithmetic or a parser raises in the block.
+        ValueError: In place of an error of indexing, arithmetic or a parser within the block.
     """
     try:
         yield
     except Exception as error:
-        expected = isinstance(error, _UNEXPECTED) or type(error) is Exception  # nuScenes' devkit
-        of_arrow = type(error) is OSError and error.errno is None
-        if is_of_the_machine(error) or not (expected or of_arrow) or str(what) in str(error):
+        from_devkit = type(error) is Exception  # nuScenes' devkit raises no subclass
+        from_arrow = type(error) is OSError and error.errno is None
+        about_content = isinstance(error, _CONTENT_ERRORS) or from_devkit or from_arrow
+        if is_of_the_machine(error) or not about_content or str(what) in str(error):
             raise
         reason = str(error)
         if isinstance(error, KeyError):
             reason = f"it has no {error}"
-        elif not isinstance(error, (ValueError, OSError)) and type(error) is not Exception:
+        elif not isinstance(error, (ValueError, OSError)) and not from_devkit:
             reason = f"{type(error).__name__}: {error}"
-        advice = "" if reason.rstrip(".").endswith(remedy) else f"; {remedy}"
-        raise InputError(f"{what} cannot be used: {reason.rstrip('.')}{advice}.") from error
+        reason = reason.rstrip(".")
+        advice = "" if reason.endswith(remedy) else f"; {remedy}"
+        raise InputError(f"{what} cannot be used: {reason}{advice}.") from error

@@ -1,4 +1,4 @@
-"""One frame whose images and calibration lie in memory."""
+"""Samples of one frame whose images and calibration are arrays in memory."""
 
 from collections.abc import Mapping, Sequence
 
@@ -15,14 +15,18 @@ Cameras = Mapping[str, np.ndarray] | Sequence[np.ndarray] | np.ndarray
 
 
 def bgr_by_name(images: Cameras) -> dict[str, np.ndarray]:
-    """Check images, and return them in the order of channels that the pipeline has.
+    """Check images and convert them from RGB to BGR.
 
     Args:
-        images: By the cameras' names, or as a list: RGB, uint8. each (H, W, 3)
+        images: RGB images by the name of the camera, or in a list, uint8. V x (H, W, 3)
+
+    Returns:
+        BGR images by the name of the camera; images of a list are named ``camera 0`` and so on.
+        V x (H, W, 3)
 
     Raises:
-        TypeError: If one is not uint8.
-        ValueError: If one has another shape.
+        TypeError: If an image is not uint8.
+        ValueError: If an image has another shape.
     """
     return {name: _bgr(name, image) for name, image in _by_name(images).items()}
 
@@ -34,57 +38,78 @@ def source_in_memory(
     frame: str,
     mount: Mount | None = None,
 ) -> Source:
-    """Make a sample of one frame.
+    """Create a source with one sample from images and calibration in memory.
 
     Args:
-        images: From `bgr_by_name`.
-        intrinsics: In the same form as those were, in pixels. each (3, 3)
-        cam_from_frame: In the same form, in metres. each (4, 4)
-        frame: ``vehicle`` (x ahead, y left, on the road below the rear axle), or an annotation
-            frame.
-        mount: Where that frame lies in the vehicle; None is the usual place.
+        images: BGR images by the name of the camera, from `bgr_by_name`. V x (H, W, 3)
+        intrinsics: Pinhole matrices in pixels, by name or in the order of the images. V x (3, 3)
+        cam_from_frame: Transforms from ``frame`` to the cameras in metres, by name or in the order
+            of the images. V x (4, 4)
+        frame: ``vehicle`` (x ahead, y left, on the road below the rear axle), ``lidar`` or ``ego``.
+        mount: Place of the frame in the vehicle; None for the usual place.
 
     Raises:
-        ValueError: If an array has another shape, a matrix is none of its kind, or the cameras of
-            the arguments differ.
+        ValueError: If an array has another shape, a matrix is not a valid calibration, or the
+            arguments have different cameras.
     """
-    rig = {"intrinsics": _by_name(intrinsics), "cam_from_frame": _by_name(cam_from_frame)}
-    names = list(images)
-    for what, values in rig.items():
-        if set(values) != set(names) or not names:
-            raise InputError(
-                f"{what} must have the cameras of images, {names}, got {list(values)}."
-            )
-    cameras = [
-        CameraRecord(
+    intrinsics = _by_name(intrinsics)
+    cam_from_frame = _by_name(cam_from_frame)
+    _require_cameras("intrinsics", values=intrinsics, names=list(images))
+    _require_cameras("cam_from_frame", values=cam_from_frame, names=list(images))
+    cameras = []
+    for name, image in images.items():
+        height, width = image.shape[:2]
+        camera = CameraRecord(
             name,
             path="in memory",
-            width=image.shape[1],
-            height=image.shape[0],
-            **{what: values[name] for what, values in rig.items()},
+            width=width,
+            height=height,
+            intrinsics=intrinsics[name],
+            cam_from_frame=cam_from_frame[name],
         )
-        for name, image in images.items()
-    ]
-    given = "ego" if frame == VEHICLE else frame
-    sample = MapSample("in memory", "", "", 0, cameras, np.eye(4))
-    check_samples([sample], AnnotationMeta("memory", given, "test"))
+        cameras.append(camera)
+    annotation_frame = "ego" if frame == VEHICLE else frame
+    sample = MapSample(
+        token="in memory",
+        scene="",
+        map_name="",
+        timestamp_ns=0,
+        cameras=cameras,
+        global_from_frame=np.eye(4),
+    )
+    check_samples([sample], AnnotationMeta("memory", frame=annotation_frame, split="test"))
     if frame == VEHICLE:
-        sample = sample_in_vehicle("in memory", "", 0, cameras, None)
+        sample = sample_in_vehicle(
+            "in memory", scene="", timestamp_ns=0, cameras=cameras, global_from_ground=None
+        )
     elif mount is not None:
         sample.ego_from_frame = mount.ego_from_frame
-    height = None if mount is None else mount.ground_z_m
-    return Source([sample], given, None, has_poses=False, ground_z_m=height)
+    return Source(
+        [sample],
+        frame=annotation_frame,
+        data_root=None,
+        has_poses=False,
+        ground_z_m=None if mount is None else mount.ground_z_m,
+    )
+
+
+def _require_cameras(argument: str, values: Mapping[str, np.ndarray], names: list[str]) -> None:
+    """Raise an error unless an argument has a value for each camera of the images."""
+    if set(values) != set(names) or not names:
+        raise InputError(
+            f"{argument} must have the cameras of images, {names}, got {list(values)}."
+        )
 
 
 def _by_name(values: Cameras) -> dict[str, np.ndarray]:
-    """Return arrays by the camera's name; those of a list are numbered."""
-    if isinstance(values, Mapping):
-        return {str(name): np.asarray(array) for name, array in values.items()}
-    return {f"camera {number}": np.asarray(array) for number, array in enumerate(values)}
+    """Return arrays by the name of the camera; arrays of a list get numbered names."""
+    if not isinstance(values, Mapping):
+        values = {f"camera {number}": array for number, array in enumerate(values)}
+    return {str(name): np.asarray(array) for name, array in values.items()}
 
 
 def _bgr(name: str, image: np.ndarray) -> np.ndarray:
-    """Check an image, and return it in BGR. (H, W, 3)"""
+    """Check an image and convert it from RGB to BGR. (H, W, 3)"""
     if image.dtype != np.uint8:
         raise InputTypeError(f"the image of {name!r} must be uint8, RGB, got {image.dtype}.")
     if image.ndim != 3 or image.shape[2] != 3 or not image.size:

@@ -1,4 +1,4 @@
-"""Samples of any origin, also seen from another annotation frame: another vehicle's data."""
+"""Samples of any origin, and their transformation to another annotation frame."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from gsmap.datasets.annotations.file import AnnotationFile
-from gsmap.datasets.annotations.record import MapSample
+from gsmap.datasets.annotations.record import CameraRecord, LidarRecord, MapSample
 from gsmap.structures.frames import frame_view
 from gsmap.structures.rigid import invert_rigid, rigid
 from gsmap.utils.errors import InputError
@@ -18,12 +18,13 @@ class Source:
     """Samples of one origin.
 
     Args:
-        samples: The samples.
-        frame: Their annotation frame, ``lidar`` or ``ego``.
-        data_root: Folder that image and LiDAR paths start from; None leaves it to the config.
-        has_poses: Whether the vehicle's pose is known.
-        notes: What the reader has to say.
-        ground_z_m: Height of the road in the frame, as in ``AnnotationMeta``.
+        samples: Samples.
+        frame: Annotation frame of the samples, ``lidar`` or ``ego``.
+        data_root: Folder that image and LiDAR paths are relative to; None for the folder in the
+            config.
+        has_poses: Whether the pose of the vehicle is known.
+        notes: Messages of the reader for the user.
+        ground_z_m: Height of the road in the frame in metres, as in ``AnnotationMeta``.
     """
 
     samples: Sequence[MapSample]
@@ -34,17 +35,17 @@ class Source:
     ground_z_m: float | None = None
 
 
-def annotated(path: str | Path, data_root: Path | None = None) -> Source:
+def open_annotations(path: str | Path, data_root: Path | None = None) -> Source:
     """Open an annotation file as a source.
 
     Args:
-        path: The file.
-        data_root: Folder that its paths start from; by default its own where its first image is
-            found from there.
+        path: Annotation file.
+        data_root: Folder that image and LiDAR paths are relative to. By default the folder of the
+            file if the first image exists there, else the folder in the config.
 
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: If it is no annotation file, or damaged.
+        ValueError: If the file is not an annotation file, or is damaged.
     """
     if Path(path).suffix != ".arrow":
         raise InputError(
@@ -53,22 +54,24 @@ def annotated(path: str | Path, data_root: Path | None = None) -> Source:
         )
     annotations = AnnotationFile(path)
     cameras = annotations[0].cameras if len(annotations) else []
-    if data_root is None and cameras and (annotations.path.parent / cameras[0].path).is_file():
-        data_root = annotations.path.parent
+    if data_root is None and cameras:
+        folder = annotations.path.parent
+        if (folder / cameras[0].path).is_file():
+            data_root = folder
     meta = annotations.meta
-    return Source(annotations, meta.frame, data_root, ground_z_m=meta.ground_z_m)
+    return Source(annotations, frame=meta.frame, data_root=data_root, ground_z_m=meta.ground_z_m)
 
 
-_SAME_M = 1e-3  # heights of the road that differ by less are one
+_HEIGHT_TOLERANCE_M = 1e-3
 
 
-def _raised(height_m: float) -> np.ndarray:
-    """Return the transform that adds a height. (4, 4)"""
-    return rigid(np.eye(3), (0, 0, height_m))
+def _shift_up(height_m: float) -> np.ndarray:
+    """Return the transform that adds a height to z. (4, 4)"""
+    return rigid(np.eye(3), translation=(0, 0, height_m))
 
 
-# From the annotation frame to the ground below the rear axle (x ahead, y left, z up), but for its
-# height, as data sets have it: nuScenes' roof LiDAR, and Argoverse 2's vehicle frame.
+# Transform from the annotation frame to (x ahead, y left, z up) above the rear axle, without the
+# height: the roof LiDAR of nuScenes and the vehicle frame of Argoverse 2. (4, 4)
 _NOMINAL = {
     "lidar": np.array([[0, 1, 0, 0.94], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]),
     "ego": np.eye(4),
@@ -76,43 +79,45 @@ _NOMINAL = {
 
 
 def usual_mount(frame: str, ground_z_m: float | None = None) -> np.ndarray:
-    """Return the transform from an annotation frame to the ground, of a level sensor.
+    """Return the transform from an annotation frame to the ground for a level sensor.
 
     Args:
-        frame: ``lidar``, whose sensor stands over the rear axle as nuScenes' does, or ``ego``.
-        ground_z_m: Height of the road in the frame, as in ``AnnotationMeta``.
+        frame: ``lidar``, a roof LiDAR mounted like in nuScenes, or ``ego``.
+        ground_z_m: Height of the road in the frame in metres, as in ``AnnotationMeta``.
 
     Returns:
-        To a frame with x ahead, y left, z up from the ground, in metres. (4, 4)
+        Transform in metres to the ground below the rear axle (x ahead, y left, z up). (4, 4)
     """
-    return _raised(-frame_view(frame, ground_z_m).ground[2]) @ _NOMINAL[frame]
+    road_z_m = frame_view(frame, ground_z_m).ground[2]
+    return _shift_up(-road_z_m) @ _NOMINAL[frame]
 
 
 def ground_from_frame(sample: MapSample, frame: str, ground_z_m: float | None = None) -> np.ndarray:
-    """Return the transform from a sample's annotation frame to the ground below the rear axle.
+    """Return the transform from the annotation frame of a sample to the ground.
 
     Args:
-        sample: The sample.
-        frame: Its annotation frame, ``lidar`` or ``ego``.
-        ground_z_m: Height of the road in the frame, as in ``AnnotationMeta``.
+        sample: Sample, whose ``ego_from_frame`` is the mounting of the sensor if it is known.
+        frame: Annotation frame of the sample, ``lidar`` or ``ego``.
+        ground_z_m: Height of the road in the frame in metres, as in ``AnnotationMeta``.
 
     Returns:
-        To a frame with x ahead, y left, z up from the ground, in metres. (4, 4)
+        Transform in metres to the ground below the rear axle (x ahead, y left, z up). (4, 4)
     """
     if sample.ego_from_frame is None:
         return usual_mount(frame, ground_z_m)
-    return _raised(-frame_view(frame, ground_z_m).ego_ground_z_m) @ sample.ego_from_frame
+    road_z_m = frame_view(frame, ground_z_m).ego_ground_z_m
+    return _shift_up(-road_z_m) @ sample.ego_from_frame
 
 
 @dataclass(frozen=True)
 class Mount:
-    """Where a model's annotation frame lies in the vehicle that it was trained on.
+    """Place of the annotation frame of a model in the vehicle that recorded the training data.
 
     Args:
-        frame: The frame, ``lidar`` or ``ego``.
-        ground_z_m: Height of the road in it, as in ``AnnotationMeta``.
-        ground_from_frame: From the frame to the ground below the rear axle (x ahead, y left, z up),
-            in metres; None is the usual one. (4, 4)
+        frame: Annotation frame, ``lidar`` or ``ego``.
+        ground_z_m: Height of the road in the frame in metres, as in ``AnnotationMeta``.
+        ground_from_frame: Transform in metres from the frame to the ground below the rear axle (x
+            ahead, y left, z up); None for the usual transform. (4, 4)
     """
 
     frame: str
@@ -121,63 +126,89 @@ class Mount:
 
     @property
     def matrix(self) -> np.ndarray:
-        """The transform from the frame to the ground. (4, 4)"""
+        """Transform from the frame to the ground in metres. (4, 4)"""
         if self.ground_from_frame is None:
             return usual_mount(self.frame, self.ground_z_m)
         return self.ground_from_frame
 
     @property
     def ego_from_frame(self) -> np.ndarray:
-        """The transform from the frame to the vehicle, as records have it. (4, 4)"""
-        return _raised(frame_view(self.frame, self.ground_z_m).ego_ground_z_m) @ self.matrix
+        """Transform from the frame to the vehicle in metres, as in ``MapSample``. (4, 4)"""
+        road_z_m = frame_view(self.frame, self.ground_z_m).ego_ground_z_m
+        return _shift_up(road_z_m) @ self.matrix
 
     def suits(self, frame: str, ground_z_m: float | None) -> bool:
-        """Whether samples of a frame, with the road at a height in it, are as the model's are.
+        """Test whether samples need no transformation for the model.
 
-        Two roof LiDARs are taken for one, and a height that is not known for the usual one.
+        All ``lidar`` frames suit each other. An unknown height of the road counts as the usual one.
+
+        Args:
+            frame: Annotation frame of the samples, ``lidar`` or ``ego``.
+            ground_z_m: Height of the road in the frame in metres, as in ``AnnotationMeta``.
         """
         if frame != self.frame:
             return False
-        heights = [frame_view(frame, z).ground[2] for z in (ground_z_m, self.ground_z_m)]
-        return frame == "lidar" or abs(heights[0] - heights[1]) < _SAME_M
+        if frame == "lidar":
+            return True
+        sample_road_z_m = frame_view(frame, ground_z_m).ground[2]
+        model_road_z_m = frame_view(frame, self.ground_z_m).ground[2]
+        return abs(sample_road_z_m - model_road_z_m) < _HEIGHT_TOLERANCE_M
 
 
-def reframed(
+def change_frame(
     sample: MapSample, frame: str, wanted: str | Mount, ground_z_m: float | None = None
 ) -> MapSample:
-    """Return a sample as it is seen from another annotation frame, without ground truth.
+    """Transform the calibration of a sample to another annotation frame.
 
-    The new frame lies in the vehicle as in the data that a model was trained on, so that cameras
-    and ground are where it expects them. A sample in a LiDAR's frame stays as it is where that kind
-    is wanted: two roof LiDARs are taken for one.
+    The new frame has the place in the vehicle that a model was trained with. If both frames are
+    ``lidar`` frames, the sample does not change: all roof LiDARs are treated as equal.
 
     Args:
-        sample: The sample.
-        frame: Its annotation frame.
-        wanted: The frame that the result has, with its place in the vehicle unless that is usual.
-        ground_z_m: Height of the road in the sample's frame, as in ``AnnotationMeta``.
+        sample: Sample.
+        frame: Annotation frame of the sample, ``lidar`` or ``ego``.
+        wanted: Annotation frame of the result, with the usual place in the vehicle for a name.
+        ground_z_m: Height of the road in ``frame`` in metres, as in ``AnnotationMeta``.
+
+    Returns:
+        Sample in the new frame, without ground truth; ``sample`` if it needs no transformation.
     """
     mount = Mount(wanted) if isinstance(wanted, str) else wanted
     if mount.suits(frame, ground_z_m):
         return sample
-    here = ground_from_frame(sample, frame, ground_z_m)
-    frame_from_new = invert_rigid(here) @ mount.matrix
-    cameras = [replace(c, cam_from_frame=c.cam_from_frame @ frame_from_new) for c in sample.cameras]
-    new_from_frame, lidar = invert_rigid(frame_from_new), sample.lidar
+    ground = ground_from_frame(sample, frame=frame, ground_z_m=ground_z_m)
+    frame_from_new = invert_rigid(ground) @ mount.matrix
+    lidar = sample.lidar
     if lidar is not None:
-        sweeps = [
-            replace(s, frame_from_lidar=new_from_frame @ s.frame_from_lidar) for s in lidar.sweeps
-        ]
-        pose = new_from_frame @ lidar.frame_from_lidar
-        lidar = replace(lidar, frame_from_lidar=pose, sweeps=sweeps)
+        lidar = _transform_lidar(lidar, new_from_frame=invert_rigid(frame_from_new))
     return replace(
         sample,
-        cameras=cameras,
+        cameras=_transform_cameras(sample.cameras, frame_from_new),
         lidar=lidar,
         global_from_frame=sample.global_from_frame @ frame_from_new,
         ego_from_frame=mount.ego_from_frame,
         instances=None,
     )
+
+
+def _transform_cameras(
+    cameras: Sequence[CameraRecord], frame_from_new: np.ndarray
+) -> list[CameraRecord]:
+    """Return cameras with extrinsics from a new frame, given the transform from it. (4, 4)"""
+    new_cameras = []
+    for camera in cameras:
+        cam_from_new = camera.cam_from_frame @ frame_from_new
+        new_cameras.append(replace(camera, cam_from_frame=cam_from_new))
+    return new_cameras
+
+
+def _transform_lidar(lidar: LidarRecord, new_from_frame: np.ndarray) -> LidarRecord:
+    """Return a LiDAR sweep, and its earlier ones, with transforms to a new frame. (4, 4)"""
+    sweeps = []
+    for sweep in lidar.sweeps:
+        new_from_lidar = new_from_frame @ sweep.frame_from_lidar
+        sweeps.append(replace(sweep, frame_from_lidar=new_from_lidar))
+    new_from_lidar = new_from_frame @ lidar.frame_from_lidar
+    return replace(lidar, frame_from_lidar=new_from_lidar, sweeps=sweeps)
 
 
 def sample_in_vehicle(
@@ -187,19 +218,24 @@ def sample_in_vehicle(
     cameras: list,
     global_from_ground: np.ndarray | None,
 ) -> MapSample:
-    """Make a sample from cameras on a vehicle, in the frame ``ego``.
+    """Create a sample in the frame ``ego`` from cameras on a vehicle.
 
     Args:
-        token: Unique name.
+        token: Unique name of the sample.
         scene: Name of the drive.
         timestamp_ns: Time in nanoseconds.
-        cameras: Cameras whose ``cam_from_frame`` starts from the ground below the vehicle (x
+        cameras: Cameras whose ``cam_from_frame`` starts from the ground below the rear axle (x
             ahead, y left, z up), in metres.
-        global_from_ground: Pose of that frame, or None. (4, 4)
+        global_from_ground: Pose of the ground frame in metres; None if it is not known. (4, 4)
     """
     ground_from_ego = usual_mount("ego")
-    pose = np.eye(4) if global_from_ground is None else global_from_ground
-    cameras = [replace(c, cam_from_frame=c.cam_from_frame @ ground_from_ego) for c in cameras]
+    global_from_ground = np.eye(4) if global_from_ground is None else global_from_ground
     return MapSample(
-        token, scene, "", timestamp_ns, cameras, pose @ ground_from_ego, ego_from_frame=np.eye(4)
+        token,
+        scene=scene,
+        map_name="",
+        timestamp_ns=timestamp_ns,
+        cameras=_transform_cameras(cameras, ground_from_ego),
+        global_from_frame=global_from_ground @ ground_from_ego,
+        ego_from_frame=np.eye(4),
     )
