@@ -12,7 +12,7 @@ from mmengine.config import Config
 from mmengine.registry import Registry, build_from_cfg
 
 from gsmap.utils.errors import GsmapError, InputError
-from gsmap.utils.faults import in_words, nearest, registered
+from gsmap.utils.faults import in_words, nearest, registry_names
 from gsmap.utils.shipped import shipped
 
 _BUILDER = build_from_cfg.__code__  # every registry calls it, also registries inside of classes
@@ -159,7 +159,7 @@ def _describe_fault(error: BaseException, parts: list[_Part]) -> str | None:
     absent = _ABSENT_TYPE.match(text)
     if absent is not None and parts[0].registry is not None:
         registry = parts[0].registry
-        close = nearest(absent[1], names=registered(registry))
+        close = nearest(absent[1], names=registry_names(registry))
         return f"there is no {registry.name} of type {absent[1]!r}{close or '.'}"
     subject = " of ".join(part.name for part in typed_parts) or "the run"
     if type(error) is ValueError:  # raised by the checks of a library's class

@@ -1,1 +1,1 @@
-"""How a run starts, saves and resumes: launch arguments, config checks, checkpoint safety."""
+"""Start, checkpoints and resumption of a run: arguments, config checks, hooks, optimizers."""

@@ -1,4 +1,4 @@
-"""Arguments that the commands share, without torch, so that ``--help`` is quick."""
+"""Command-line arguments that the commands share; free of torch, so that ``--help`` is quick."""
 
 import argparse
 from collections.abc import Sequence
@@ -9,25 +9,25 @@ from mmengine.config import DictAction
 
 
 def data_root_options(data_root: str | Path) -> dict[str, str]:
-    """Return the overrides, by dotted name, that take every split from one folder."""
+    """Return config overrides, by dotted name, that read every split from one folder."""
     splits = ("train", "val", "test")
     return {f"{split}_dataloader.dataset.data_root": str(data_root) for split in splits}
 
 
 class _OptionAction(argparse.Action):
-    """Turns an argument into overrides, which those of ``--cfg-options`` outdo."""
+    """Turn an argument into config overrides; ``--cfg-options`` takes precedence over them."""
 
     def __call__(
         self, parser: object, namespace: argparse.Namespace, values: Any, option: object = None
     ) -> None:
         setattr(namespace, self.dest, values)
-        given = getattr(namespace, "cfg_options", None) or {}
-        own = data_root_options(values) if self.dest == "data_root" else {self.dest: values}
-        namespace.cfg_options = {**own, **given}
+        overrides = data_root_options(values) if self.dest == "data_root" else {self.dest: values}
+        explicit_overrides = getattr(namespace, "cfg_options", None) or {}
+        namespace.cfg_options = {**overrides, **explicit_overrides}
 
 
 def add_config_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that go to `read_config` as ``cfg_options``."""
+    """Add the options that `read_config` takes as ``cfg_options``."""
     parser.add_argument(
         "--data-root",
         type=Path,
@@ -52,7 +52,7 @@ def add_config_options(parser: argparse.ArgumentParser) -> None:
 
 
 def parse_options(words: Sequence[str]) -> dict[str, Any]:
-    """Read overrides ``KEY=VALUE`` as ``--cfg-options`` does."""
+    """Parse overrides of the form ``KEY=VALUE`` as ``--cfg-options`` does."""
     parser = argparse.ArgumentParser()
     add_config_options(parser)
     return parser.parse_args(["--cfg-options", *words]).cfg_options

@@ -1,4 +1,4 @@
-"""Checkpoints that are whole or absent when written, and run no code when read."""
+"""Checkpoint hook with atomic writes, and loading that runs no code from a checkpoint."""
 
 import json
 import re
@@ -34,30 +34,36 @@ from gsmap.utils.split_lists import (
     require_same_list,
 )
 
-NEWEST = "last_checkpoint"  # file of a work folder, which mmengine opens as it stands
-VALIDATED = "last_validation"  # file of a work folder: the iteration validated last
+NEWEST = "last_checkpoint"  # file in a work folder, written by mmengine
+VALIDATED = "last_validation"  # file in a work folder: iteration of the latest validation
 
 
 @register_backend("atomic")
 class AtomicLocalBackend(LocalBackend):
-    """mmengine's local files, each written beside its place and then moved there in one step."""
+    """mmengine's backend for local files, with atomic writes."""
 
     def put(self, obj: bytes, filepath: str | Path) -> None:
-        """Write ``obj`` to ``filepath``; a reader sees the old file or the whole new one."""
-        write_bytes(filepath, obj)
+        """Write bytes to a file; a reader opens either the old file or the complete new one."""
+        write_bytes(filepath, content=obj)
 
     def put_text(self, obj: str, filepath: str | Path, encoding: str = "utf-8") -> None:
-        """Write text to ``filepath`` in one step."""
-        self.put(obj.encode(encoding), filepath)
+        """Write text to a file atomically.
+
+        Args:
+            obj: Text.
+            filepath: File to create or replace.
+            encoding: Encoding of the text.
+        """
+        self.put(obj.encode(encoding), filepath=filepath)
 
 
 def _metainfo(loader: Any) -> dict[str, Any]:
-    """Return what a data set says of itself; nothing if it is none of mmengine's."""
+    """Return the metadata of a loader's data set; empty for data sets without metadata."""
     return getattr(loader.dataset, "metainfo", {})
 
 
-def _tell_results(loop: Any, path: Path, meta: dict[str, Any]) -> None:
-    """Tell what writes results which checkpoint they are of, and how that was calibrated."""
+def _pass_model_facts(loop: Any, path: Path, meta: dict[str, Any]) -> None:
+    """Add the checkpoint's digest and calibration to the metadata that result files receive."""
     facts: dict[str, Any] = {CALIBRATION: calibration_of(meta)}
     if path.is_file():  # not an address
         facts[CHECKPOINT] = digest(path)
@@ -66,15 +72,22 @@ def _tell_results(loop: Any, path: Path, meta: dict[str, Any]) -> None:
 
 @HOOKS.register_module()
 class AtomicCheckpointHook(CheckpointHook):
-    """mmengine's hook, for runs that may be killed and for checkpoints from strangers.
+    """mmengine's hook, for runs that may be killed and for checkpoints from untrusted sources.
 
-    A run that is killed while it saves leaves the previous checkpoint as it was, so ``--resume``
-    always finds a whole one, and a validation that it missed is made up for on resuming. A
-    checkpoint holds the model's settings. What is loaded, fetched and resumed from is read with
-    torch's ``weights_only``, to which the hook names mmengine's own data when a run begins.
+    A run that is killed during a save keeps its previous checkpoint, so ``--resume`` always finds a
+    complete one. A validation that was due when the run stopped is run first on resumption. A
+    checkpoint holds the settings of its model. Checkpoints are loaded with ``weights_only`` of
+    torch; when a run begins, the hook allows the classes that mmengine stores in a checkpoint.
 
-    Data to score of another split than a model is or was trained on is refused (``ValueError``),
-    unless ``allow_other_split``: the training may hold its places.
+    By default, validation and test data of another split than the training data raise
+    ``ValueError``, because the training may have covered the same places.
+
+    Args:
+        backend_args: Arguments of the file backend, by default atomic writes to local files.
+        allow_other_split: Whether validation and test data may come from another split than the
+            training data.
+        *args: Positional arguments of ``CheckpointHook``.
+        **kwargs: Keyword arguments of ``CheckpointHook``.
     """
 
     def __init__(
@@ -88,57 +101,66 @@ class AtomicCheckpointHook(CheckpointHook):
         self.allow_other_split = allow_other_split
 
     def before_run(self, runner: Runner) -> None:
-        """Let torch read mmengine's checkpoints; mmengine reads one right after this."""
+        """Register the safe checkpoint loaders; mmengine loads a checkpoint after this call."""
         mmengine_checkpoint.load_url = load_published
-        register = CheckpointLoader.register_scheme
-        register(("torchvision://", "modelzoo://"), load_from_torchvision, force=True)
-        register("", load_from_file, force=True)
+        CheckpointLoader.register_scheme(
+            ("torchvision://", "modelzoo://"), loader=load_from_torchvision, force=True
+        )
+        CheckpointLoader.register_scheme("", loader=load_from_file, force=True)
         torch.serialization.add_safe_globals(mmengine_globals())
 
     def after_load_checkpoint(self, runner: Runner, checkpoint: dict) -> None:
-        """Drop the text that mmengine would run as a config; check and note the model's origin.
+        """Check a loaded checkpoint, and adapt it to the run in place.
 
-        Weights that another training loop wrapped are put where mmengine looks for them. Of a run
-        that goes on, the optimizer's state is fitted to its groups of parameters.
+        The config text, which mmengine would execute, is removed. Weights from other training loops
+        are moved to ``state_dict``. On resumption, the optimizer state is converted to the
+        parameter groups of this run. The split and calibration of the checkpoint are passed to the
+        validation and test loops.
 
         Raises:
-            ValueError: If the run cannot go on from it, or it is of another split.
+            ValueError: If the run cannot be resumed from the checkpoint, or if the checkpoint was
+                trained on another split.
         """
+        source = runner._load_from
         if runner._resume:
-            check_resumable(checkpoint, runner, runner._load_from)
-        with refusing(runner._load_from):
+            check_resumable(checkpoint, runner=runner, path=source)
+        with refusing(source):
             state = unwrap(checkpoint).state
         if state.keys() != checkpoint.get("state_dict", {}).keys():
             checkpoint["state_dict"] = state
         meta = checkpoint.get("meta")
-        meta = meta if isinstance(meta, dict) else {}
+        if not isinstance(meta, dict):
+            meta = {}
         meta.pop("config", None)
         if "optimizer" in checkpoint and runner._resume:
             wrapper = runner.optim_wrapper
-            fit_optimizer_state(checkpoint, wrapper)
+            fit_optimizer_state(checkpoint, wrapper=wrapper)
             if isinstance(wrapper, OptimWrapper):
-                path = runner._load_from
-                with refusing_state(path):
-                    check_optimizer_state(checkpoint["optimizer"], wrapper.optimizer, path=path)
-        trained = meta.get("dataset_meta")
-        for loop in (runner._val_loop, runner._test_loop):
-            if isinstance(loop, BaseLoop) and isinstance(trained, dict):
-                self._check_split(trained, loop)
+                with refusing_state(source):
+                    check_optimizer_state(
+                        checkpoint["optimizer"], optimizer=wrapper.optimizer, path=source
+                    )
+        trained_meta = meta.get("dataset_meta")
+        if isinstance(trained_meta, dict):
+            for loop in (runner._val_loop, runner._test_loop):
+                if isinstance(loop, BaseLoop):
+                    self._check_split(trained_meta, loop=loop)
         if isinstance(runner._test_loop, BaseLoop):
-            _tell_results(runner._test_loop, Path(str(runner._load_from)), meta)
+            _pass_model_facts(runner._test_loop, path=Path(str(source)), meta=meta)
 
     def before_save_checkpoint(self, runner: Runner, checkpoint: dict) -> None:
-        """Note the model's settings, the size of the scaled images, and if there are signals.
+        """Store the model's settings, the size of the scaled images and the presence of signals.
 
         Raises:
-            FloatingPointError: If a loss or a weight is not finite; such a checkpoint is of no use.
+            FloatingPointError: If a loss or a weight is not finite.
         """
         finish_checks(runner)
         state = checkpoint["state_dict"]
-        broken = [key for key, value in state.items() if not bool(value.isfinite().all())]
-        if broken:
+        nonfinite_keys = [key for key, value in state.items() if not bool(value.isfinite().all())]
+        if nonfinite_keys:
             raise NotFiniteError(
-                f"weights are NaN or infinite ({summarize_names(broken)}), so they are not saved."
+                f"weights are NaN or infinite ({summarize_names(nonfinite_keys)}), so they are not "
+                "saved."
             )
         settings = plain(runner.cfg.model.to_dict())
         checkpoint["meta"][MODEL_SETTINGS] = json.dumps(settings)
@@ -148,59 +170,75 @@ class AtomicCheckpointHook(CheckpointHook):
             checkpoint["meta"][SIGNALS] = dataset.has_signals()
 
     def _save_checkpoint_with_step(self, runner: Runner, step: int, meta: dict) -> None:
-        """Save a checkpoint; the file that tells of the newest is never written through a link."""
+        """Save a checkpoint; a link in place of `NEWEST` is replaced, not followed."""
         if runner.rank == 0:
             take_from_link(Path(runner.work_dir, NEWEST))
-        super()._save_checkpoint_with_step(runner, step, meta)
+        super()._save_checkpoint_with_step(runner, step=step, meta=meta)
 
-    def _check_split(self, trained: dict[str, Any], loop: Any) -> None:
-        """Refuse data of another split, and tell results what the model was trained on."""
-        scored = _metainfo(loop.dataloader)
-        if trained.get("dataset") != scored.get("dataset"):
+    def _check_split(self, trained_meta: dict[str, Any], loop: Any) -> None:
+        """Require that training and evaluation data have one split, and pass it to the results.
+
+        Data of another data set are not compared.
+        """
+        scored_meta = _metainfo(loop.dataloader)
+        if trained_meta.get("dataset") != scored_meta.get("dataset"):
             return
-        identity = checked_identity(trained.get(SPLIT_LIST))
+        identity = checked_identity(trained_meta.get(SPLIT_LIST))
         if not self.allow_other_split:
-            remedy = "--cfg-options default_hooks.checkpoint.allow_other_split=True"
-            require_same_list(identity, scored.get(SPLIT_LIST), "the model", remedy)
-        loop.evaluator.dataset_meta = scored | {TRAINED_ON: identity}
+            require_same_list(
+                model=identity,
+                data=scored_meta.get(SPLIT_LIST),
+                subject="the model",
+                remedy="--cfg-options default_hooks.checkpoint.allow_other_split=True",
+            )
+        loop.evaluator.dataset_meta = scored_meta | {TRAINED_ON: identity}
 
     def before_train(self, runner: Runner) -> None:
-        """Make up for the validation that was due when a run was cut off, then begin as ever."""
+        """Run a validation that was due when the run was interrupted, then start the training."""
         super().before_train(runner)
-        self._forget_others_best(runner)
+        self._forget_foreign_best(runner)
         if isinstance(runner.val_loop, BaseLoop):
-            self._check_split(_metainfo(runner.train_dataloader), runner.val_loop)
-        loop, marker = runner.train_loop, Path(runner.work_dir, VALIDATED)
-        by_epoch = isinstance(loop, EpochBasedTrainLoop)
-        done, end = (loop.epoch, loop.max_epochs) if by_epoch else (loop.iter, loop.max_iters)
-        due = done >= max(loop.val_begin, 1) and (done % loop.val_interval == 0 or done == end)
-        validated = marker.exists() and read_text(marker) == str(runner.iter)
-        if due and runner.val_loop is not None and not validated:
+            self._check_split(_metainfo(runner.train_dataloader), loop=runner.val_loop)
+        loop = runner.train_loop
+        if isinstance(loop, EpochBasedTrainLoop):
+            progress = loop.epoch
+            end = loop.max_epochs
+        else:
+            progress = loop.iter
+            end = loop.max_iters
+        is_due = progress >= max(loop.val_begin, 1) and (
+            progress % loop.val_interval == 0 or progress == end
+        )
+        marker = Path(runner.work_dir, VALIDATED)
+        is_validated = marker.exists() and read_text(marker) == str(runner.iter)
+        if is_due and runner.val_loop is not None and not is_validated:
             runner.logger.info("The run was cut off before its validation, which is made up for.")
             runner.val_loop.run()
 
-    def _forget_others_best(self, runner: Runner) -> None:
-        """Keep mmengine from removing, as the best before, a file that only a checkpoint names."""
+    def _forget_foreign_best(self, runner: Runner) -> None:
+        """Forget best checkpoints outside of the run's folder, so that mmengine deletes none."""
         folder = Path(self.out_dir).resolve()
-        if self._is_elsewhere(getattr(self, "best_ckpt_path", None), folder):
+        if self._is_foreign(getattr(self, "best_ckpt_path", None), folder=folder):
             self.best_ckpt_path = None
         paths = getattr(self, "best_ckpt_path_dict", {})
-        paths.update({name: None for name, p in paths.items() if self._is_elsewhere(p, folder)})
+        for name, path in paths.items():
+            if self._is_foreign(path, folder=folder):
+                paths[name] = None
 
     @staticmethod
-    def _is_elsewhere(path: Any, folder: Path) -> bool:
-        """Whether a path is none of a best checkpoint of a run's folder."""
+    def _is_foreign(path: Any, folder: Path) -> bool:
+        """Whether a path from a checkpoint is not a best checkpoint in the run's folder."""
         if not isinstance(path, str):
             return path is not None
         place = Path(path)
-        name = re.fullmatch(r"best_.+_\d+\.pth", place.name)
-        return not name or place.is_symlink() or place.resolve().parent != folder
+        is_best = re.fullmatch(r"best_.+_\d+\.pth", place.name)
+        return not is_best or place.is_symlink() or place.resolve().parent != folder
 
     def after_val_epoch(self, runner: Runner, metrics: dict[str, float] | None = None) -> None:
-        """Keep the best checkpoint and note which state was validated.
+        """Save the best checkpoint, and record the validated iteration.
 
         Raises:
-            ValueError: If the validation does not have the figure that ``save_best`` names.
+            ValueError: If the validation lacks the metric that ``save_best`` names.
         """
         for name in getattr(self, "key_indicators", ()):
             if metrics and name not in metrics:
@@ -208,6 +246,6 @@ class AtomicCheckpointHook(CheckpointHook):
                     f"default_hooks.checkpoint.save_best names {name!r}, which the validation does "
                     f"not measure; it has {', '.join(n for n in metrics if n.endswith('/mAP'))}."
                 )
-        super().after_val_epoch(runner, metrics)
+        super().after_val_epoch(runner, metrics=metrics)
         if runner.rank == 0:
-            write_text(Path(runner.work_dir, VALIDATED), str(runner.iter))
+            write_text(Path(runner.work_dir, VALIDATED), text=str(runner.iter))

@@ -1,4 +1,4 @@
-"""Mixed precision on a CPU, which mmengine's ``AmpOptimWrapper`` refuses."""
+"""Mixed precision on a CPU, which mmengine's ``AmpOptimWrapper`` does not support."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,14 +12,14 @@ from gsmap.engine.optimizers import MapOptimWrapper
 
 @OPTIM_WRAPPERS.register_module()
 class CPUAutocastOptimWrapper(MapOptimWrapper):
-    """Runs forward and losses under bfloat16 autocast of the CPU; weights stay float32.
+    """Runs forward pass and losses under bfloat16 autocast on a CPU; weights stay float32.
 
-    bfloat16 has the exponents of float32, so the loss needs no scale. Parts that need float32
-    (references, matching, losses, rendering) leave autocast themselves, as on a GPU.
+    bfloat16 has the exponent range of float32, so the loss needs no scaling. Parts that need
+    float32 (reference points, matching, losses, rendering) disable autocast, as on a GPU.
     """
 
     @contextmanager
     def optim_context(self, model: nn.Module) -> Iterator[None]:
-        """Enter autocast, and what ``OptimWrapper`` enters to accumulate gradients."""
-        with super().optim_context(model), torch.autocast("cpu", torch.bfloat16):
+        """Enter autocast and the context of ``OptimWrapper`` that accumulates gradients."""
+        with super().optim_context(model), torch.autocast("cpu", dtype=torch.bfloat16):
             yield

@@ -1,4 +1,4 @@
-"""Figures of iterations that stay on a GPU until someone looks at their history."""
+"""Training scalars that stay on a GPU until a log line or a checkpoint needs them."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,48 +12,52 @@ from mmengine.model import is_model_wrapper
 from mmengine.runner import Runner
 from torch import Tensor
 
-_MOST_ROWS = 1000  # that nobody has looked at
+_MAX_ROWS = 1000  # unread iterations
 
 
 class _Waiting:
-    """Figures on a device that histories have not read yet, the oldest first."""
+    """Queue of device values that have not been copied to their histories, oldest first."""
 
     def __init__(self) -> None:
         self.rows: list[tuple[Sequence[LateHistory], Tensor]] = []
 
     def add(self, histories: Sequence["LateHistory"], values: Tensor) -> None:
-        """Add a figure to each history. (len(histories),)"""
-        if len(self.rows) >= _MOST_ROWS:
+        """Queue one value for each history. (len(histories),)"""
+        if len(self.rows) >= _MAX_ROWS:
             self.read()
         self.rows.append((histories, values))
 
     def read(self) -> None:
-        """Read all figures in one copy, and let their histories have them."""
-        rows, self.rows = self.rows, []
+        """Copy all queued values to the CPU at once, and append them to their histories."""
+        rows = self.rows
+        self.rows = []
         if not rows:
             return
-        numbers = iter(torch.cat([values for _, values in rows]).tolist())
-        new: dict[int, tuple[LateHistory, list[float]]] = {}
+        numbers = torch.cat([values for _, values in rows]).tolist()
+        new_values: dict[LateHistory, list[float]] = {}
+        position = 0
         for histories, _ in rows:
             for history in histories:
-                new.setdefault(id(history), (history, []))[1].append(next(numbers))
-        for history, values in new.values():
+                new_values.setdefault(history, []).append(numbers[position])
+                position += 1
+        for history, values in new_values.items():
             history.extend(values)
 
 
 class LateHistory(HistoryBuffer):
-    """A history of one figure whose latest values are read from a device when they are wanted.
+    """History of one scalar that copies its latest values from the device on access.
 
-    It is copied and saved as mmengine's `HistoryBuffer`.
+    Copies and pickles are plain `HistoryBuffer` objects of mmengine.
 
     Args:
-        history: What there is so far.
-        waiting: Where its later values wait.
+        history: History of the previous iterations.
+        waiting: Queue that holds the later values.
     """
 
     def __init__(self, history: HistoryBuffer, waiting: _Waiting) -> None:
         self._waiting = waiting
-        super().__init__(*history.data, history.max_length)
+        values, counts = history.data
+        super().__init__(values, counts, max_length=history.max_length)
 
     @property
     def _log_history(self) -> Any:
@@ -74,52 +78,72 @@ class LateHistory(HistoryBuffer):
         self._counts = counts
 
     def extend(self, values: Sequence[float]) -> None:
-        """Add values, each of one iteration."""
-        self._values = np.append(self._values, values)[-self.max_length :]
-        self._counts = np.append(self._counts, [1] * len(values))[-self.max_length :]
+        """Append values, one per iteration."""
+        counts = [1] * len(values)
+        self._values = np.append(self._values, values=values)[-self.max_length :]
+        self._counts = np.append(self._counts, values=counts)[-self.max_length :]
 
     def __reduce__(self) -> Any:
-        return HistoryBuffer, (*self.data, self.max_length)
+        values, counts = self.data
+        return HistoryBuffer, (values, counts, self.max_length)
+
+
+def _waiting_values(scalars: Mapping[str, HistoryBuffer]) -> _Waiting:
+    """Return the queue that the histories of a message hub share, a new one if there is none."""
+    for history in scalars.values():
+        if isinstance(history, LateHistory):
+            return history._waiting
+    return _Waiting()
 
 
 def keep_figures(hub: MessageHub, figures: Mapping[str, Any]) -> None:
-    """Add figures of an iteration to the histories of a message hub.
+    """Append the scalars of one iteration to the histories of a message hub.
 
-    Figures on a GPU are not waited for: they are read together, once anyone reads a history.
+    Scalars on a GPU are not waited for. They are copied together on the next access to a history.
 
     Args:
-        hub: mmengine's message hub.
+        hub: Message hub of mmengine.
         figures: Scalars by name, tensors or numbers.
     """
     scalars = hub.log_scalars
-    late: dict[LateHistory, Tensor] = {}
-    waiting = next((h._waiting for h in scalars.values() if isinstance(h, LateHistory)), _Waiting())
+    waiting = _waiting_values(scalars)
+    histories: list[LateHistory] = []
+    values: list[Tensor] = []
     for name, value in figures.items():
         if not isinstance(value, Tensor) or value.device.type == "cpu" or name not in scalars:
             hub.update_scalar(name, value)
             continue
         history = scalars[name]
         if not isinstance(history, LateHistory):
-            history = scalars[name] = LateHistory(history, waiting)
-        late[history] = value.detach()
-    if late:
-        waiting.add(list(late), torch.stack([value.reshape(()) for value in late.values()]))
+            history = LateHistory(history, waiting=waiting)
+            scalars[name] = history
+        histories.append(history)
+        values.append(value.detach().reshape(()))
+    if histories:
+        waiting.add(histories, values=torch.stack(values))
 
 
 @HOOKS.register_module()
 class MapRuntimeInfoHook(RuntimeInfoHook):
-    """mmengine's hook, which on a GPU waits for no figure of an iteration until a line is logged.
+    """mmengine's hook without GPU synchronisation between log lines.
 
-    A loss that is not finite ends the run one iteration later there; what is still open at the end
-    of an epoch or of the training is checked then.
+    On a GPU, a loss that is not finite ends the run one iteration later. Losses that are still
+    unchecked at the end of an epoch or of the training are checked then.
     """
 
     def after_train_iter(
         self, runner: Runner, batch_idx: int, data_batch: Any = None, outputs: dict | None = None
     ) -> None:
-        """Keep the figures of an iteration."""
-        figures = {f"train/{name}": value for name, value in (outputs or {}).items()}
-        keep_figures(runner.message_hub, figures)
+        """Add the scalars of an iteration to the message hub.
+
+        Args:
+            runner: Runner of the training.
+            batch_idx: Index of the iteration within its epoch; not used.
+            data_batch: Batch of the iteration; not used.
+            outputs: Losses and other scalars of the iteration, by name.
+        """
+        scalars = {f"train/{name}": value for name, value in (outputs or {}).items()}
+        keep_figures(runner.message_hub, figures=scalars)
 
     def after_train_epoch(self, runner: Runner) -> None:
         """Check the losses of the last iteration."""

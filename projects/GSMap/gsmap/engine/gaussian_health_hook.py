@@ -1,30 +1,30 @@
-"""A warning when the Gaussians of a run die."""
+"""Warning when the Gaussians of a run collapse to their smallest size."""
 
 from mmdet3d.registry import HOOKS
 from mmengine.hooks import Hook
 from mmengine.runner import Runner
 
-_FIGURE = "train/at_floor"
-_WINDOW, _TOO_MANY = 50, 0.5
+_SCALAR = "train/at_floor"
+_WINDOW = 50  # iterations that the share is averaged over
+_LARGEST_SHARE = 0.5
 
 
 @HOOKS.register_module()
 class GaussianHealthHook(Hook):
-    """Warn after an epoch in which most Gaussians of matched predictions are at their smallest.
+    """Warns after an epoch in which most Gaussians of matched predictions have the smallest size.
 
-    GSMap's head logs ``at_floor``, the share of Gaussians whose sigmas both lie within 10 % of the
-    smallest; a model without Gaussians logs none, and the hook is silent.
-
-    The share is that of the latest 50 iterations, and half of all is too many.
+    GSMap's head logs ``at_floor``, the share of Gaussians whose two sigmas lie within 10 % of the
+    lower bound. The hook averages it over the latest 50 iterations and warns from a share of one
+    half. A model without Gaussians does not log it, and the hook does nothing.
     """
 
     def after_train_epoch(self, runner: Runner) -> None:
-        """Look at the latest iterations."""
-        history = runner.message_hub.log_scalars.get(_FIGURE)
+        """Check the latest iterations."""
+        history = runner.message_hub.log_scalars.get(_SCALAR)
         if history is None:
             return
         share = history.mean(_WINDOW)
-        if share >= _TOO_MANY:
+        if share >= _LARGEST_SHARE:
             runner.logger.warning(
                 f"{100 * share:.0f} % of the Gaussians of matched predictions are at their "
                 "smallest size: their masks are dots, which teach nothing. Use "

@@ -1,4 +1,4 @@
-"""What the tools share: reading a config, changing it, checking it, the work folder."""
+"""Reading, overriding and checking of configs, and the newest checkpoint of a work folder."""
 
 import argparse
 import errno
@@ -26,41 +26,48 @@ from gsmap.checkpoints.settings import pipeline_steps, scale_steps
 from gsmap.engine.rank_watch import TIMEOUT_S
 from gsmap.engine.targets import check_targets, class_of_type, share_settings
 from gsmap.utils.errors import InputError
-from gsmap.utils.faults import nearest, registered
+from gsmap.utils.faults import nearest, registry_names
 from gsmap.utils.files import DAMAGED_ZIP
 from gsmap.utils.parallel import LAUNCHER, die_with_parent
 
-# mmengine accepts a misspelt top-level key in silence: only these mean something.
-_COPIED = ("backend_args", "classes", "data_root", "grid", "vis_backends")  # read by no runner
-_OWN_KEYS = (
-    *_COPIED, "custom_imports", "find_unused_parameters", "model_wrapper_cfg", "runner_type",
+# Keys that configs copy into other sections; no code reads them at the top level
+_COPIED_KEYS = ("backend_args", "classes", "data_root", "grid", "vis_backends")
+# Top-level keys beside the runner's arguments; mmengine itself ignores a misspelt key
+_EXTRA_KEYS = (
+    *_COPIED_KEYS, "custom_imports", "find_unused_parameters", "model_wrapper_cfg", "runner_type",
     "images_on_device", "strategy", "sync_bn",
 )  # fmt: skip
-_MOST_WORKERS = 16
+_MAX_WORKERS = 16
+# Endings of the keys whose values must be dictionaries
 _SECTIONS = ("_cfg", "_dataloader", "default_hooks", "model", "optim_wrapper", "randomness")
 
 
 @cache
 def _known_keys() -> frozenset[str]:
-    """Return the top-level keys of a config; mmengine's runner is slow to import."""
+    """Return the valid top-level keys of a config."""
+    # this import is slow
     from mmengine.runner import Runner
 
-    return frozenset(inspect.signature(Runner).parameters) - {"cfg"} | set(_OWN_KEYS)
+    runner_keys = frozenset(inspect.signature(Runner).parameters) - {"cfg"}
+    return runner_keys | set(_EXTRA_KEYS)
 
 
 def read_config(config: str | Path | Config, cfg_options: dict | None = None) -> Config:
-    """Return a config with overrides applied, ready to build from.
+    """Read a config and apply overrides to it.
 
-    What it registers is imported, and its scope is made the default one.
+    Imports the modules that register the config's classes, and makes its scope the default scope.
 
     Args:
-        config: A config, by file or name (`find_config`), or a ``Config``, which is left as it is.
-        cfg_options: Overrides, by dotted name; ``image_scale`` is the factor of all images.
+        config: File or name of a config (`find_config`), or a ``Config``, which is copied.
+        cfg_options: Overrides by dotted name; ``image_scale`` is the scale of all images.
+
+    Returns:
+        The config, complete for building a runner or a model.
 
     Raises:
         FileNotFoundError: If there is no such file or model.
-        ValueError: If it cannot be read, has an unknown top-level key, or an override does not fit
-            or would change nothing.
+        ValueError: If the config cannot be read or has an unknown top-level key, or if an override
+            does not fit or has no effect.
     """
     if isinstance(config, Config):
         cfg = Config(config.to_dict())
@@ -71,11 +78,11 @@ def read_config(config: str | Path | Config, cfg_options: dict | None = None) ->
     options = dict(cfg_options or {})
     factor = options.pop("image_scale", None)
     for name in options:
-        _check_effect(cfg, name)
+        _check_effect(cfg, name=name)
     with reading_config(f"--cfg-options of {cfg.filename or 'a config'}"):
         cfg.merge_from_dict(options)
     if factor is not None:
-        _scale_images(cfg, factor)
+        _scale_images(cfg, factor=factor)
     _check_keys(cfg)
     _fit_loaders(cfg)
     with reading_config(f"custom_imports of {cfg.filename or 'a config'}"):
@@ -87,7 +94,7 @@ def read_config(config: str | Path | Config, cfg_options: dict | None = None) ->
 
 
 def _scale_images(cfg: Config, factor: float) -> None:
-    """Set the factor by which all pipelines of a config scale their images, in place.
+    """Set the image scale of all pipelines of a config, in place.
 
     Raises:
         ValueError: If no pipeline scales images.
@@ -100,22 +107,23 @@ def _scale_images(cfg: Config, factor: float) -> None:
 
 
 def _fit_loaders(cfg: Config) -> None:
-    """Fit the data loaders of a config to the machine, in place.
+    """Adapt the data loaders of a config to the machine, in place.
 
-    ``num_workers='cores'`` is the number of cores that a process has, at most 16. With
-    ``images_on_device``, images are copied to the device as they were decoded, from pinned memory,
-    and the steps of the pipelines on pixels run there.
+    ``num_workers='cores'`` becomes the number of cores per process, at most 16. With
+    ``images_on_device``, decoded images are copied to the device from pinned memory, and pixel
+    transforms run on the device.
 
     Raises:
-        ValueError: If a transform of another library reads the pixels before they are packed.
+        ValueError: If ``images_on_device`` is set and a transform reads the pixels on the host.
     """
     for part in ("train", "val", "test"):
         loader = cfg.get(f"{part}_dataloader")
         if not loader:
             continue
         if loader.get("num_workers") == "cores":
-            cores = len(os.sched_getaffinity(0)) // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
-            loader.num_workers = min(max(cores, 1), _MOST_WORKERS)
+            processes = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+            cores = len(os.sched_getaffinity(0)) // processes
+            loader.num_workers = min(max(cores, 1), _MAX_WORKERS)
         if not cfg.get("images_on_device"):
             continue
         loader.pin_memory = True
@@ -131,14 +139,20 @@ def _fit_loaders(cfg: Config) -> None:
 
 
 def load_config(args: argparse.Namespace) -> Config:
-    """Read ``args.config``, apply the command-line options to it, and check the result.
+    """Read the config of a command, apply the command-line options, and check the result.
 
-    The config's own values (``_name``) are left out: a run's log and config show what counts.
-    Without a GPU several processes talk through gloo, whatever the config says. Errors are those of
-    `read_config` and `check_config`.
+    Template values (``_name``) are removed, so that logs and dumped configs show only settings with
+    an effect. Without a GPU, several processes communicate through gloo, independent of the config.
+
+    Args:
+        args: Parsed arguments; ``config`` and the options of `add_common_arguments` are used.
+
+    Raises:
+        FileNotFoundError: As `read_config`.
+        ValueError: As `read_config` and `check_config`.
     """
     os.environ.setdefault("LOCAL_RANK", str(args.local_rank))
-    cfg = read_config(args.config, args.cfg_options)
+    cfg = read_config(args.config, cfg_options=args.cfg_options)
     cfg.launcher = args.launcher
     if args.work_dir:
         cfg.work_dir = args.work_dir
@@ -147,12 +161,13 @@ def load_config(args: argparse.Namespace) -> Config:
     check_config(cfg)
     for name in list(cfg):
         if name.startswith("_"):
-            cfg.pop(name)  # a config's own values have done their work
+            cfg.pop(name)
     if args.launcher == "pytorch":
-        # torchrun killed with SIGKILL cannot stop its ranks
-        die_with_parent(int(os.environ.pop(LAUNCHER, os.getppid())))
+        # torchrun cannot stop its ranks if it is killed with SIGKILL
+        launcher_process = int(os.environ.pop(LAUNCHER, os.getppid()))
+        die_with_parent(launcher_process)
     if args.launcher == "pytorch" and not torch.cuda.is_available():
-        # mmengine would choose a CUDA device first, and wrap the model with its number
+        # mmengine would select a CUDA device, and pass its index to the wrapper of the model
         timeout = timedelta(seconds=rank_timeout_s(cfg))
         torch.distributed.init_process_group("gloo", timeout=timeout)
         cfg.model_wrapper_cfg = {
@@ -165,10 +180,10 @@ def load_config(args: argparse.Namespace) -> Config:
 
 
 def rank_timeout_s(cfg: Config) -> float:
-    """Return how long ranks wait for each other, in seconds.
+    """Return the timeout of collective operations, in seconds.
 
     Raises:
-        ValueError: If ``env_cfg.dist_cfg.timeout`` is no positive number.
+        ValueError: If ``env_cfg.dist_cfg.timeout`` is not a positive number.
     """
     timeout_s = cfg.get("env_cfg", {}).get("dist_cfg", {}).get("timeout", TIMEOUT_S)
     if not isinstance(timeout_s, int | float) or not timeout_s > 0:
@@ -181,14 +196,14 @@ def rank_timeout_s(cfg: Config) -> float:
 def newest_checkpoint(
     work_dir: str | Path, read: Callable[[Path], object] | None = None
 ) -> Path | None:
-    """Return the newest good checkpoint of a run; a warning names each one that is passed over.
+    """Find the newest valid checkpoint of a run; log a warning for each invalid one.
 
     Args:
         work_dir: Folder of the run.
-        read: Function that raises ``ValueError`` for a whole checkpoint that cannot be used.
+        read: Function that raises ``ValueError`` if an undamaged checkpoint cannot be used.
 
     Returns:
-        The path of the checkpoint, None if there is no good one.
+        Path of the checkpoint, or None if there is no valid one.
     """
     numbers: dict[Path, int] = {}
     for path in Path(work_dir).glob("*.pth"):
@@ -198,7 +213,7 @@ def newest_checkpoint(
     for path in sorted(numbers, key=numbers.__getitem__, reverse=True):
         reason = f"{path} is damaged and is passed over."
         try:
-            if _is_whole(path):
+            if _is_undamaged_zip(path):
                 if read is not None:
                     read(path)
                 return path
@@ -208,37 +223,41 @@ def newest_checkpoint(
     return None
 
 
-def _is_whole(path: Path) -> bool:
-    """Whether a file is a zip archive without damage."""
+def _is_undamaged_zip(path: Path) -> bool:
+    """Whether a file is a zip archive whose members have the right checksums."""
     try:
         with zipfile.ZipFile(path) as archive:
             return archive.testzip() is None
     except DAMAGED_ZIP:
         return False
     except OSError as error:
-        if error.errno != errno.EINVAL:  # a place before the file's beginning
+        if error.errno != errno.EINVAL:  # a damaged archive refers to a negative file position
             raise
         return False
 
 
 def check_config(cfg: Config) -> None:
-    """Refuse the mistakes in the values of a config that the config system lets through.
+    """Check the values of a config for mistakes that mmengine accepts without an error.
 
     Raises:
-        ValueError: If a learning-rate schedule ends at another epoch than the training, there is no
-            such optimizer or runner, the pipeline lacks a transform that the head needs, or a
-            loader tears the streams of a model with memory apart.
+        ValueError: If a learning-rate schedule and the training end at different epochs, if the
+            optimizer or runner does not exist, if the pipeline lacks a transform that the head
+            needs, or if a loader does not keep the frame order that a temporal model needs.
     """
     check_targets(cfg)
     _check_streams(cfg)
     _check_schedule(cfg)
-    optimizer = ((cfg.get("optim_wrapper") or {}).get("optimizer") or {}).get("type")
-    _check_registered(cfg, "optimizer", OPTIMIZERS, optimizer)  # mmengine goes on without it
-    _check_registered(cfg, "runner", RUNNERS, cfg.get("runner_type", "Runner"))
+    optimizer = (cfg.get("optim_wrapper") or {}).get("optimizer") or {}
+    # mmengine would build the run without an optimizer
+    _check_registered(
+        cfg, component="optimizer", registry=OPTIMIZERS, type_name=optimizer.get("type")
+    )
+    runner_type = cfg.get("runner_type", "Runner")
+    _check_registered(cfg, component="runner", registry=RUNNERS, type_name=runner_type)
 
 
 def _check_schedule(cfg: Config) -> None:
-    """Refuse a cosine schedule that ends at another epoch than the training."""
+    """Require that a cosine schedule and the training end at one epoch."""
     end = (cfg.get("train_cfg") or {}).get("max_epochs")
     if end is None:
         return
@@ -252,27 +271,40 @@ def _check_schedule(cfg: Config) -> None:
             )
 
 
-def _check_registered(cfg: Config, what: str, registry: Registry, kind: Any) -> None:
-    """Refuse a name of a class that a registry does not have."""
-    if isinstance(kind, str) and registry.get(kind) is None:
-        close = nearest(kind, registered(registry)) or "."
-        raise InputError(f"{cfg.filename}: there is no {what} of type {kind!r}{close}")
+def _check_registered(cfg: Config, component: str, registry: Registry, type_name: Any) -> None:
+    """Require that a class name of a config is in a registry.
+
+    Args:
+        cfg: Config that names the class.
+        component: Part of the run that the class implements, for the error.
+        registry: Registry of mmengine.
+        type_name: Name of the class; other values are not checked.
+
+    Raises:
+        ValueError: If the registry has no such class.
+    """
+    if isinstance(type_name, str) and registry.get(type_name) is None:
+        hint = nearest(type_name, names=registry_names(registry)) or "."
+        raise InputError(f"{cfg.filename}: there is no {component} of type {type_name!r}{hint}")
 
 
 def _check_effect(cfg: Config, name: str) -> None:
-    """Refuse an override of a config's own value, of which the other settings have copies."""
+    """Refuse an override of a template value, because other settings already hold copies of it."""
     top, *keys = name.split(".")
-    if not (top.startswith("_") or top in _COPIED):
+    if not (top.startswith("_") or top in _COPIED_KEYS):
         return
     value: Any = cfg.get(top)
     for key in keys:
         value = value.get(key) if isinstance(value, dict) else None
-    last = keys[-1] if keys else top.removeprefix("_")
+    last_key = keys[-1] if keys else top.removeprefix("_")
     if name == "data_root":
         copies = ["--data-root DIR"]
     else:
-        settings = {k: v for k, v in cfg.items() if k not in _COPIED and not k.startswith("_")}
-        copies = list(_places(settings, name=last, value=value, path=""))
+        settings = {}
+        for key, setting in cfg.items():
+            if key not in _COPIED_KEYS and not key.startswith("_"):
+                settings[key] = setting
+        copies = list(_find_copies(settings, key=last_key, value=value, prefix=""))
     remedy = f"give {', '.join(copies)}, or edit" if copies else "edit"
     raise InputError(
         f"--cfg-options {name} changes nothing: the other settings have copies of it, made when "
@@ -280,53 +312,67 @@ def _check_effect(cfg: Config, name: str) -> None:
     )
 
 
-def _places(settings: Any, name: str, value: Any, path: str) -> Iterator[str]:
-    """Yield where nested settings have a value under a name, by dotted name."""
+def _find_copies(settings: Any, key: str, value: Any, prefix: str) -> Iterator[str]:
+    """Yield the dotted names of the settings that have a key and a value.
+
+    Args:
+        settings: Nested dictionaries and lists.
+        key: Last part of the names.
+        value: Value of the settings.
+        prefix: Dotted name of ``settings``, with a final dot; empty at the top level.
+    """
     if isinstance(settings, list | tuple):
         settings = dict(enumerate(settings))
-    for key, inner in settings.items() if isinstance(settings, dict) else ():
-        if key == name and inner == value:
-            yield f"{path}{key}"
+    if not isinstance(settings, dict):
+        return
+    for inner_key, inner_value in settings.items():
+        if inner_key == key and inner_value == value:
+            yield f"{prefix}{inner_key}"
         else:
-            yield from _places(inner, name, value, f"{path}{key}.")
+            inner_prefix = f"{prefix}{inner_key}."
+            yield from _find_copies(inner_value, key=key, value=value, prefix=inner_prefix)
 
 
 def _check_keys(cfg: Config) -> None:
-    """Refuse top-level keys that no code reads, and sections that are no dictionaries."""
+    """Refuse unknown top-level keys, and sections that are not dictionaries."""
     for key, value in cfg.items():
-        known = key in _known_keys()
-        if known and key.endswith(_SECTIONS) and not isinstance(value, dict | None):
+        is_known = key in _known_keys()
+        if is_known and key.endswith(_SECTIONS) and not isinstance(value, dict | None):
             raise InputError(f"{cfg.filename}: {key} must be dict(...), got {value!r:.60}.")
-        if known or key.startswith("_"):
+        if is_known or key.startswith("_"):
             continue
-        hint = nearest(key, _known_keys()) or "; names of a config's own values start with '_'."
+        hint = nearest(key, names=_known_keys())
+        if not hint:
+            hint = "; names of a config's own values start with '_'."
         raise InputError(f"{cfg.filename}: unknown top-level key {key!r}{hint}")
 
 
 def _check_streams(cfg: Config) -> None:
-    """Refuse loaders that would not hand a model with memory the frames of each scene in order."""
+    """Require samplers that keep the frames of each scene in order if the model is temporal."""
     temporal = (cfg.get("model") or {}).get("temporal")
     if temporal is None:
         return
-    needed = dict.fromkeys(("val", "test"), "StreamTestSampler")
-    if temporal.get("bev") is not None or temporal.get("queries") is not None:
-        needed["train"] = "StreamTrainSampler"  # a memory of elements alone is not trained
-    for part, wanted in needed.items():
+    samplers = {"val": "StreamTestSampler", "test": "StreamTestSampler"}
+    has_trained_memory = temporal.get("bev") is not None or temporal.get("queries") is not None
+    if has_trained_memory:  # a memory of map elements alone is not trained
+        samplers["train"] = "StreamTrainSampler"
+    for part, needed_sampler in samplers.items():
         loader = cfg.get(f"{part}_dataloader") or {}
         sampler = loader.get("sampler") or {}
         kind = sampler.get("type")
-        found = class_of_type(kind, DATA_SAMPLERS) or object
-        bases = {base.__name__ for base in found.__mro__}
-        if loader and wanted not in bases:
+        sampler_class = class_of_type(kind, registry=DATA_SAMPLERS) or object
+        class_names = {base.__name__ for base in sampler_class.__mro__}
+        if loader and needed_sampler not in class_names:
             raise InputError(
                 f"{cfg.filename}: {part}_dataloader.sampler is {kind!r}, which tears scenes apart "
                 "(several ranks take turns with their frames), so model.temporal would remember "
-                f"other frames than the last: set its type to '{wanted}', or model.temporal=None."
+                f"other frames than the last: set its type to '{needed_sampler}', or "
+                "model.temporal=None."
             )
         slots = sampler.get("slots")
-        size = loader.get("batch_size")
-        if part == "train" and slots != size:
+        batch_size = loader.get("batch_size")
+        if part == "train" and slots != batch_size:
             raise InputError(
-                f"{cfg.filename}: train_dataloader.batch_size is {size} and sampler.slots is "
+                f"{cfg.filename}: train_dataloader.batch_size is {batch_size} and sampler.slots is "
                 f"{slots}: a place of the batch is a stream, so set both to one number."
             )

@@ -1,38 +1,66 @@
-"""Log lines of evaluations that can be read."""
+"""Readable log lines of iterations and evaluations."""
 
 import re
 from typing import Any
 
 from mmdet3d.registry import LOG_PROCESSORS
-from mmengine.runner import LogProcessor
+from mmengine.runner import LogProcessor, Runner
 
-# Of an iteration: layers before the last, Gaussians, the time that loading takes
+# Iterations: losses of the layers before the last, Gaussian statistics, data loading time
 _MINOR = re.compile(r"d\d+\.|data_time:|at_floor:|[\w.]+/[\w.]+:")
-# All figures of MapMetric but the APs of classes and groups and their means
+# Evaluations: all metrics of MapMetric except APs of classes and groups and their means
 _DETAIL = re.compile(r"(.*/)?(chamfer|raster)/(?!.*\bm?AP:)")
 
 
 @LOG_PROCESSORS.register_module()
 class MapLogProcessor(LogProcessor):
-    """mmengine's log processor, whose lines name only the main figures.
+    """mmengine's log processor with log lines that name only the main metrics.
 
-    `MapMetric` has some 180 figures and logs its tables itself. Backends such as TensorBoard, JSON
-    logs and ``tools/test.py --metrics-out`` get all of them.
+    `MapMetric` computes some 180 metrics and logs its tables itself. Backends such as TensorBoard,
+    JSON logs and ``tools/test.py --metrics-out`` receive all of them.
     """
 
-    def get_log_after_iter(self, *args: Any, **kwargs: Any) -> tuple[dict[str, Any], str]:
-        """Return all figures of an iteration, and a log line with the last layer's losses alone."""
-        figures, line = super().get_log_after_iter(*args, **kwargs)
-        return figures, _without(line, _MINOR)
+    def get_log_after_iter(
+        self, runner: Runner, batch_idx: int, mode: str
+    ) -> tuple[dict[str, Any], str]:
+        """Format the log of an iteration.
 
-    def get_log_after_epoch(self, *args: Any, **kwargs: Any) -> tuple[dict[str, Any], str]:
-        """Return all figures of an evaluation, and the log line with the main ones."""
-        figures, line = super().get_log_after_epoch(*args, **kwargs)
-        return figures, _without(line, _DETAIL)
+        Args:
+            runner: Runner of the iteration.
+            batch_idx: Index of the iteration within its epoch.
+            mode: ``"train"``, ``"val"`` or ``"test"``.
+
+        Returns:
+            All scalars, and a log line with the losses of the last decoder layer only.
+        """
+        scalars, line = super().get_log_after_iter(runner, batch_idx=batch_idx, mode=mode)
+        return scalars, _remove_items(line, pattern=_MINOR)
+
+    def get_log_after_epoch(
+        self, runner: Runner, batch_idx: int, mode: str, with_non_scalar: bool = False
+    ) -> tuple[dict[str, Any], str]:
+        """Format the log of an evaluation.
+
+        Args:
+            runner: Runner of the evaluation.
+            batch_idx: Index of its last batch.
+            mode: ``"val"`` or ``"test"``.
+            with_non_scalar: Whether metrics that are not numbers are returned as well.
+
+        Returns:
+            All metrics, and a log line with the main ones.
+        """
+        metrics, line = super().get_log_after_epoch(
+            runner, batch_idx=batch_idx, mode=mode, with_non_scalar=with_non_scalar
+        )
+        return metrics, _remove_items(line, pattern=_DETAIL)
 
 
-def _without(line: str, minor: re.Pattern[str]) -> str:
-    """Leave figures out of a log line."""
+def _remove_items(line: str, pattern: re.Pattern[str]) -> str:
+    """Remove the items of a log line that match a pattern."""
     head, _, rest = line.partition("]  ")
-    items = [item for item in rest.split("  ") if item and not minor.match(item)]
-    return "  ".join([f"{head}]", *items])
+    parts = [f"{head}]"]
+    for item in rest.split("  "):
+        if item and not pattern.match(item):
+            parts.append(item)
+    return "  ".join(parts)

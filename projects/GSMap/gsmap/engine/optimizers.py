@@ -1,4 +1,4 @@
-"""Optimizers of few parameter groups, which read nothing from a GPU."""
+"""Optimizer wrappers with few parameter groups and without GPU synchronisation."""
 
 import inspect
 from collections.abc import Sequence
@@ -12,119 +12,153 @@ from torch import Tensor, nn
 from gsmap.engine.figures import keep_figures
 from gsmap.utils.errors import InputError
 
-_KERNELS = ("fused", "foreach")  # settings of a group that say how a step is computed
-_LISTS = ("base_values", "_last_value")  # of a scheduler's state, one value a group
+_KERNELS = ("fused", "foreach")  # settings of a group that choose the kernels of a step
+_SCHEDULER_LISTS = ("base_values", "_last_value")  # scheduler state with one value per group
 
 
 class _LateNorm(OptimWrapper):
-    """Keeps the norm of the gradients on their device until it is logged.
+    """Optimizer wrapper that keeps the gradient norm on its device until it is logged.
 
     Attributes:
-        members: Places of each group's parameters in the model; empty with one group of all.
+        members: Indices of each group's parameters in the order of the model; empty if the
+            parameters have not been regrouped.
     """
 
     members: Sequence[Sequence[int]] = ()
 
     def _clip_grad(self) -> None:
-        params = [p for group in self.optimizer.param_groups for p in group["params"]]
-        places = [place for group in self.members for place in group]
-        if places:  # in the model's order, in which the norms are summed
-            params = [
-                param for _, param in sorted(zip(places, params, strict=True), key=itemgetter(0))
-            ]
+        params: list[Tensor] = []
+        for group in self.optimizer.param_groups:
+            params.extend(group["params"])
+        model_indices: list[int] = []
+        for indices in self.members:
+            model_indices.extend(indices)
+        if model_indices:  # sum the norms in the order of the model
+            pairs = sorted(zip(model_indices, params, strict=True), key=itemgetter(0))
+            params = [param for _, param in pairs]
         params = [p for p in params if p.requires_grad and p.grad is not None]
-        if params:
-            norm = self.clip_func(params, **self.clip_grad_kwargs)
-            if norm is not None:  # clipped by value
-                keep_figures(self.message_hub, {f"train/{self.grad_name}": norm})
+        if not params:
+            return
+        norm = self.clip_func(params, **self.clip_grad_kwargs)
+        if norm is not None:  # clipping by value has no norm
+            keep_figures(self.message_hub, figures={f"train/{self.grad_name}": norm})
 
 
 @OPTIM_WRAPPERS.register_module()
 class MapOptimWrapper(_LateNorm):
-    """mmengine's `OptimWrapper`, which waits for nothing on a GPU.
+    """mmengine's `OptimWrapper` without GPU synchronisation.
 
-    There a loss that is not finite is found out one step later (`LossCheck`). A fused optimizer
-    leaves the weights as they are until then.
+    On a GPU, a loss that is not finite is detected one step later (`LossCheck`). Until then a fused
+    optimizer skips its steps, so the weights stay unchanged.
     """
 
-    _unfit: Tensor | None = None  # whether a loss since the last step is not finite
+    _has_nonfinite_loss: Tensor | None = None  # 1 if a loss since the last step is not finite
 
-    def update_params(self, loss: Tensor, *args: Any, **kwargs: Any) -> None:
-        """Compute gradients and, unless they are accumulated further, take a step."""
+    def update_params(
+        self, loss: Tensor, step_kwargs: dict | None = None, zero_kwargs: dict | None = None
+    ) -> None:
+        """Compute gradients and take a step once enough of them are accumulated.
+
+        Args:
+            loss: Loss of the iteration. ()
+            step_kwargs: Arguments of the optimizer's ``step``.
+            zero_kwargs: Arguments of the optimizer's ``zero_grad``.
+        """
         if loss.device.type != "cpu":
-            unfit = loss.detach().isfinite().logical_not().float()
-            self._unfit = unfit if self._unfit is None else self._unfit.maximum(unfit)
-        super().update_params(loss, *args, **kwargs)
+            is_nonfinite = loss.detach().isfinite().logical_not().float()
+            if self._has_nonfinite_loss is None:
+                self._has_nonfinite_loss = is_nonfinite
+            else:
+                self._has_nonfinite_loss = self._has_nonfinite_loss.maximum(is_nonfinite)
+        super().update_params(loss, step_kwargs=step_kwargs, zero_kwargs=zero_kwargs)
 
     def step(self, **kwargs: Any) -> None:
         """Clip the gradients and take a step."""
-        skipping = getattr(self.optimizer, "_step_supports_amp_scaling", False)
-        if skipping and self._unfit is not None:
-            self.optimizer.found_inf = self._unfit
+        can_skip_steps = getattr(self.optimizer, "_step_supports_amp_scaling", False)
+        if can_skip_steps and self._has_nonfinite_loss is not None:
+            self.optimizer.found_inf = self._has_nonfinite_loss
         super().step(**kwargs)
-        self._unfit = None
+        self._has_nonfinite_loss = None
         self.optimizer.__dict__.pop("found_inf", None)
 
 
 @OPTIM_WRAPPERS.register_module()
 class MapAmpOptimWrapper(_LateNorm, AmpOptimWrapper):
-    """mmengine's `AmpOptimWrapper`, which reads the norm of the gradients when it is logged."""
+    """mmengine's `AmpOptimWrapper`, which reads the gradient norm only when it is logged."""
 
 
 @OPTIM_WRAPPER_CONSTRUCTORS.register_module()
 class MergedGroupsConstructor(DefaultOptimWrapperConstructor):
     """mmengine's constructor, with one group for all parameters of equal settings.
 
-    mmengine makes a group of each parameter with ``paramwise_cfg``, and a GPU then takes hundreds
-    of steps, each of one parameter. ``fused_on_gpu=False`` in ``optim_wrapper`` keeps a step on a
-    GPU from being computed by one kernel; ``optimizer.fused`` has the last word.
+    With ``paramwise_cfg``, mmengine makes one group per parameter, and an optimizer step on a GPU
+    becomes hundreds of steps of one parameter each. On a GPU, a step is computed by a fused kernel
+    unless ``optim_wrapper`` has ``fused_on_gpu=False``. A value of ``optimizer.fused`` or
+    ``optimizer.foreach`` in the config is left as it is.
     """
 
     def __init__(self, optim_wrapper_cfg: dict, paramwise_cfg: dict | None = None) -> None:
-        super().__init__(optim_wrapper_cfg, paramwise_cfg)
+        super().__init__(optim_wrapper_cfg, paramwise_cfg=paramwise_cfg)
         self.fused_on_gpu = self.optim_wrapper_cfg.pop("fused_on_gpu", True)
         self._members: list[list[int]] = []
 
     def add_params(
         self, params: list[dict], module: nn.Module, prefix: str = "", is_dcn_module: Any = None
     ) -> None:
-        """Add the groups of a module's parameters; those of the whole model are merged."""
-        super().add_params(params, module, prefix, is_dcn_module)
+        """Add the parameter groups of a module, and merge equal groups at the end.
+
+        Args:
+            params: Parameter groups so far; changed in place.
+            module: Module whose parameters are added.
+            prefix: Dotted name of the module; empty for the whole model, whose groups are merged.
+            is_dcn_module: Whether the module lies in a deformable convolution.
+        """
+        super().add_params(params, module, prefix=prefix, is_dcn_module=is_dcn_module)
         if prefix:
             return
-        kinds: dict[str, list[int]] = {}
-        for number, group in enumerate(params):
-            settings = sorted((key, value) for key, value in group.items() if key != "params")
-            kinds.setdefault(repr(settings), []).append(number)
-        self._members = list(kinds.values())
-        merged = []
-        for numbers in self._members:
-            together = [param for number in numbers for param in params[number]["params"]]
-            merged.append({**params[numbers[0]], "params": together})
-        params[:] = merged
+        indices_by_settings: dict[str, list[int]] = {}
+        for index, group in enumerate(params):
+            settings = sorted(_group_settings(group).items())
+            indices_by_settings.setdefault(repr(settings), []).append(index)
+        self._members = list(indices_by_settings.values())
+        merged_groups = []
+        for indices in self._members:
+            group_params = []
+            for index in indices:
+                group_params.extend(params[index]["params"])
+            merged_groups.append({**params[indices[0]], "params": group_params})
+        params[:] = merged_groups
 
     def __call__(self, model: nn.Module) -> OptimWrapper:
-        """Build the optimizer of a model, and what wraps it."""
-        kind = self.optimizer_cfg["type"]
-        kind = OPTIMIZERS.get(kind) if isinstance(kind, str) else kind
-        takes = set(inspect.signature(kind).parameters)
+        """Build the optimizer of a model and its wrapper."""
+        optimizer_type = self.optimizer_cfg["type"]
+        if isinstance(optimizer_type, str):
+            optimizer_type = OPTIMIZERS.get(optimizer_type)
+        parameters = set(inspect.signature(optimizer_type).parameters)
+        free_parameters = parameters - set(self.optimizer_cfg)
         on_gpu = all(param.device.type != "cpu" for param in model.parameters())
-        if self.fused_on_gpu and on_gpu and set(_KERNELS) <= takes - set(self.optimizer_cfg):
+        if self.fused_on_gpu and on_gpu and set(_KERNELS) <= free_parameters:
             self.optimizer_cfg["fused"] = True
         wrapper = super().__call__(model)
         wrapper.members = self._members
         return wrapper
 
 
-def fit_optimizer_state(checkpoint: dict[str, Any], wrapper: Any) -> None:
-    """Fit a checkpoint's optimizer and schedulers, in place, to an optimizer of merged groups.
+def _group_settings(group: dict[str, Any]) -> dict[str, Any]:
+    """Return a parameter group without its parameters."""
+    return {name: value for name, value in group.items() if name != "params"}
 
-    A checkpoint may have a group of each parameter, as mmengine's constructor makes them; and it
-    may have been computed on another kind of device.
+
+def fit_optimizer_state(checkpoint: dict[str, Any], wrapper: Any) -> None:
+    """Convert the optimizer and scheduler states of a checkpoint to merged groups, in place.
+
+    The checkpoint may hold one group per parameter, as mmengine's constructor makes them. It may
+    also have been written on another kind of device, so the choice of kernels (fused, foreach)
+    comes from the optimizer of this run.
 
     Args:
-        checkpoint: A training's checkpoint, perhaps without an optimizer.
-        wrapper: What wraps the optimizer that is to go on, from `MergedGroupsConstructor`.
+        checkpoint: Checkpoint of a training, possibly without an optimizer.
+        wrapper: Wrapper of this run's optimizer, from `MergedGroupsConstructor`.
 
     Raises:
         ValueError: If parameters of one group had different settings.
@@ -133,43 +167,69 @@ def fit_optimizer_state(checkpoint: dict[str, Any], wrapper: Any) -> None:
     members: list[list[int]] | None = getattr(wrapper, "members", None)
     if members is None or not isinstance(state, dict) or "param_groups" not in state:
         return
-    numbers = [number for group in members for number in group]
     groups = state["param_groups"]
-    if len(groups) > len(members) and [len(g["params"]) for g in groups] == [1] * len(numbers):
-        state["param_groups"] = _merged(groups, members)
-        old = state["state"]
-        state["state"] = {new: old[number] for new, number in enumerate(numbers) if number in old}
-        kept = len(wrapper.param_groups) - len(members)  # mmengine's base settings
-        if not kept:
+    param_count = sum(len(indices) for indices in members)
+    group_sizes = [len(group["params"]) for group in groups]
+    if len(groups) > len(members) and group_sizes == [1] * param_count:
+        _merge_state(state, members=members)
+        # mmengine appends a group with its base settings
+        extra_groups = len(wrapper.param_groups) - len(members)
+        if not extra_groups:
             state.pop("base_param_settings", None)
-        for scheduler in _schedulers(checkpoint.get("param_schedulers")):
-            for name in set(_LISTS) & set(scheduler):
+        for scheduler in _scheduler_states(checkpoint.get("param_schedulers")):
+            for name in _SCHEDULER_LISTS:
+                if name not in scheduler:
+                    continue
                 values = scheduler[name]
-                firsts = [values[group[0]] for group in members]
-                scheduler[name] = firsts + values[len(numbers) : len(numbers) + kept]
-    for group, own in zip(state["param_groups"], wrapper.optimizer.param_groups, strict=False):
-        group.update({name: own[name] for name in _KERNELS if name in own and name in group})
+                group_values = [values[indices[0]] for indices in members]
+                extra_values = values[param_count : param_count + extra_groups]
+                scheduler[name] = group_values + extra_values
+    run_groups = wrapper.optimizer.param_groups
+    for group, run_group in zip(state["param_groups"], run_groups, strict=False):
+        for name in _KERNELS:
+            if name in run_group and name in group:
+                group[name] = run_group[name]
 
 
-def _merged(groups: Sequence[dict], members: Sequence[Sequence[int]]) -> list[dict]:
-    """Return groups of several parameters from groups of one; all of one must be set alike."""
-    merged = []
-    first = 0
-    for numbers in members:
-        settings = [{k: v for k, v in groups[n].items() if k != "params"} for n in numbers]
-        if any(each != settings[0] for each in settings):
-            raise InputError(
-                "the checkpoint's parameter groups differ in settings that are equal in the "
-                "config: resume with the config that it was trained with, or start anew from it "
-                "(load_from=...)."
-            )
-        merged.append({**settings[0], "params": list(range(first, first + len(numbers)))})
-        first += len(numbers)
-    return merged
+def _merge_state(state: dict[str, Any], members: Sequence[Sequence[int]]) -> None:
+    """Merge an optimizer state of one group per parameter, in place.
+
+    Args:
+        state: State of the optimizer; parameters are renumbered in the order of the merged groups.
+        members: Indices of the former groups that each merged group replaces.
+
+    Raises:
+        ValueError: If groups with different settings would be merged.
+    """
+    groups = state["param_groups"]
+    param_states = state["state"]
+    merged_groups = []
+    merged_states = {}
+    next_param = 0
+    for indices in members:
+        settings = _group_settings(groups[indices[0]])
+        numbers = []
+        for index in indices:
+            if _group_settings(groups[index]) != settings:
+                raise InputError(
+                    "the checkpoint's parameter groups differ in settings that are equal in the "
+                    "config: resume with the config that it was trained with, or start anew from "
+                    "it (load_from=...)."
+                )
+            if index in param_states:
+                merged_states[next_param] = param_states[index]
+            numbers.append(next_param)
+            next_param += 1
+        merged_groups.append({**settings, "params": numbers})
+    state["param_groups"] = merged_groups
+    state["state"] = merged_states
 
 
-def _schedulers(states: Any) -> list[dict]:
-    """Return the states of schedulers, of one list or of one by parameter."""
-    if isinstance(states, dict):
-        return [state for each in states.values() for state in each]
-    return list(states or ())
+def _scheduler_states(states: Any) -> list[dict]:
+    """Return the states of schedulers from a list, or from a dictionary of lists."""
+    if not isinstance(states, dict):
+        return list(states or ())
+    flat_states = []
+    for group_states in states.values():
+        flat_states.extend(group_states)
+    return flat_states

@@ -1,24 +1,24 @@
-"""Training on a few samples until a model knows them by heart: the first test of new data."""
+"""Training on a few samples until a model reproduces them, the first test of a new data set."""
 
 from mmengine.config import Config
 
 from gsmap.utils.errors import InputError
 
-LOG_LINES = 10  # of the losses of a run
+LOG_LINES = 10  # loss lines of a run
 WARM_UP = 20  # iterations
 
 
 def overfit(cfg: Config, samples: int, iterations: int) -> None:
-    """Let a config train on the first samples of its training data alone, in place.
+    """Restrict a training config to the first samples of its training data, in place.
 
-    The run counts iterations, does not validate, writes one checkpoint at its end, and logs its
+    The run counts iterations, skips validation, writes one checkpoint at its end, and logs its
     losses about `LOG_LINES` times. The learning rate rises during the first `WARM_UP` iterations
-    and then stays.
+    and then stays constant.
 
     Args:
-        cfg: Config of a training, as `load_config` returns it.
+        cfg: Training config, as returned by `load_config`.
         samples: Number of samples, at least 1.
-        iterations: Length of the training, at least 1.
+        iterations: Number of training iterations, at least 1.
 
     Raises:
         ValueError: If a number is below 1, the training data are wrapped by another data set, or

@@ -1,4 +1,4 @@
-"""The end of a run of several ranks of which one no longer answers, in words that name it."""
+"""Detection of a rank that no longer answers; it ends the run with an error that names the rank."""
 
 import os
 import platform
@@ -8,38 +8,56 @@ import time
 from collections import Counter
 from contextlib import suppress
 from datetime import timedelta
+from typing import NamedTuple
 
 import torch.distributed as dist
 
 from gsmap.utils.cli import BAD_INPUT
 
-TIMEOUT_S = 1800.0  # where a config does not say env_cfg.dist_cfg.timeout
-_PATIENCE = 0.8  # share of the timeout after which a rank looks for who is missing
-_MISSED = 3  # beats after which a rank counts as silent
+TIMEOUT_S = 1800.0  # default of env_cfg.dist_cfg.timeout
+_PATIENCE = 0.8  # share of the timeout after which a rank without progress checks all ranks
+_MISSED_BEATS = 3  # heartbeats after which a rank counts as silent
+
+
+class _Report(NamedTuple):
+    """Latest heartbeat of a rank.
+
+    Attributes:
+        beats: Number of heartbeats, as text; empty if there was none.
+        steps: Number of hook calls that the rank has begun.
+        description: Process, machine and current hook, for messages.
+    """
+
+    beats: str
+    steps: int
+    description: str
 
 
 class RankWatch:
-    """Watches the ranks of a run, from a thread of each; a context manager.
+    """Context manager that watches the ranks of a run from a background thread in each rank.
 
-    Every rank tells the store of the run that it is there and how many steps it has taken. A rank
-    that has taken none for most of the timeout looks at what the others tell. It names those that
-    are silent or else furthest behind, and ends its process, before the operation that it waits in
-    ends with an error that names nobody.
+    Every rank writes a heartbeat and its number of steps to the distributed store of the run. A
+    rank that has made no step for most of the timeout reads the heartbeats of all ranks. If ranks
+    are silent, or else if ranks are behind the others, it names them and ends its process. This
+    comes before the pending collective operation times out with an error that names no rank.
 
     Args:
-        timeout_s: Time that an operation of all ranks may take, in seconds.
+        timeout_s: Time that a collective operation may take, in seconds.
     """
 
     def __init__(self, timeout_s: float) -> None:
         self._timeout_s = timeout_s
         self._beat_s = min(5.0, timeout_s / 40)
-        self._rank, self._ranks = dist.get_rank(), dist.get_world_size()
-        self._beats = self._steps = 0
+        self._rank = dist.get_rank()
+        self._ranks = dist.get_world_size()
+        self._beats = 0
+        self._steps = 0
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
 
     def __enter__(self) -> "RankWatch":
-        host, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
+        host = os.environ["MASTER_ADDR"]
+        port = int(os.environ["MASTER_PORT"])
         patience = timedelta(seconds=self._beat_s)
         store = dist.TCPStore(host, port, is_master=False, timeout=patience)
         start = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")
@@ -48,61 +66,86 @@ class RankWatch:
         self._thread.start()
         return self
 
-    def __exit__(self, *raised: object) -> None:
+    def __exit__(self, *exception: object) -> None:
         self._ended.set()
         self._thread.join()
 
     def step(self, name: str) -> None:
-        """Note that this rank goes on, and with what."""
-        self._moved_s = time.monotonic()
+        """Record that this rank begins a step of this name."""
+        self._step_start_s = time.monotonic()
         self._steps += 1
         self._name = name
 
     def _watch(self) -> None:
-        self._beat()  # a rank may hang before its first turn
+        self._beat()  # a rank may hang before the first wait ends
         while not self._ended.wait(self._beat_s):
             self._beat()
-            if time.monotonic() - self._moved_s > _PATIENCE * self._timeout_s:
-                self._judge()
+            if time.monotonic() - self._step_start_s > _PATIENCE * self._timeout_s:
+                self._end_if_stuck()
 
     def _beat(self) -> None:
-        """Tell that this rank is there, how far it is, and where it runs."""
+        """Write the heartbeat, the number of steps and the process of this rank to the store."""
         self._beats += 1
-        who = f"process {os.getpid()} on {platform.node()}, at {self._name}"
-        with suppress(RuntimeError):  # the store is silent: `_judge` will say so
-            self._store.set(f"{self._rank}", f"{self._beats} {self._steps} {who}")
+        description = f"process {os.getpid()} on {platform.node()}, at {self._name}"
+        with suppress(RuntimeError):  # the store does not answer: `_end_if_stuck` reports it
+            self._store.set(f"{self._rank}", f"{self._beats} {self._steps} {description}")
 
-    def _told(self) -> dict[int, list[str]]:
-        """Return what each rank has told last: its beats, its steps and who it is."""
-        told = {}
+    def _read_reports(self) -> dict[int, _Report]:
+        """Return the latest heartbeat of each rank.
+
+        If the store does not answer for this rank, the result holds rank 0 alone, whose machine
+        runs the store.
+        """
+        reports: dict[int, _Report] = {}
         for rank in (self._rank, *range(self._ranks)):
             try:
-                told[rank] = self._store.get(f"{rank}").decode().split(maxsplit=2)
+                text = self._store.get(f"{rank}").decode()
             except RuntimeError:  # no answer in time
-                told[rank] = ["", "0", "not begun"]
-                if rank == self._rank:  # the store itself is silent; rank 0 or its launcher has it
-                    return {0: told[rank]}
-        return told
+                missing = _Report(beats="", steps=0, description="not begun")
+                if rank == self._rank:
+                    return {0: missing}
+                reports[rank] = missing
+            else:
+                beats, steps, description = text.split(maxsplit=2)
+                reports[rank] = _Report(beats, steps=int(steps), description=description)
+        return reports
 
-    def _judge(self) -> None:
-        """End this process if the run does not go on, and name the rank that keeps it."""
-        steps, before = self._steps, self._told()
-        for _ in range(_MISSED):
+    def _end_if_stuck(self) -> None:
+        """End this process if it still makes no step, and name the ranks that it waits for."""
+        steps = self._steps
+        before = self._read_reports()
+        for _ in range(_MISSED_BEATS):
             self._ended.wait(self._beat_s)
             self._beat()
-        after = self._told()
+        after = self._read_reports()
         if self._steps != steps or self._ended.is_set():
             return
-        silent = [rank for rank in after if before.get(rank, [""])[0] == after[rank][0]]
-        count = Counter(int(told[1]) for told in after.values())
-        last = [rank for rank in after if len(count) > 1 and int(after[rank][1]) == min(count)]
-        who = " and ".join(f"rank {rank} ({after[rank][2]})" for rank in silent or last)
-        what = f"{who} does not {'answer' if silent else 'go on'}" if who else "no rank goes on"
+        wait_s = time.monotonic() - self._step_start_s
         text = (
-            f"{what}; this one has waited {time.monotonic() - self._moved_s:.0f} s "
+            f"{_missing_ranks(before=before, after=after)}; this one has waited {wait_s:.0f} s "
             f"(env_cfg.dist_cfg.timeout is {self._timeout_s:g}): see whether it is stopped, and "
             "what it reads."
         )
         sys.stderr.write(f"error: {text}\n")
         sys.stderr.flush()
         os._exit(BAD_INPUT)
+
+
+def _missing_ranks(before: dict[int, _Report], after: dict[int, _Report]) -> str:
+    """Describe the ranks without a new heartbeat, or else the ranks with the fewest steps."""
+    silent_ranks = []
+    for rank, report in after.items():
+        previous_beats = before[rank].beats if rank in before else ""
+        if previous_beats == report.beats:
+            silent_ranks.append(rank)
+    steps_count = Counter(report.steps for report in after.values())
+    last_ranks = []
+    if len(steps_count) > 1:
+        fewest_steps = min(steps_count)
+        last_ranks = [rank for rank, report in after.items() if report.steps == fewest_steps]
+    verb = "answer" if silent_ranks else "go on"
+    ranks = silent_ranks or last_ranks
+    if not ranks:
+        return "no rank goes on"
+    names = " and ".join(f"rank {rank} ({after[rank].description})" for rank in ranks)
+    return f"{names} does not {verb}"

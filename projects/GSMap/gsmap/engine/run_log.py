@@ -1,7 +1,7 @@
-"""A training log that opens with what matters, in a few lines."""
+"""Runner with a short training log, and a summary of the run at the start of the log."""
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from gsmap.utils.errors import NotFiniteError
 from gsmap.utils.files import naming_file, write_text
 from gsmap.utils.words import counted
 
-# How mmengine's long records begin, and those that say nothing about the run
+# Prefixes of mmengine's long log records and of records without information about the run
 _DUMPS = (
     "\n" + "-" * 60 + "\nSystem environment", "Config:\n", "Hooks will be executed", "Exp name: ",
     '"FileClient" will be', '"HardDiskBackend" is the alias', "Distributed training is not used",
@@ -33,72 +33,99 @@ _DUMPS = (
 
 
 def _lower_dumps(record: logging.LogRecord) -> bool:
-    """Give mmengine's dumps the level ``DEBUG``."""
+    """Set the level of mmengine's long records to ``DEBUG``; a filter that keeps all records."""
     if record.getMessage().startswith(_DUMPS):
-        record.levelno, record.levelname = logging.DEBUG, "DEBUG"
+        record.levelno = logging.DEBUG
+        record.levelname = "DEBUG"
     return True
 
 
 class MapRunner(Runner):
-    """mmengine's runner with a short log: environment, config and hooks only with ``DEBUG``.
+    """mmengine's runner with a short log: environment, config and hooks appear only in ``DEBUG``.
 
-    The whole config stands in the work folder in any case. A rank that does not answer ends a run
-    within ``env_cfg.dist_cfg.timeout``.
+    The complete config is written to the work folder at any log level. If a rank does not answer,
+    the run ends within ``env_cfg.dist_cfg.timeout`` (`RankWatch`).
     """
 
     _watch: RankWatch | None = None
 
     @master_only
     def dump_config(self) -> None:
-        """Write the whole config into the work folder, but never over the one that was read."""
+        """Write the complete config to the work folder, unless it would replace its source."""
         source = self.cfg.filename and Path(self.cfg.filename)
         target = Path(self.work_dir, source.name if source else f"{self.timestamp}.py")
         if source and target.exists() and source.exists() and target.samefile(source):
             self.logger.info(f"{target} stays as it is; the whole config is in {self.log_dir}.")
             return
-        write_text(target, self.cfg.dump())
+        write_text(target, text=self.cfg.dump())
 
-    def build_logger(self, *args: Any, **kwargs: Any) -> MMLogger:
-        """Build mmengine's logger, which tells its dumps only if ``log_level`` is ``DEBUG``."""
-        logger = super().build_logger(*args, **kwargs)
+    def build_logger(
+        self, log_level: int | str = "INFO", log_file: str | None = None, **kwargs: Any
+    ) -> MMLogger:
+        """Build mmengine's logger with its long records at level ``DEBUG``.
+
+        Args:
+            log_level: Lowest level of the records that are logged.
+            log_file: File of the log; None for the default place in the work folder.
+            **kwargs: Further arguments of ``MMLogger``.
+        """
+        logger = super().build_logger(log_level=log_level, log_file=log_file, **kwargs)
         logger.addFilter(_lower_dumps)
         return logger
 
     def train(self) -> nn.Module:
-        """Train; where losses or weights are no longer finite, say what to lower.
+        """Run the training.
 
         Raises:
-            FloatingPointError: If they are not.
+            FloatingPointError: If losses or weights become NaN or infinite; the message names
+                settings to lower.
         """
         try:
-            with naming_file(Path(self.work_dir)), self._watched():
+            with naming_file(Path(self.work_dir)), self._watch_ranks():
                 return super().train()
         except FloatingPointError as error:
-            raise NotFiniteError(f"{error} {_what_to_lower(self)}") from error
+            raise NotFiniteError(f"{error} {_divergence_advice(self)}") from error
 
     def test(self) -> dict:
-        """Test."""
-        with naming_file(Path(self.work_dir)), self._watched():
+        """Run the test loop and return its metrics."""
+        with naming_file(Path(self.work_dir)), self._watch_ranks():
             return super().test()
 
-    def resume(self, filename: str, *args: Any, **kwargs: Any) -> None:
-        """Go on from a checkpoint.
+    def resume(
+        self,
+        filename: str,
+        resume_optimizer: bool = True,
+        resume_param_scheduler: bool = True,
+        map_location: str | Callable = "default",
+    ) -> None:
+        """Load the state of a run from a checkpoint.
+
+        Args:
+            filename: File of the checkpoint.
+            resume_optimizer: Whether to load the state of the optimizer.
+            resume_param_scheduler: Whether to load the states of the schedulers.
+            map_location: Device of the loaded tensors, as in ``torch.load``.
 
         Raises:
-            ValueError: If its state does not fit.
+            ValueError: If the state does not fit this run.
         """
         with refusing_state(filename):
-            super().resume(filename, *args, **kwargs)
+            super().resume(
+                filename,
+                resume_optimizer=resume_optimizer,
+                resume_param_scheduler=resume_param_scheduler,
+                map_location=map_location,
+            )
 
     def call_hook(self, fn_name: str, **kwargs: Any) -> None:
-        """Call all hooks, and note that this rank goes on."""
+        """Call a method of all hooks, and report a step to `RankWatch`."""
         if self._watch:
             self._watch.step(f"{fn_name}, iteration {self.iter}")
         super().call_hook(fn_name, **kwargs)
 
     @contextmanager
-    def _watched(self) -> Iterator[None]:
-        """Watch for ranks that do not answer."""
+    def _watch_ranks(self) -> Iterator[None]:
+        """Context that ends the run if a rank does not answer; does nothing for a single rank."""
         if self.world_size == 1:
             yield
             return
@@ -106,57 +133,81 @@ class MapRunner(Runner):
             yield
 
 
-def _what_to_lower(runner: Runner) -> str:
-    """Say how to go on after a divergence; ``--resume`` keeps the learning rate."""
-    last = newest_checkpoint(runner.work_dir)
+def _divergence_advice(runner: Runner) -> str:
+    """Return advice after a divergence; ``--resume`` would keep the learning rate."""
+    checkpoint = newest_checkpoint(runner.work_dir)
+    if checkpoint:
+        start = "from its last good checkpoint"
+        load_from = f"load_from={checkpoint} "
+    else:
+        start = "again"
+        load_from = ""
     group = runner.optim_wrapper.param_groups[0]
-    amp = isinstance(runner.optim_wrapper, (AmpOptimWrapper, CPUAutocastOptimWrapper))
+    learning_rate = group.get("initial_lr", group["lr"])
+    uses_amp = isinstance(runner.optim_wrapper, (AmpOptimWrapper, CPUAutocastOptimWrapper))
+    amp_advice = " or without --amp" if uses_amp else ""
     return (
-        f"The training has diverged at iteration {runner.iter}: start it "
-        f"{'from its last good checkpoint' if last else 'again'} with a lower learning rate than "
-        f"{group.get('initial_lr', group['lr']):g}{' or without --amp' if amp else ''} (--work-dir "
-        f"NEW --cfg-options {f'load_from={last} ' if last else ''}optim_wrapper.optimizer.lr=...)."
+        f"The training has diverged at iteration {runner.iter}: start it {start} with a lower "
+        f"learning rate than {learning_rate:g}{amp_advice} (--work-dir NEW --cfg-options "
+        f"{load_from}optim_wrapper.optimizer.lr=...)."
     )
 
 
 @HOOKS.register_module()
 class RunSummaryHook(Hook):
-    """Logs what is trained, on what, for how long and where to, before the first iteration."""
+    """Logs model, data, length, device and output folder before the first iteration."""
 
     def before_train(self, runner: Runner) -> None:
-        """Log it."""
+        """Log the summary."""
         model = runner.model.module if is_model_wrapper(runner.model) else runner.model
-        sizes = [(p.numel(), p.requires_grad) for p in model.parameters()]
-        frozen = sum(size for size, trained in sizes if not trained)
-        note = f", {frozen / 1e6:.2f} M of them frozen" if frozen else ""
-        kind = f"{type(model).__name__} with {type(getattr(model, 'map_head', None)).__name__}"
-        start = runner._load_from or "the config's initial weights"
+        if runner.iter:
+            start = f"goes on after iteration {runner.iter}"
+        else:
+            source = runner._load_from or "the config's initial weights"
+            start = f"from {source}"
         device = next(model.parameters()).device
-        log_dir = getattr(runner, "log_dir", None) or runner._log_dir  # FlexibleRunner's is public
+        threads = counted(torch.get_num_threads(), noun="thread")
+        log_dir = getattr(runner, "log_dir", None) or runner._log_dir  # public in FlexibleRunner
         lines = {
-            "model": f"{kind}, {sum(size for size, _ in sizes) / 1e6:.2f} M parameters{note}",
-            "start": f"goes on after iteration {runner.iter}" if runner.iter else f"from {start}",
-            **_data(runner),
-            "length": _length(runner),
-            "runs on": f"{device}, {counted(torch.get_num_threads(), 'thread')}; "
-            f"torch {torch.__version__}, seed {runner.seed}",
+            "model": _describe_model(model),
+            "start": start,
+            **_describe_data(runner),
+            "length": _describe_length(runner),
+            "runs on": f"{device}, {threads}; torch {torch.__version__}, seed {runner.seed}",
             "writes to": f"{runner.work_dir} (checkpoints, the whole config), {log_dir}",
         }
         text = "".join(f"\n    {name:<12}{value}" for name, value in lines.items())
         runner.logger.info(f"This run{text}")
-        if missed := _missed_elements(runner, model):
-            runner.logger.warning(missed)
+        warning = _missed_elements(runner, model=model)
+        if warning:
+            runner.logger.warning(warning)
+
+
+def _describe_model(model: nn.Module) -> str:
+    """Return the classes of a model and its head, and the number of parameters in millions."""
+    total = 0
+    frozen = 0
+    for parameter in model.parameters():
+        total += parameter.numel()
+        if not parameter.requires_grad:
+            frozen += parameter.numel()
+    head = getattr(model, "map_head", None)
+    frozen_note = f", {frozen / 1e6:.2f} M of them frozen" if frozen else ""
+    return (
+        f"{type(model).__name__} with {type(head).__name__}, {total / 1e6:.2f} M "
+        f"parameters{frozen_note}"
+    )
 
 
 def innermost(dataset: Any) -> Any:
-    """Return the data set inside of wrappers, such as RepeatDataset."""
+    """Return the data set inside of wrappers such as ``RepeatDataset``."""
     while hasattr(dataset, "dataset"):
         dataset = dataset.dataset
     return dataset
 
 
-def _data(runner: Runner) -> dict[str, str]:
-    """Describe the data: how many samples, cameras, range and classes."""
+def _describe_data(runner: Runner) -> dict[str, str]:
+    """Return log lines with the number of samples, the cameras, the map range and the classes."""
     loaders = {"training": runner.train_dataloader}
     if runner.val_loop is not None:
         loaders["validation"] = runner.val_dataloader
@@ -164,53 +215,64 @@ def _data(runner: Runner) -> dict[str, str]:
     for name, loader in loaders.items():
         dataset = innermost(loader.dataset)
         file = getattr(dataset, "ann_file", type(dataset).__name__)
-        lines[name] = f"{counted(len(loader.dataset), 'sample')} of {file}"
+        lines[name] = f"{counted(len(loader.dataset), noun='sample')} of {file}"
     if not hasattr(dataset, "sample"):
         return lines
     cameras = dataset.sample(0).cameras
     names = dataset.cameras or [camera.name for camera in cameras]
     sizes = sorted({f"{camera.width} x {camera.height}" for camera in cameras})
     meta = dataset.metainfo
-    ranges = ("{} from {:g} to {:g} m".format(axis, *meta[f"{axis}_range"]) for axis in "xy")
+    x_min, x_max = meta["x_range"]
+    y_min, y_max = meta["y_range"]
     lines["cameras"] = f"{len(names)}, their files {' and '.join(sizes)}"
-    lines["map"] = f"{', '.join(ranges)}; {', '.join(meta['classes'])}"
+    lines["map"] = (
+        f"x from {x_min:g} to {x_max:g} m, y from {y_min:g} to {y_max:g} m; "
+        f"{', '.join(meta['classes'])}"
+    )
     lines["elements"] = f"up to {_element_counts(runner.train_dataloader).max()} in a sample"
     return lines
 
 
 def _element_counts(loader: Any) -> np.ndarray:
-    """Return the number of map elements of each sample, 0 where it is not known."""
+    """Return the number of map elements of each sample, 0 if unknown. (number of samples,)"""
     return np.maximum(innermost(loader.dataset).annotations.instance_counts(), 0)
 
 
 def _missed_elements(runner: Runner, model: Any) -> str | None:
-    """Say how many elements no query is left for; None if there are enough."""
+    """Return a warning if training samples have more elements than the model has queries."""
     groups = getattr(getattr(model, "map_head", None), "query_groups", None)
     if not groups or not hasattr(innermost(runner.train_dataloader.dataset), "annotations"):
         return None
-    counts, queries = _element_counts(runner.train_dataloader), groups[0].num
-    beyond = np.maximum(counts - queries, 0)
-    if not beyond.any():
+    counts = _element_counts(runner.train_dataloader)
+    queries = groups[0].num
+    excess = np.maximum(counts - queries, 0)
+    if not excess.any():
         return None
+    samples = counted(len(counts), noun="training sample")
     return (
-        f"{(beyond > 0).sum()} of {counted(len(counts), 'training sample')} have more elements (up "
-        f"to {counts.max()}) than the model has queries ({queries}): {beyond.sum()} elements can "
-        "never be found. Set model.map_head.query_groups=[dict(num=...)] to more (in the "
-        "template _queries), or take a smaller range."
+        f"{(excess > 0).sum()} of {samples} have more elements (up to {counts.max()}) than the "
+        f"model has queries ({queries}): {excess.sum()} elements can never be found. Set "
+        "model.map_head.query_groups=[dict(num=...)] to more (in the template _queries), or take "
+        "a smaller range."
     )
 
 
-def _length(runner: Runner) -> str:
-    """Say how long the run is and how often it is validated."""
-    loop, loader = runner.train_loop, runner.train_dataloader
-    by_epoch = isinstance(loop, EpochBasedTrainLoop)
-    text = f"{counted(loop.max_epochs, 'epoch')} of " if by_epoch else ""
-    iterations = len(loader) if by_epoch else loop.max_iters
-    unit = "epoch" if by_epoch else "iteration"
+def _describe_length(runner: Runner) -> str:
+    """Return the number of epochs and iterations, the batch size and the validation interval."""
+    loop = runner.train_loop
+    loader = runner.train_dataloader
+    if isinstance(loop, EpochBasedTrainLoop):
+        unit = "epoch"
+        length = (
+            f"{counted(loop.max_epochs, noun='epoch')} of {counted(len(loader), noun='iteration')}"
+        )
+    else:
+        unit = "iteration"
+        length = counted(loop.max_iters, noun="iteration")
     validation = "no validation"
     if runner.val_loop is not None:
-        validation = f"validation every {counted(loop.val_interval, unit)}"
+        validation = f"validation every {counted(loop.val_interval, noun=unit)}"
     return (
-        f"{text}{counted(iterations, 'iteration')}, {counted(loader.batch_size, 'sample')} x "
-        f"{counted(runner.world_size, 'process')} each; {validation}"
+        f"{length}, {counted(loader.batch_size, noun='sample')} x "
+        f"{counted(runner.world_size, noun='process')} each; {validation}"
     )

@@ -1,8 +1,7 @@
-"""Targets of a config: which transforms make them, and what these take from the head."""
+"""Training targets of a config: transforms that compute them, and settings shared with the head."""
 
 import inspect
 from collections.abc import Iterator
-from itertools import chain
 from typing import Any
 
 from mmdet3d.registry import MODELS, TRANSFORMS
@@ -14,133 +13,184 @@ from gsmap.utils.targets import NeedsTargets
 
 
 def share_settings(cfg: Config) -> None:
-    """Give the transforms that make the targets of a config's head its settings, in place.
+    """Copy settings of the head to the transforms that compute its targets, in place.
 
-    A setting that follows from one of the head (`NeedsTargets.target_settings`) has its source
-    there; a transform that names it keeps its value, which `check_targets` compares.
+    The settings to copy come from `NeedsTargets.target_settings`. A transform keeps a value that
+    the config gives explicitly; `check_targets` compares it with the head.
 
     Args:
-        cfg: The config.
+        cfg: Config to change.
     """
+    sections = [value for key, value in cfg.items() if key != "model"]
     for head in _heads(cfg):
-        wanted = _target_settings(head)
-        sections = [value for key, value in cfg.items() if key != "model"]
-        for step in _steps_of(sections, _needs(head.get("type")).transforms) if wanted else ():
-            known = _defaults(class_of_type(step["type"], TRANSFORMS))
-            step.update({k: v for k, v in wanted.items() if k in known and k not in step})
+        head_settings = _target_settings(head)
+        if not head_settings:
+            continue
+        for step in _find_steps(sections, names=_needs(head.get("type")).transforms):
+            transform = class_of_type(step["type"], registry=TRANSFORMS)
+            parameters = _defaults(transform)
+            for name, value in head_settings.items():
+                if name in parameters and name not in step:
+                    step[name] = value
 
 
 def _check_agreement(cfg: Config, steps: list[Any]) -> None:
-    """Refuse a transform that names another value of a setting than the head makes it."""
+    """Require transforms with the values that follow from the settings of the head."""
     for head in _heads(cfg):
-        wanted = _target_settings(head)
-        for step in _steps_of(steps, _needs(head.get("type")).transforms):
-            for name in wanted.keys() & step.keys():
-                if _plain(step[name]) != _plain(wanted[name]):
+        head_settings = _target_settings(head)
+        for step in _find_steps(steps, names=_needs(head.get("type")).transforms):
+            for name in head_settings.keys() & step.keys():
+                if _tuples_to_lists(step[name]) != _tuples_to_lists(head_settings[name]):
                     raise InputError(
                         f"{cfg.filename}: {name} of {step['type']} is {step[name]}, but that of "
-                        f"{head['type']} makes it {wanted[name]}: leave it out of the transform, "
-                        "which takes it from the head."
+                        f"{head['type']} makes it {head_settings[name]}: leave it out of the "
+                        "transform, which takes it from the head."
                     )
 
 
 def _target_settings(head: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings of transforms that follow from those of a head's config."""
-    kind = _needs(head.get("type"))
+    """Return the settings of transforms that follow from the config of a head."""
+    head_class = _needs(head.get("type"))
     try:
-        return kind.target_settings({**_defaults(kind), **head})
-    except (TypeError, ValueError):  # settings that the head refuses, in words, when it is built
+        return head_class.target_settings({**_defaults(head_class), **head})
+    except (TypeError, ValueError):  # invalid settings, which the head reports when it is built
         return {}
 
 
 def _heads(cfg: Config) -> list[dict[str, Any]]:
-    """Return the head of a config, and that of its first stage if it has two."""
+    """Return the head of a config, followed by the first-stage head of a two-stage model."""
     head = (cfg.get("model") or {}).get("map_head")
     if not isinstance(head, dict):
         return []
-    return [head, head["detector"]] if isinstance(head.get("detector"), dict) else [head]
+    if isinstance(head.get("detector"), dict):
+        return [head, head["detector"]]
+    return [head]
 
 
-def _steps_of(settings: Any, names: tuple[str, ...]) -> Iterator[dict[str, Any]]:
-    """Yield all steps of nested settings that are one of these transforms, or derive from one."""
+def _find_steps(settings: Any, names: tuple[str, ...]) -> Iterator[dict[str, Any]]:
+    """Yield the transforms in nested settings whose class or base class has one of the names."""
     if isinstance(settings, list | tuple):
-        for inner in settings:
-            yield from _steps_of(inner, names)
+        for item in settings:
+            yield from _find_steps(item, names=names)
     elif isinstance(settings, dict):
-        kind = class_of_type(settings.get("type"), TRANSFORMS)
-        if kind is not None and not {base.__name__ for base in kind.__mro__}.isdisjoint(names):
+        transform = class_of_type(settings.get("type"), registry=TRANSFORMS)
+        if transform is not None and not _class_names(transform).isdisjoint(names):
             yield settings
-        for inner in settings.values():
-            yield from _steps_of(inner, names)
+        for value in settings.values():
+            yield from _find_steps(value, names=names)
 
 
-def _defaults(kind: type | None) -> dict[str, Any]:
-    """Return the settings of a class that have defaults, those of its bases included."""
-    found: dict[str, Any] = {}
-    makers = [vars(base).get("__init__") for base in reversed(kind.__mro__ if kind else ())]
-    for maker in filter(None, makers):
-        for name, parameter in inspect.signature(maker).parameters.items():
+def _class_names(cls: type) -> set[str]:
+    """Return the names of a class and of all its base classes."""
+    return {base.__name__ for base in cls.__mro__}
+
+
+def _defaults(cls: type | None) -> dict[str, Any]:
+    """Return the default values of a class's constructor arguments, including its base classes."""
+    defaults: dict[str, Any] = {}
+    if cls is None:
+        return defaults
+    for base in reversed(cls.__mro__):
+        constructor = vars(base).get("__init__")
+        if constructor is None:
+            continue
+        for name, parameter in inspect.signature(constructor).parameters.items():
             if parameter.default is not parameter.empty:
-                found[name] = parameter.default
-    return found
+                defaults[name] = parameter.default
+    return defaults
 
 
-def _plain(value: Any) -> Any:
-    """Return a setting with lists in place of tuples."""
-    return [_plain(inner) for inner in value] if isinstance(value, list | tuple) else value
+def _tuples_to_lists(value: Any) -> Any:
+    """Convert tuples in a nested setting to lists."""
+    if isinstance(value, list | tuple):
+        return [_tuples_to_lists(item) for item in value]
+    return value
 
 
 def needed_targets(cfg: Config) -> dict[str, Any]:
-    """Return which transforms make the targets of a config's head and of its parts.
+    """Return the transforms that compute the targets of a config's head and its parts.
 
     Returns:
-        Names of transforms (``transforms`` of the classes), each with the type that needs it.
+        The type of the head, loss or auxiliary head that needs a transform, by the transform's
+        name.
     """
     heads = _heads(cfg)
-    lists = [own.get(name) for own in heads for name in ("losses", "aux_heads")]
-    parts = chain(heads, *(part for part in lists if isinstance(part, list)))
-    kinds = [part.get("type") for part in parts if isinstance(part, dict)]
-    return {name: kind for kind in kinds for name in _needs(kind).transforms}
+    parts: list[Any] = list(heads)
+    for head in heads:
+        for name in ("losses", "aux_heads"):
+            if isinstance(head.get(name), list):
+                parts.extend(head[name])
+    targets = {}
+    for part in parts:
+        if isinstance(part, dict):
+            part_type = part.get("type")
+            for transform in _needs(part_type).transforms:
+                targets[transform] = part_type
+    return targets
 
 
 def _needs(kind: Any) -> type[NeedsTargets]:
-    """Return the class of a part, for what it needs; a part of a stranger needs nothing."""
-    found = class_of_type(kind)
-    return found if found and issubclass(found, NeedsTargets) else NeedsTargets
+    """Return the class of a part if it declares its targets, else `NeedsTargets`."""
+    part_class = class_of_type(kind)
+    if part_class is not None and issubclass(part_class, NeedsTargets):
+        return part_class
+    return NeedsTargets
 
 
 def class_of_type(kind: Any, registry: Registry = MODELS) -> type | None:
-    """Return the class of a type, itself or its name; None if it names none."""
-    found = registry.get(kind) if isinstance(kind, str) else kind
-    return found if isinstance(found, type) else None
+    """Return the class that a ``type`` of a config names; None if there is no such class.
+
+    Args:
+        kind: Class, or name of a class.
+        registry: Registry of the names.
+    """
+    cls = registry.get(kind) if isinstance(kind, str) else kind
+    return cls if isinstance(cls, type) else None
 
 
 def check_targets(cfg: Config) -> None:
-    """Refuse a training pipeline without the transforms that `needed_targets` names."""
+    """Require a training pipeline with the transforms that `needed_targets` names.
+
+    Raises:
+        ValueError: If a transform is missing, or its settings contradict the head.
+    """
     dataset = (cfg.get("train_dataloader") or {}).get("dataset") or {}
     for steps in _pipelines(dataset):
-        made = [class_of_type(kind, TRANSFORMS) for kind in _step_types(steps)]
-        bases = {base.__name__ for kind in made for base in inspect.getmro(kind or object)}
+        transform_names: set[str] = set()
+        for kind in _step_types(steps):
+            transform = class_of_type(kind, registry=TRANSFORMS)
+            if transform is not None:
+                transform_names |= _class_names(transform)
         for name, kind in needed_targets(cfg).items():
-            if name not in bases:
+            if name not in transform_names:
                 raise InputError(
                     f"{cfg.filename}: {kind} needs the targets of {name}: add it to the pipeline "
                     "of train_dataloader.dataset."
                 )
-        _check_agreement(cfg, steps)
+        _check_agreement(cfg, steps=steps)
 
 
 def _pipelines(dataset: dict[str, Any]) -> list[list[Any]]:
-    """Return the steps of a data set, or of each one that it wraps; none without a data set."""
-    own = list(dataset.get("pipeline") or ())
-    wrapped = [dataset["dataset"]] if dataset.get("dataset") else dataset.get("datasets") or []
-    if wrapped:
-        return [[*steps, *own] for part in wrapped for steps in _pipelines(part)]
-    return [own] if dataset else []
+    """Return the pipeline of each data set in a config, followed by the steps of its wrappers.
+
+    Without a data set, the result is empty.
+    """
+    steps = list(dataset.get("pipeline") or ())
+    if dataset.get("dataset"):
+        inner_datasets = [dataset["dataset"]]
+    else:
+        inner_datasets = dataset.get("datasets") or []
+    if not inner_datasets:
+        return [steps] if dataset else []
+    pipelines = []
+    for inner_dataset in inner_datasets:
+        for inner_steps in _pipelines(inner_dataset):
+            pipelines.append([*inner_steps, *steps])
+    return pipelines
 
 
 def _step_types(steps: Any) -> Iterator[Any]:
-    """Yield the types of a pipeline's steps, and of those that they wrap."""
+    """Yield the types of all steps of a pipeline, including steps inside of other steps."""
     for step in steps:
         if isinstance(step, dict):
             yield step.get("type")

@@ -1,6 +1,6 @@
-"""torchrun whose end is one line: ``python -m gsmap.engine.torchrun``.
+"""torchrun that ends with a one-line error: ``python -m gsmap.engine.torchrun``.
 
-Ctrl-C is left to the ranks to report. A rank that dies, however that happens, ends the others.
+The ranks report Ctrl-C themselves. A rank that dies for any reason ends the others.
 """
 
 import logging
@@ -11,7 +11,7 @@ import sys
 from gsmap.utils.interrupt import leave_at_once_on_ctrl_c
 
 if __name__ == "__main__":
-    leave_at_once_on_ctrl_c()  # until torchrun's own answer, the import of torch takes seconds
+    leave_at_once_on_ctrl_c()  # the import of torch takes seconds; then torchrun's handler is set
 # isort: split
 from torch.distributed.elastic.multiprocessing import SignalException
 from torch.distributed.elastic.multiprocessing.errors import ChildFailedError, ProcessFailure
@@ -25,31 +25,31 @@ STOP_TIMEOUT_S = 30  # torchrun ends ranks with SIGTERM, and after this time wit
 
 
 def _cause(error: ChildFailedError) -> tuple[int, ProcessFailure]:
-    """Return the rank whose end caused the others' ends, and its failure.
+    """Return the rank whose failure caused the failures of the others, and this failure.
 
-    torch counts the ranks that it stops itself among the failures, and times all failures in whole
-    seconds. Of ranks that ended by themselves, one that was killed comes before one that was
-    interrupted, and that before one that met an error: a rank that loses its peers ends with an
-    error.
+    torch lists the ranks that it stops itself among the failures, and records times in whole
+    seconds. Failures are therefore ordered by kind first: killed ranks, interrupted ranks, then
+    ranks that ended with an error, because a rank that loses its peers ends with an error.
     """
     first_s = min(failure.timestamp for failure in error.failures.values())
 
     def order(rank: int) -> tuple[bool, bool, bool, float, int]:
         failure = error.failures[rank]
         code = failure.exitcode
-        late = failure.timestamp - first_s >= STOP_TIMEOUT_S - 1
-        stopped = code == -signal.SIGTERM or (code == -signal.SIGKILL and late)
-        return stopped, code >= 0, code != INTERRUPTED, failure.timestamp, rank
+        is_late = failure.timestamp - first_s >= STOP_TIMEOUT_S - 1
+        was_killed_late = code == -signal.SIGKILL and is_late
+        stopped_by_torchrun = code == -signal.SIGTERM or was_killed_late
+        return stopped_by_torchrun, code >= 0, code != INTERRUPTED, failure.timestamp, rank
 
-    first = min(error.failures, key=order)
-    return first, error.failures[first]
+    first_rank = min(error.failures, key=order)
+    return first_rank, error.failures[first_rank]
 
 
 def signal_behind(error: BaseException | None) -> SignalException | None:
-    """Return the signal that led to an exception, if any.
+    """Return the signal that led to an exception, or None.
 
-    torchrun answers a signal by an exception wherever it stands, and code that it interrupts may
-    raise another one on top of it.
+    torchrun turns a signal into an exception at an arbitrary point, and the interrupted code may
+    raise another exception while it handles this one.
     """
     while error is not None and not isinstance(error, SignalException):
         error = error.__cause__ or error.__context__
@@ -57,29 +57,35 @@ def signal_behind(error: BaseException | None) -> SignalException | None:
 
 
 def reason(error: ChildFailedError) -> tuple[str, int]:
-    """Return what to say of ranks that failed, and the exit code: those of the cause."""
+    """Describe why ranks failed.
+
+    Returns:
+        The message, which names the rank that caused the failure, and the exit code for it.
+    """
     rank, failure = _cause(error)
     if failure.exitcode < 0:
         kill = signal.Signals(-failure.exitcode)
         hint = ", most likely for want of memory" if kill == signal.SIGKILL else ""
-        said, code = f"was killed ({kill.name}{hint})", 128 + kill
+        end = f"was killed ({kill.name}{hint})"
+        code = 128 + kill
     else:
-        said, code = f"ended with {failure.exitcode} (its own words stand above)", failure.exitcode
-    trains = any(word.endswith("train.py") for word in sys.argv)
-    remedy = "; --resume goes on from its last checkpoint" if trains else ""
-    return f"rank {rank} {said}, so the run was stopped{remedy}.", code
+        end = f"ended with {failure.exitcode} (its own words stand above)"
+        code = failure.exitcode
+    is_training = any(word.endswith("train.py") for word in sys.argv)
+    remedy = "; --resume goes on from its last checkpoint" if is_training else ""
+    return f"rank {rank} {end}, so the run was stopped{remedy}.", code
 
 
 if __name__ == "__main__":
-    for part in ("agent.server.api", "multiprocessing.api"):  # torch gives each a level of its own
+    for part in ("agent.server.api", "multiprocessing.api"):  # torch sets a level for each logger
         logging.getLogger(f"torch.distributed.elastic.{part}").setLevel(logging.CRITICAL)
     os.environ[LAUNCHER] = str(os.getpid())
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)  # also for the ranks
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)  # the ranks inherit the mask
     try:
         main()
     except Exception as error:
         stopped_by = signal_behind(error)
-        if stopped_by is not None:  # the ranks have had this signal too, and rank 0 has spoken
+        if stopped_by is not None:  # the ranks receive this signal too, and rank 0 reports it
             sys.exit(128 + signal.Signals(stopped_by.sigval))
         if not isinstance(error, ChildFailedError):
             raise

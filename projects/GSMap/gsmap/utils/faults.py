@@ -83,7 +83,7 @@ def nearest(name: str, names: Iterable[str]) -> str:
     return f"; did you mean {close[0]!r}?" if close else ""
 
 
-def registered(registry: Any) -> list[str]:
+def registry_names(registry: Any) -> list[str]:
     """Return the names in a registry of mmengine, its parents and their children."""
     while registry.parent is not None:
         registry = registry.parent
