@@ -144,10 +144,10 @@ def test_the_map_grows_on_the_ground(camera_drive, true):
     drive, _ = camera_drive
     lengths = []
     for moment in Replay(drive, true, "lidar", ()).moments():
-        lengths.append(sum(shapely.LineString(line[:, :2]).length for _, line in moment.seen))
+        lengths.append(sum(shapely.LineString(line[:, :2]).length for _, line in moment.map_lines))
         for local in moment.lines:
             np.testing.assert_allclose(local[:, 2], -1.84)
-        for _, line in moment.seen:
+        for _, line in moment.map_lines:
             np.testing.assert_allclose(line[:, 2], 0.0, atol=1e-9)
         centres, half_axes, quaternions = moment.ellipses
         assert len(centres) == len(half_axes) == len(quaternions)

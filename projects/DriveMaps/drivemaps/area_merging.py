@@ -1,7 +1,6 @@
-"""Areas of many frames (crossings) merged by a weighted vote on every spot of ground."""
+"""Merging of the areas of many frames (crossings) by a weighted vote on each spot of ground."""
 
 from collections import defaultdict
-from collections.abc import Sequence
 
 import numpy as np
 import shapely
@@ -11,89 +10,121 @@ from drivemaps.drive import MIN_AREA_M2, Drive
 from drivemaps.truth import components, polygons_of
 from gsmap.structures.elements import FloatArray, IntArray
 
-_MAJORITY = 0.5
-_MIN_OVERLAP = 0.3  # of the smaller one: rings of different frames that are of one area
-_SIMPLIFY_M = 0.15  # a vote's outline changes from one frame's edge to another's
+_MAJORITY = 0.5  # share of the votes above which a spot belongs to an area
+_MIN_OVERLAP = 0.3  # smallest shared part, of the smaller area, of two detections of one object
+_SIMPLIFY_M = 0.15  # tolerance of outlines, which alternate between the edges of several frames
 
 
 def merge_areas(drive: Drive, label: int, config: MergeConfig) -> list[tuple[FloatArray, float]]:
     """Merge the rings of one class.
 
-    Rings that overlap from frame to frame are one area. A spot belongs to it if the frames that
-    see the spot, and know of the area, say so by the majority of their weights.
+    Rings of different frames that overlap are detections of one object. A spot of ground belongs
+    to the object by a vote of the frames that detected it and have the spot in their range,
+    weighted by score over variance. The confidence at a spot is the sum of the scores of the
+    frames whose ring contains it, divided by the number of frames that have it in their range, and
+    at most 1.
 
     Args:
         drive: Frames with their predictions.
-        label: The class.
-        config: Rules.
+        label: Index of the class.
+        config: Parameters of merging.
 
     Returns:
-        Closed ring (n, 2) and confidence of each area: the mean over its ground of the share of
-        frames, of those that see the spot, that found it, weighted by their scores.
+        Closed ring in metres in the global frame, (n, 2), and mean confidence in [0, 1] of each
+        area.
     """
-    areas, frames, scores, weights = [], [], [], []
-    for number, frame in enumerate(drive.frames):
-        elements, variances = frame.elements, config.variances(frame)
-        for i in np.flatnonzero(elements.labels == label).tolist():
-            part = slice(elements.offsets[i], elements.offsets[i + 1])
-            for area in polygons_of([elements.points[part]]):
+    areas: list[shapely.Geometry] = []
+    frames: list[int] = []
+    scores: list[float] = []
+    weights: list[float] = []
+    for frame_index, frame in enumerate(drive.frames):
+        elements = frame.elements
+        variances = config.variances(frame)
+        for index in np.flatnonzero(elements.labels == label).tolist():
+            vertices = slice(elements.offsets[index], elements.offsets[index + 1])
+            for area in polygons_of([elements.points[vertices]]):
+                score = elements.confidence[index]
                 areas.append(area)
-                frames.append(number)
-                scores.append(elements.confidence[i])
-                weights.append(scores[-1] / variances[part].mean())
+                frames.append(frame_index)
+                scores.append(score)
+                weights.append(score / variances[vertices].mean())
+    all_areas = np.array(areas, dtype=object)
+    all_frames = np.array(frames, np.int64)
+    all_scores = np.array(scores)
+    all_weights = np.array(weights)
     merged = []
-    for group in _groups(areas, np.array(frames, np.int64)):
-        merged += _voted(
+    for group in _group_by_overlap(all_areas, frames=all_frames):
+        voted_areas = _vote(
             drive,
-            [areas[i] for i in group],
-            [frames[i] for i in group],
-            np.array([scores[i] for i in group]),
-            np.array([weights[i] for i in group]),
+            areas=all_areas[group],
+            frames=all_frames[group],
+            scores=all_scores[group],
+            weights=all_weights[group],
         )
-    return [(ring, score) for ring, score in merged if score >= config.min_area_confidence]
+        for ring, confidence in voted_areas:
+            if confidence >= config.min_area_confidence:
+                merged.append((ring, confidence))
+    return merged
 
 
-def _groups(areas: Sequence[shapely.Geometry], frames: IntArray) -> list[IntArray]:
-    """Return which areas are the same thing."""
-    shapes = np.array(areas, dtype=object)
-    first, second = shapely.STRtree(shapes).query(shapes, predicate="intersects")
-    between = frames[first] != frames[second]
-    first, second = first[between], second[between]
-    shared = shapely.area(shapely.intersection(shapes[first], shapes[second]))
-    smaller = np.minimum(shapely.area(shapes[first]), shapely.area(shapes[second]))
-    same = shared >= _MIN_OVERLAP * smaller
-    return components(len(areas), first[same], second[same])
+def _group_by_overlap(areas: np.ndarray, frames: IntArray) -> list[IntArray]:
+    """Group areas (A,) of different frames (A,) that overlap; return the indices of each group."""
+    first, second = shapely.STRtree(areas).query(areas, predicate="intersects")
+    differ = frames[first] != frames[second]
+    first = first[differ]
+    second = second[differ]
+    shared_m2 = shapely.area(shapely.intersection(areas[first], areas[second]))
+    smaller_m2 = np.minimum(shapely.area(areas[first]), shapely.area(areas[second]))
+    overlap = shared_m2 >= _MIN_OVERLAP * smaller_m2
+    return components(len(areas), first[overlap], second[overlap])
 
 
-def _voted(
+def _vote(
     drive: Drive,
-    areas: Sequence[shapely.Geometry],
-    frames: Sequence[int],
+    areas: np.ndarray,
+    frames: IntArray,
     scores: FloatArray,
     weights: FloatArray,
 ) -> list[tuple[FloatArray, float]]:
-    """Return outline and confidence of what the majority of one group's frames say."""
-    members = defaultdict(list)
-    for i, number in enumerate(frames):
-        members[number].append(i)
-    footprints = {number: drive.footprint(drive.frames[number]) for number in members}
+    """Outline the ground that most of the frames with a detection of an object assign to it.
+
+    Args:
+        drive: Frames of the drive.
+        areas: Detections of the object. (A,)
+        frames: Index of the frame of each detection. (A,)
+        scores: Score of each detection, in [0, 1]. (A,)
+        weights: Score over mean variance of each detection, in 1 / m^2. (A,)
+
+    Returns:
+        Closed ring (n, 2) and mean confidence of each connected part.
+    """
+    rows_of_frame: defaultdict[int, list[int]] = defaultdict(list)
+    for row, frame_index in enumerate(frames.tolist()):
+        rows_of_frame[frame_index].append(row)
+    footprints = {index: drive.footprint(drive.frames[index]) for index in rows_of_frame}
     edges = [shapely.boundary(shape) for shape in (*areas, *footprints.values())]
+    # Between the edges, no vote changes: one spot stands for each face.
     faces = shapely.get_parts(shapely.polygonize([shapely.union_all(edges)]))
-    spots = shapely.get_coordinates(shapely.point_on_surface(faces))
-    for_it, in_all, support = np.zeros((3, len(faces)))
-    for number, rows in members.items():
-        inside = np.array([shapely.contains_xy(areas[i], *spots.T) for i in rows])
+    spots = shapely.get_coordinates(shapely.point_on_surface(faces))  # (F, 2)
+    x, y = spots.T
+    votes = np.zeros(len(faces))
+    all_votes = np.zeros(len(faces))
+    support = np.zeros(len(faces))
+    for frame_index, rows in rows_of_frame.items():
+        contains = np.array([shapely.contains_xy(areas[row], x, y) for row in rows])  # (rows, F)
         weight = weights[rows].mean()
-        for_it += weight * inside.any(axis=0)
-        in_all += weight * shapely.contains_xy(footprints[number], *spots.T)
-        support += (scores[rows][:, None] * inside).max(axis=0)
-    chosen = for_it > _MAJORITY * np.maximum(in_all, for_it)
+        votes += weight * contains.any(axis=0)
+        all_votes += weight * shapely.contains_xy(footprints[frame_index], x, y)
+        support += (scores[rows][:, None] * contains).max(axis=0)
+    is_chosen = votes > _MAJORITY * np.maximum(all_votes, votes)
     confidence = np.minimum(support / np.maximum(drive.times_seen(spots), 1), 1.0)
-    found = []
-    for part in shapely.get_parts(shapely.union_all(faces[chosen])):
-        if part.area >= MIN_AREA_M2:
-            within = chosen & shapely.contains_xy(part, *spots.T)
-            ring = part.exterior.simplify(_SIMPLIFY_M)
-            score = np.average(confidence[within], weights=shapely.area(faces[within]))
-            found.append((shapely.get_coordinates(ring), float(score)))
-    return found
+    outlines = []
+    for part in shapely.get_parts(shapely.union_all(faces[is_chosen])):
+        if part.area < MIN_AREA_M2:
+            continue
+        in_part = is_chosen & shapely.contains_xy(part, x, y)
+        face_areas_m2 = shapely.area(faces[in_part])
+        mean_confidence = np.average(confidence[in_part], weights=face_areas_m2)
+        ring = shapely.get_coordinates(part.exterior.simplify(_SIMPLIFY_M))
+        outlines.append((ring, float(mean_confidence)))
+    return outlines

@@ -1,4 +1,4 @@
-"""Rules of merging, and how certain a predicted vertex is."""
+"""Parameters of merging."""
 
 from dataclasses import dataclass
 
@@ -7,18 +7,20 @@ import numpy as np
 from drivemaps.drive import DriveFrame
 from gsmap.structures.elements import FloatArray
 
-NEAR_SIGMA_M = 0.2  # where results carry no Gaussians
-SIGMA_PER_M = 0.02  # of the distance from the vehicle
+NEAR_SIGMA_M = 0.2  # standard deviation near the vehicle of vertices without Gaussians
+SIGMA_PER_M = 0.02  # standard deviation per metre of distance from the vehicle
 
 
 @dataclass(frozen=True)
 class MergeConfig:
-    """Rules of merging.
+    """Parameters of merging.
 
     Args:
-        gaussians: Weigh by the vertices' Gaussians where the results carry them.
-        min_confidence: Vertices of lines with less are left out (``merge_lines`` defines it).
-        min_area_confidence: Areas with less are left out; models find them from nearby only.
+        gaussians: Whether to weight vertices by their Gaussians, where the results have them.
+        min_confidence: Smallest confidence of a vertex of a line in the map, in [0, 1]
+            (``merge_lines``).
+        min_area_confidence: Smallest confidence of an area in the map, in [0, 1]
+            (``merge_areas``). Lower, because models detect areas only from nearby.
     """
 
     gaussians: bool = True
@@ -26,10 +28,16 @@ class MergeConfig:
     min_area_confidence: float = 0.1
 
     def variances(self, frame: DriveFrame) -> FloatArray:
-        """Return the variance of each predicted vertex across its line, in square metres. (M,)
+        """Compute the variance of each predicted vertex across its line.
 
-        It is that of the vertices' Gaussians, or of a fixed deviation, plus a part that grows with
-        the distance from the vehicle.
+        It is the variance of the vertex's Gaussian, or a constant without Gaussians, plus a part
+        that grows with the distance from the vehicle.
+
+        Args:
+            frame: Frame with its predictions.
+
+        Returns:
+            Variances in square metres. (M,)
         """
         elements = frame.elements
         distances = np.linalg.norm(frame.to_frame(elements.points), axis=1)
@@ -40,8 +48,12 @@ class MergeConfig:
 
         from gsmap.structures.gaussians import Gaussians, extents_along_line
 
-        values = map(torch.from_numpy, (elements.points, elements.scales, elements.rotations))
         counts = elements.num_points.tolist()
-        lines = zip(*(value.split(counts) for value in values), strict=True)
-        across = [extents_along_line(Gaussians(*line))[:, 1] for line in lines]
-        return np.concatenate([np.zeros(0), *across]) ** 2 + far
+        means = torch.from_numpy(elements.points).split(counts)
+        scales = torch.from_numpy(elements.scales).split(counts)
+        rotations = torch.from_numpy(elements.rotations).split(counts)
+        sigmas = [np.zeros(0)]
+        for line_means, line_scales, line_rotations in zip(means, scales, rotations, strict=True):
+            gaussians = Gaussians(line_means, scales=line_scales, rotations=line_rotations)
+            sigmas.append(extents_along_line(gaussians)[:, 1].numpy())
+        return np.concatenate(sigmas) ** 2 + far

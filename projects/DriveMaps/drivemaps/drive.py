@@ -1,4 +1,4 @@
-"""A drive: the maps of its frames, predicted or annotated, in the global frame's plane."""
+"""Drives: sequences of frames with their maps, predicted or annotated, in the global frame."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,18 +13,21 @@ from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElemen
 from gsmap.utils.errors import InputError
 
 MIN_LENGTH_M = 2.0
+"""Smallest length in metres of a line in the map of a drive."""
 MIN_AREA_M2 = 1.0
+"""Smallest area in square metres of an area in the map of a drive."""
 SIMPLIFY_M = 0.02
-_SLACK_M = 1e-3  # for the rounding of frames
+"""Largest distance in metres of a dropped vertex from the simplified line."""
+_SLACK_M = 1e-3  # covers the rounding of transforms
 
 
 @dataclass(frozen=True, eq=False)
 class DriveFrame:
-    """One sample of a drive.
+    """One sample of a drive with its map.
 
     Args:
         sample: Sensors and poses.
-        elements: Its map, (x, y) in metres in the global frame.
+        elements: Map of the sample, (x, y) in metres in the global frame.
     """
 
     sample: MapSample
@@ -32,39 +35,53 @@ class DriveFrame:
 
     @property
     def origin(self) -> FloatArray:
-        """Where the annotation frame's origin lies in the global frame, in metres. (2,)"""
+        """Origin of the annotation frame, in metres in the global frame. (2,)"""
         return self.sample.global_from_frame[:2, 3]
 
     @property
     def rotation(self) -> FloatArray:
-        """Turn by the pose's yaw, from the annotation frame to the global frame. (2, 2)"""
+        """Rotation by yaw from the annotation frame to the global frame. (2, 2)"""
         cos, sin = self.sample.global_from_frame[:2, 0]
         return np.array([[cos, -sin], [sin, cos]]) / np.hypot(cos, sin)
 
     @property
     def yaw_rad(self) -> float:
-        """Angle of that turn in radians."""
+        """Angle of ``rotation`` in radians, anticlockwise."""
         return float(np.arctan2(self.rotation[1, 0], self.rotation[0, 0]))
 
     def to_global(self, points: FloatArray) -> FloatArray:
-        """Move points from the annotation frame to the global frame, in the plane. (..., 2)"""
+        """Transform points from the annotation frame to the global frame, in the plane.
+
+        Args:
+            points: Points (x, y) in metres. (..., 2)
+
+        Returns:
+            Points in the global frame. (..., 2)
+        """
         return points @ self.rotation.T + self.origin
 
     def to_frame(self, points: FloatArray) -> FloatArray:
-        """Move points from the global frame to the annotation frame, in the plane. (..., 2)"""
+        """Transform points from the global frame to the annotation frame, in the plane.
+
+        Args:
+            points: Points (x, y) in metres. (..., 2)
+
+        Returns:
+            Points in the annotation frame. (..., 2)
+        """
         return (points - self.origin) @ self.rotation
 
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """The frames of one scene.
+    """Frames of one scene.
 
     Args:
         scene: Name of the scene.
         classes: Class names in label order.
-        x_range: Smallest and largest x that a frame sees, in its own frame, in metres.
-        y_range: Smallest and largest y, likewise.
-        frames: The frames in the order of time.
+        x_range: Smallest and largest x of the range of a frame, in metres in its annotation frame.
+        y_range: Smallest and largest y of the range of a frame, in metres in its annotation frame.
+        frames: Frames in the order of time.
     """
 
     scene: str
@@ -74,85 +91,138 @@ class Drive:
     frames: Sequence[DriveFrame]
 
     def sees(self, frame: DriveFrame, points: FloatArray) -> BoolArray:
-        """Say which points of the global frame, (M, 2) in metres, lie in a frame's range. (M,)"""
+        """Find the points in the range of a frame.
+
+        Args:
+            frame: Frame of the drive.
+            points: Points in metres in the global frame. (M, 2)
+
+        Returns:
+            True for points in the range. (M,)
+        """
         low, high = np.array([self.x_range, self.y_range]).T
         local = frame.to_frame(points)
         return ((local >= low) & (local <= high)).all(axis=1)
 
     @property
     def reach_m(self) -> float:
-        """How far from a frame's origin the farthest corner of its range is, in metres."""
-        return float(np.hypot(np.abs(self.x_range).max(), np.abs(self.y_range).max())) + _SLACK_M
+        """Largest distance in metres from the origin of a frame to a point of its range."""
+        farthest_x = np.abs(self.x_range).max()
+        farthest_y = np.abs(self.y_range).max()
+        return float(np.hypot(farthest_x, farthest_y)) + _SLACK_M
 
     def times_seen(self, points: FloatArray) -> IntArray:
-        """Count the frames that have points, (M, 2) in metres, in their range. (M,)"""
-        counts, tree = np.zeros(len(points), np.int64), cKDTree(points)
+        """Count the frames that have each point in their range.
+
+        Args:
+            points: Points in metres in the global frame. (M, 2)
+
+        Returns:
+            Number of frames. (M,)
+        """
+        counts = np.zeros(len(points), np.int64)
+        tree = cKDTree(points)
         for frame in self.frames:
             near = tree.query_ball_point(frame.origin, self.reach_m)
             counts[near] += self.sees(frame, points[near])
         return counts
 
     def nearby(self, frame: DriveFrame, elements: MapElements) -> MapElements:
-        """Return the elements, in the global frame, whose boxes come near a frame's range."""
-        long = np.flatnonzero(elements.num_points)
-        if not len(long):
+        """Select the elements whose bounding boxes come near the range of a frame.
+
+        Args:
+            frame: Frame of the drive.
+            elements: Elements in the global frame.
+
+        Returns:
+            All elements with a vertex or an edge in the range, and possibly some others.
+        """
+        nonempty = np.flatnonzero(elements.num_points)
+        if not len(nonempty):
             return elements
-        starts, points = elements.offsets[long], elements.points[:, :2]
-        low, high = (f.reduceat(points, starts) for f in (np.minimum, np.maximum))
-        near = (low <= frame.origin + self.reach_m) & (high >= frame.origin - self.reach_m)
-        return elements.select(long[near.all(axis=1)])
+        starts = elements.offsets[nonempty]
+        points = elements.points[:, :2]
+        low = np.minimum.reduceat(points, starts)  # (N, 2)
+        high = np.maximum.reduceat(points, starts)  # (N, 2)
+        starts_before = low <= frame.origin + self.reach_m
+        ends_behind = high >= frame.origin - self.reach_m
+        is_near = (starts_before & ends_behind).all(axis=1)
+        return elements.select(nonempty[is_near])
 
     def footprint(self, frame: DriveFrame) -> shapely.Polygon:
-        """Return a frame's range in the global frame."""
-        (x0, x1), (y0, y1) = self.x_range, self.y_range
+        """Range of a frame as a rectangle in the global frame."""
+        x0, x1 = self.x_range
+        y0, y1 = self.y_range
         corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
         return shapely.Polygon(frame.to_global(corners))
 
 
 def read_drive(annotations: AnnotationFile, scene: str, maps: Mapping[str, MapElements]) -> Drive:
-    """Gather the frames of a scene.
+    """Create the drive of a scene.
 
     Args:
-        annotations: File with the scene's samples.
+        annotations: Annotation file with the samples of the scene.
         scene: Name of the scene.
-        maps: Map of each sample in its annotation frame, by token; samples that it lacks are left
+        maps: Map of each sample in its annotation frame, by token. Samples without one are left
             out.
 
+    Returns:
+        Frames with their maps in the global frame.
+
     Raises:
-        ValueError: If the file has no such scene, or no sample of it has a map.
+        ValueError: If the file has no such scene, or no sample of the scene has a map.
     """
-    meta, scenes = annotations.meta, annotations.column("scene")
-    samples = [annotations[i] for i, name in enumerate(scenes) if name == scene]
-    if not samples:
+    scenes = annotations.column("scene")
+    if scene not in scenes:
         raise InputError(
             f"{annotations.path} has no scene {scene!r}, but {sorted(set(scenes))[:5]} ..."
         )
-    samples = sorted((s for s in samples if s.token in maps), key=lambda s: s.timestamp_ns)
+    samples = []
+    for row, name in enumerate(scenes):
+        if name == scene:
+            sample = annotations[row]
+            if sample.token in maps:
+                samples.append(sample)
     if not samples:
         raise InputError(
             f"no sample of scene {scene!r} has results: give the results of {annotations.path}."
         )
-    frames = [
-        DriveFrame(s, maps[s.token].with_coordinates(2).to_frame(s.global_from_frame))
-        for s in samples
-    ]
-    return Drive(scene, meta.classes, meta.x_range, meta.y_range, frames)
+    samples.sort(key=lambda sample: sample.timestamp_ns)
+    frames = []
+    for sample in samples:
+        elements = maps[sample.token].with_coordinates(2)
+        frames.append(DriveFrame(sample, elements.to_frame(sample.global_from_frame)))
+    meta = annotations.meta
+    return Drive(scene, meta.classes, x_range=meta.x_range, y_range=meta.y_range, frames=frames)
 
 
-def drive_map(found: Iterable[tuple[int, FloatArray, float]], scored: bool = True) -> MapElements:
-    """Order elements, and drop the vertices that a line does not need.
+def drive_map(rows: Iterable[tuple[int, FloatArray, float]], scored: bool = True) -> MapElements:
+    """Create the map of a drive from simplified elements in a fixed order.
 
     Args:
-        found: Label, vertices (n, 2) and score of each element.
+        rows: Label, vertices in metres in the global frame, (n, >= 2), and score of each element.
         scored: Whether the map keeps the scores.
 
     Returns:
-        The elements by class, then by falling score. (N,)
+        Elements ordered by class, then by falling score, then by the first vertex. (N,)
     """
-    rows = [
-        (label, shapely.get_coordinates(shapely.LineString(line[:, :2]).simplify(SIMPLIFY_M)), s)
-        for label, line, s in found
-    ]
-    rows.sort(key=lambda row: (row[0], -round(row[2], 9), *np.round(row[1][0], 6)))
-    labels, lines, scores = ([row[i] for row in rows] for i in range(3))
-    return MapElements.from_polylines(lines, labels, scores if scored else None)
+    simple_rows = []
+    for label, line, score in rows:
+        simple_line = shapely.LineString(line[:, :2]).simplify(SIMPLIFY_M)
+        simple_rows.append((label, shapely.get_coordinates(simple_line), score))
+    simple_rows.sort(key=_order_in_map)
+    polylines = []
+    labels = []
+    scores = []
+    for label, line, score in simple_rows:
+        polylines.append(line)
+        labels.append(label)
+        scores.append(score)
+    return MapElements.from_polylines(polylines, labels=labels, scores=scores if scored else None)
+
+
+def _order_in_map(row: tuple[int, FloatArray, float]) -> tuple[float, ...]:
+    """Key that sorts by class, then by falling score, then by the first vertex."""
+    label, line, score = row
+    x, y = np.round(line[0], 6)
+    return label, -round(score, 9), x, y

@@ -1,4 +1,4 @@
-"""Where a map's global frame lies on the Earth."""
+"""Position of the global frame of a map on the Earth."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,20 +11,21 @@ from gsmap.structures.elements import FloatArray
 from gsmap.utils.errors import InputError
 from gsmap.utils.extras import import_extra
 
-_FARTHEST_M = 100_000.0
+_FARTHEST_M = 100_000.0  # largest distance of a position from the origin
 
 
 @dataclass(frozen=True)
 class MapOrigin:
-    """Where the global frame has its origin; its x axis points east and its y axis north.
+    """Origin of a global frame whose x axis points east and whose y axis points north.
 
     Args:
-        latitude_deg: Latitude of the origin on the WGS 84 ellipsoid, in degrees.
-        longitude_deg: Longitude, in degrees.
-        utm_zone: UTM zone whose grid the axes follow; None: true east and north at the origin.
+        latitude_deg: Latitude of the origin on the WGS 84 ellipsoid in degrees, in (-90, 90).
+        longitude_deg: Longitude of the origin in degrees, in [-180, 180].
+        utm_zone: UTM zone to whose grid the axes are parallel. By default, the axes point to true
+            east and north at the origin.
 
     Raises:
-        ValueError: If the place is not on Earth.
+        ValueError: If the latitude or the longitude is out of range.
     """
 
     latitude_deg: float
@@ -40,25 +41,34 @@ class MapOrigin:
 
     @cached_property
     def _projection(self) -> Any:
-        place = {"proj": "tmerc", "lat_0": self.latitude_deg, "lon_0": self.longitude_deg}
+        """Projection from degrees to metres, with any false origin."""
+        create_projection = import_extra("pyproj", "maps").Proj
         if self.utm_zone is not None:
-            place = {"proj": "utm", "zone": self.utm_zone}
-        return import_extra("pyproj", "maps").Proj(ellps="WGS84", **place)
+            return create_projection(proj="utm", zone=self.utm_zone, ellps="WGS84")
+        return create_projection(
+            proj="tmerc", lat_0=self.latitude_deg, lon_0=self.longitude_deg, ellps="WGS84"
+        )
 
     def lon_lat(self, points: FloatArray) -> FloatArray:
-        """Return longitude and latitude, in degrees on the WGS 84 ellipsoid. (n, 2)
+        """Convert points to longitude and latitude on the WGS 84 ellipsoid.
 
-        Points (n, >= 2) are in metres of the global frame.
+        Args:
+            points: Points in metres in the global frame. (n, >= 2)
+
+        Returns:
+            Longitude and latitude in degrees. (n, 2)
 
         Raises:
-            ValueError: If a point lies farther from the origin than the projection reaches.
+            ValueError: If a point is too far from the origin for the projection.
         """
         east, north = self._projection(self.longitude_deg, self.latitude_deg)
         x, y = np.asarray(points)[:, :2].T
-        degrees = np.stack(self._projection(x + east, y + north, inverse=True), axis=1)
+        lon_deg, lat_deg = self._projection(x + east, y + north, inverse=True)
+        degrees = np.stack([lon_deg, lat_deg], axis=1)
         if not np.isfinite(degrees).all():
+            farthest_m = max(np.abs(x).max(), np.abs(y).max())
             raise InputError(
-                f"the map reaches {max(np.abs(x).max(), np.abs(y).max()):.3g} m from the origin of "
+                f"the map reaches {farthest_m:.3g} m from the origin of "
                 "its frame, where there is no longitude and latitude: its poses are wrong, or "
                 "--formats geojson without --origin writes metres."
             )
@@ -67,14 +77,15 @@ class MapOrigin:
 
 @dataclass(frozen=True)
 class MapGrid:
-    """A coordinate reference system that the global frame's x and y are coordinates of.
+    """Coordinate reference system of a global frame that is a map grid.
 
     Args:
-        crs: Its name, as pyproj takes it, such as ``EPSG:32650``; x is its easting.
+        crs: Name of the system for ``pyproj``, such as ``EPSG:32650``. Its easting is x, its
+            northing y.
 
     Raises:
         RuntimeError: If ``pyproj`` is missing.
-        ValueError: If there is no such system, or it is not in metres.
+        ValueError: If the system does not exist, or is not a grid in metres.
     """
 
     crs: str
@@ -82,39 +93,47 @@ class MapGrid:
     def __post_init__(self) -> None:
         crs = import_extra("pyproj", "maps").CRS
         try:
-            found = crs.from_user_input(self.crs)
-        except Exception as error:  # pyproj's own is no ValueError
+            system = crs.from_user_input(self.crs)
+        except Exception as error:  # CRSError, which is not a ValueError
             raise InputError(f"{self.crs} is no coordinate reference system: {error}.") from error
-        units = {axis.unit_name for axis in found.axis_info[:2]}
-        if not found.is_projected or units != {"metre"}:
+        units = {axis.unit_name for axis in system.axis_info[:2]}
+        if not system.is_projected or units != {"metre"}:
             raise InputError(
-                f"{self.crs} ({found.name}) is no grid in metres: give that of the poses, such as "
+                f"{self.crs} ({system.name}) is no grid in metres: give that of the poses, such as "
                 "EPSG:32650."
             )
 
     @cached_property
-    def _to_degrees(self) -> Any:
-        transformer = import_extra("pyproj", "maps").Transformer
-        return transformer.from_crs(self.crs, "EPSG:4326", always_xy=True)
+    def _transformer(self) -> Any:
+        """Transformation from the grid to longitude and latitude."""
+        pyproj = import_extra("pyproj", "maps")
+        return pyproj.Transformer.from_crs(self.crs, "EPSG:4326", always_xy=True)
 
     def lon_lat(self, points: FloatArray) -> FloatArray:
-        """Return longitude and latitude, in degrees on the WGS 84 ellipsoid. (n, 2)
+        """Convert points to longitude and latitude on the WGS 84 ellipsoid.
 
-        Points (n, >= 2) are in metres of the grid.
+        Args:
+            points: Points in metres of the grid. (n, >= 2)
+
+        Returns:
+            Longitude and latitude in degrees. (n, 2)
         """
         x, y = np.asarray(points)[:, :2].T
-        return np.stack(self._to_degrees.transform(x, y), axis=1)
+        lon_deg, lat_deg = self._transformer.transform(x, y)
+        return np.stack([lon_deg, lat_deg], axis=1)
 
 
 def require_near(positions: FloatArray, where: str) -> None:
-    """Refuse positions that are too far from an origin to be metres from it.
+    """Check that positions are near the origin of the global frame.
+
+    Positions far from it are probably coordinates of a grid.
 
     Args:
-        positions: Of the vehicle, in metres of the global frame. (n, >= 2)
-        where: Of which map, for the message.
+        positions: Positions of the vehicle in metres in the global frame. (n, >= 2)
+        where: Name of their file, for the message.
 
     Raises:
-        ValueError: If one is farther than `_FARTHEST_M`.
+        ValueError: If a coordinate is larger than 100 km.
     """
     farthest_m = float(np.abs(np.asarray(positions)[:, :2]).max(initial=0.0))
     if farthest_m > _FARTHEST_M:
@@ -126,21 +145,28 @@ def require_near(positions: FloatArray, where: str) -> None:
 
 
 def known_origin(meta: AnnotationMeta, map_name: str) -> MapOrigin | None:
-    """Return the origin that a data set's devkit gives for one of its maps.
+    """Look up the origin of a map in the devkit of its data set.
 
-    nuScenes' devkit takes the south-western corner of a map for both the reference coordinate that
-    it lists and the origin of the poses; Argoverse 2 shifts the UTM grid to the origin of a city.
-    None stands for other data sets, and maps that the devkit does not list.
+    In the devkit of nuScenes, the reference coordinate of a map is its south-western corner, and
+    so is the origin of the poses. Argoverse 2 shifts the UTM grid to the origin of a city.
+
+    Args:
+        meta: Metadata of the annotation file.
+        map_name: Name of the map.
+
+    Returns:
+        Origin, or None for other data sets and for maps that the devkit does not list.
     """
     if meta.dataset == "nuscenes":
         from nuscenes.scripts.export_poses import REFERENCE_COORDINATES
 
         if map_name in REFERENCE_COORDINATES:
-            return MapOrigin(*REFERENCE_COORDINATES[map_name])
+            latitude_deg, longitude_deg = REFERENCE_COORDINATES[map_name]
+            return MapOrigin(latitude_deg, longitude_deg)
     if meta.dataset == "av2":
         from av2.geometry.utm import CITY_ORIGIN_LATLONG_DICT, UTM_ZONE_MAP
 
-        for city, place in CITY_ORIGIN_LATLONG_DICT.items():
+        for city, (latitude_deg, longitude_deg) in CITY_ORIGIN_LATLONG_DICT.items():
             if map_name == city.value:
-                return MapOrigin(place[0], place[1], UTM_ZONE_MAP[city])
+                return MapOrigin(latitude_deg, longitude_deg, utm_zone=UTM_ZONE_MAP[city])
     return None

@@ -1,4 +1,4 @@
-"""A map as GeoJSON (RFC 7946): in longitude and latitude, or in metres of the global frame."""
+"""GeoJSON files of maps (RFC 7946), in longitude and latitude or in metres of the global frame."""
 
 import json
 from collections.abc import Sequence
@@ -12,7 +12,8 @@ from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import MapElements
 from gsmap.utils.files import write_text
 
-# longitude, latitude; programs read the member of the first GeoJSON, RFC 7946 has no other system
+# Longitude and latitude. RFC 7946 allows no other system and has dropped the member ``crs``, but
+# programs still read it.
 _CRS84 = {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}
 
 
@@ -22,14 +23,14 @@ def write_geojson(
     classes: Sequence[str],
     origin: MapOrigin | MapGrid | None,
 ) -> None:
-    """Write a map: areas as polygons, all else as line strings.
+    """Write a map as GeoJSON: areas as polygons, other elements as line strings.
 
     Args:
         path: File to write.
-        elements: The map in the global frame.
-        classes: Names of the classes.
-        origin: Where the global frame lies; without one, coordinates are metres of that frame, and
-            the file says that it has no coordinate reference system (``"crs": null``).
+        elements: Map in the global frame.
+        classes: Class names in label order.
+        origin: Position of the global frame on the Earth. Without one, coordinates are metres of
+            the global frame, and the file has no coordinate reference system (``"crs": null``).
 
     Raises:
         RuntimeError: If an origin is given and ``pyproj`` is missing.
@@ -37,20 +38,19 @@ def write_geojson(
     features = []
     for line, label, score in elements.rows:
         name = classes[label]
-        digits = 4 if origin is None else 9  # a tenth of a millimetre
-        points = (line if origin is None else origin.lon_lat(line)).round(digits).tolist()
-        area = name in AREA_CLASSES and points[0] == points[-1]
-        clockwise = area and not shapely.is_ccw(shapely.LineString(line))
-        features.append(
-            {
-                "type": "Feature",
-                "properties": {"class": name, "score": round(score, 4)},
-                "geometry": {
-                    "type": "Polygon" if area else "LineString",
-                    "coordinates": [points[:: -1 if clockwise else 1]] if area else points,
-                },
-            }
-        )
+        if origin is None:
+            points = line.round(4).tolist()  # a tenth of a millimetre
+        else:
+            points = origin.lon_lat(line).round(9).tolist()  # a tenth of a millimetre
+        is_area = name in AREA_CLASSES and points[0] == points[-1]
+        if is_area and not shapely.is_ccw(shapely.LineString(line)):
+            points.reverse()
+        geometry = {
+            "type": "Polygon" if is_area else "LineString",
+            "coordinates": [points] if is_area else points,
+        }
+        properties = {"class": name, "score": round(score, 4)}
+        features.append({"type": "Feature", "properties": properties, "geometry": geometry})
     collection: dict[str, Any] = {"type": "FeatureCollection", "crs": _CRS84 if origin else None}
     if origin is None:
         collection["frame"] = "global frame of the poses, metres"

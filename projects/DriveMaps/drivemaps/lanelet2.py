@@ -1,4 +1,4 @@
-"""A map as Lanelet2's OSM file: line strings, polygons and lanelets."""
+"""OSM files of maps for Lanelet2: line strings, polygons and lanelets."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +11,8 @@ from gsmap.structures.elements import FloatArray, MapElements
 from gsmap.utils.files import write_bytes
 
 SPEED_LIMIT_KMH = 50.0
-# Lanelet2's tags of line strings; a class that has none keeps its own name.
+"""Default speed limit of lanelets in km/h."""
+# Lanelet2 types of line strings by class. The type of any other class is its name.
 TYPES = {
     "divider": "line_thin",
     "boundary": "road_border",
@@ -29,17 +30,17 @@ def write_lanelet2(
     lanes: LaneGraph | None = None,
     speed_limit_kmh: float = SPEED_LIMIT_KMH,
 ) -> None:
-    """Write a map that the ``lanelet2`` package loads.
+    """Write a map for the ``lanelet2`` package.
 
-    Areas become polygons, other rings end at the node that they start at. Each node also carries
-    ``local_x`` and ``local_y``, the metres of the global frame.
+    Areas become polygons, and other rings end at the node at which they start. Each node has its
+    position in the global frame in metres as ``local_x`` and ``local_y``.
 
     Args:
         path: File to write.
-        elements: The map in the global frame.
-        classes: Names of the classes.
-        origin: Where the global frame lies.
-        lanes: Lanelets of the map, one-way roads.
+        elements: Map in the global frame.
+        classes: Class names in label order.
+        origin: Position of the global frame on the Earth.
+        lanes: Lanelets of the map, written as one-way roads.
         speed_limit_kmh: Speed limit of the lanelets, in km/h.
 
     Raises:
@@ -47,13 +48,13 @@ def write_lanelet2(
     """
     file = _OSMFile(origin)
     for line, label, _ in elements.rows:
-        ring = len(line) > 3 and bool((line[0] == line[-1]).all())
-        nodes = file.add_nodes(line[:-1] if ring else line)
+        is_ring = len(line) > 3 and bool((line[0] == line[-1]).all())
+        nodes = file.add_nodes(line[:-1] if is_ring else line)
         name = classes[label]
         tags = {"type": TYPES.get(name, name), "class": name}
-        if ring and name in AREA_CLASSES:
-            tags["area"] = "yes"  # Lanelet2's polygons do not repeat their first node
-        elif ring:
+        if is_ring and name in AREA_CLASSES:
+            tags["area"] = "yes"  # polygons of Lanelet2 do not repeat their first node
+        elif is_ring:
             nodes.append(nodes[0])
         file.add_way(nodes, tags)
     if lanes is not None:
@@ -62,7 +63,7 @@ def write_lanelet2(
 
 
 def _add_lanelets(file: "_OSMFile", lanes: LaneGraph, speed_limit_kmh: float) -> None:
-    """Add lanelets; those that follow one another share the end nodes of their bounds."""
+    """Add lanelets; successive ones share the end nodes of their bounds."""
     tags = {
         "type": "lanelet",
         "subtype": "road",
@@ -75,63 +76,68 @@ def _add_lanelets(file: "_OSMFile", lanes: LaneGraph, speed_limit_kmh: float) ->
     for lane in lanes.lanelets:
         left = [left_ends[lane.entry], *file.add_nodes(lane.left), left_ends[lane.exit]]
         right = [right_ends[lane.entry], *file.add_nodes(lane.right), right_ends[lane.exit]]
-        members = {
+        way_of_role = {
             "left": file.add_way(left, {"type": "virtual"}),
             "right": file.add_way(right, {"type": "virtual"}),
         }
-        file.add_relation(members, tags)
+        file.add_relation(way_of_role, tags)
 
 
 class _OSMFile:
-    """Nodes, ways and relations of an OSM file, numbered from 1 in the order of their coming.
+    """Nodes, ways and relations of an OSM file, with ids from 1 in the order of their creation.
 
     Args:
-        origin: Where the global frame lies.
+        origin: Position of the global frame on the Earth.
     """
 
     def __init__(self, origin: MapOrigin | MapGrid) -> None:
         self._origin = origin
-        self._parts: dict[str, list[ElementTree.Element]] = {"node": [], "way": [], "relation": []}
+        # In the order of the file.
+        self._elements_of_kind: dict[str, list[ElementTree.Element]] = {
+            "node": [],
+            "way": [],
+            "relation": [],
+        }
 
     def add_nodes(self, points: FloatArray) -> list[str]:
-        """Add points of the global frame, in metres, and return their ids. (n, 2) -> (n,)"""
-        identities = []
+        """Add points in metres in the global frame and return their ids. (n, 2) -> (n,)"""
+        ids = []
         degrees = self._origin.lon_lat(points).tolist()
         for (x, y), (lon, lat) in zip(points.tolist(), degrees, strict=True):
             tags = {"local_x": f"{x:.4f}", "local_y": f"{y:.4f}"}
             node = self._add("node", tags)
             node.set("lat", f"{lat:.11f}")
             node.set("lon", f"{lon:.11f}")
-            identities.append(node.get("id", ""))
-        return identities
+            ids.append(node.get("id", ""))
+        return ids
 
     def add_way(self, nodes: Sequence[str], tags: dict[str, str]) -> str:
-        """Add a line through nodes and return its id."""
+        """Add a line through nodes, given by their ids, and return its id."""
         way = self._add("way", tags)
-        for place, reference in enumerate(nodes):
-            way.insert(place, ElementTree.Element("nd", ref=reference))
+        for index, node in enumerate(nodes):
+            way.insert(index, ElementTree.Element("nd", ref=node))
         return way.get("id", "")
 
-    def add_relation(self, members: dict[str, str], tags: dict[str, str]) -> None:
-        """Add a relation of ways, by their roles."""
+    def add_relation(self, way_of_role: dict[str, str], tags: dict[str, str]) -> None:
+        """Add a relation of ways, given by their ids."""
         relation = self._add("relation", tags)
-        for place, (role, reference) in enumerate(members.items()):
-            member = ElementTree.Element("member", type="way", ref=reference, role=role)
-            relation.insert(place, member)
+        for index, (role, way) in enumerate(way_of_role.items()):
+            member = ElementTree.Element("member", type="way", ref=way, role=role)
+            relation.insert(index, member)
 
     def _add(self, kind: str, tags: dict[str, str]) -> ElementTree.Element:
-        """Add an element with the next free id of all kinds."""
-        identity = 1 + sum(map(len, self._parts.values()))
-        element = ElementTree.Element(kind, id=str(identity), version="1")
+        """Add an element with the next id."""
+        num_elements = sum(len(elements) for elements in self._elements_of_kind.values())
+        element = ElementTree.Element(kind, id=str(num_elements + 1), version="1")
         for key, value in tags.items():
             ElementTree.SubElement(element, "tag", k=key, v=value)
-        self._parts[kind].append(element)
+        self._elements_of_kind[kind].append(element)
         return element
 
     def write(self, path: str | Path) -> None:
         """Write the file: nodes first, then ways, then relations."""
         root = ElementTree.Element("osm", version="0.6", generator="gsmap")
-        for elements in self._parts.values():
+        for elements in self._elements_of_kind.values():
             root.extend(elements)
         ElementTree.indent(root, " ")
         text = ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)

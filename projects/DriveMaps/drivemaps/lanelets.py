@@ -1,4 +1,4 @@
-"""Lanelets of a map: lanes with a left and a right bound, made from centre lines."""
+"""Lanelets: lanes with a left and a right bound, constructed from centre lines."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -11,17 +11,21 @@ from scipy.spatial import cKDTree
 
 from drivemaps.drive import Drive
 from drivemaps.truth import components
-from gsmap.structures.elements import FloatArray, IntArray, MapElements
+from gsmap.structures.elements import FloatArray, MapElements
 
 CENTERLINE = "centerline"
+"""Class of centre lines."""
 BORDERS = ("divider", "boundary")
-HALF_WIDTH_M = 1.75  # of a side of a lane beside which no border lies
+"""Classes of lines that bound lanes."""
+HALF_WIDTH_M = 1.75
+"""Distance in metres of a bound from the centre line if there is no border on that side."""
 _MOST_HALF_WIDTH_M = 3.0  # a border farther away belongs to another lane
-_JOIN_M = 1.0  # ends that are so near are one place of the graph of lanes
-_SHORTEST_M = 2.0  # a lane is not split nearer to its ends
-_STEP_M = 2.0  # between points at which directions and widths are measured
-_ALIKE = 0.5  # least cosine between directions of lanes that follow one another
-_ALONG = 0.7  # least cosine between a line and a piece that has its direction, or its opposite
+_MIN_HALF_WIDTH_M = 0.5
+_JOIN_M = 1.0  # ends within this distance are one node of the lane graph
+_SHORTEST_M = 2.0  # smallest distance between the points at which a lane is split, and its ends
+_STEP_M = 2.0  # largest distance of the points at which directions and widths are measured
+_MIN_SUCCESSOR_COSINE = 0.5  # between the directions of successive lanes
+_MIN_PARALLEL_COSINE = 0.7  # between a line and a piece along it, in either direction
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +35,8 @@ class Lanelet:
     Args:
         left: Vertices of the left bound between its ends, in metres. (n, 2)
         right: Vertices of the right bound between its ends, in metres. (m, 2)
-        entry: Place of the graph of lanes at which the lane begins.
-        exit: Place at which it ends.
+        entry: Index of the node of the lane graph at which the lane begins.
+        exit: Index of the node at which the lane ends.
     """
 
     left: FloatArray
@@ -43,12 +47,12 @@ class Lanelet:
 
 @dataclass(frozen=True, eq=False)
 class LaneGraph:
-    """Lanelets that share the ends of their bounds where they follow one another.
+    """Graph of lanelets; the bounds of successive lanelets share their ends at a node.
 
     Args:
-        lanelets: The lanelets.
-        left: Left end of the bounds at each place, in metres. (places, 2)
-        right: Right end of the bounds at each place, in metres. (places, 2)
+        lanelets: Lanelets, the edges of the graph.
+        left: End of the left bounds at each node, in metres. (nodes, 2)
+        right: End of the right bounds at each node, in metres. (nodes, 2)
     """
 
     lanelets: Sequence[Lanelet]
@@ -57,17 +61,17 @@ class LaneGraph:
 
 
 def lane_graph_of(drive: Drive, elements: MapElements) -> LaneGraph:
-    """Make lanelets of the centre lines of a drive's map.
+    """Construct lanelets from the centre lines in the map of a drive.
 
-    Maps keep no direction of lines. The direction of travel is the one that the frames' centre
-    lines have along a line of the map.
+    Lines of maps have no direction. The direction of travel of a centre line is that in which most
+    centre lines of the frames run along it.
 
     Args:
         drive: Frames with centre lines in the direction of travel.
         elements: Map of the drive in the global frame.
 
     Returns:
-        The lanelets; none if the drive has no class ``centerline``.
+        Lanelets and nodes, none if the drive has no class ``centerline``.
     """
     if CENTERLINE not in drive.classes:
         return lane_graph([], [])
@@ -79,69 +83,103 @@ def lane_graph_of(drive: Drive, elements: MapElements) -> LaneGraph:
     borders: list[FloatArray] = []
     for name in BORDERS:
         if name in drive.classes:
-            of_class = elements.labels == drive.classes.index(name)
-            borders += elements.select(of_class).polylines
-    return lane_graph(_directed(lines, pieces), borders)
+            border_label = drive.classes.index(name)
+            borders += elements.select(elements.labels == border_label).polylines
+    return lane_graph(_orient_lines(lines, pieces), borders)
 
 
 def lane_graph(centerlines: Iterable[FloatArray], borders: Sequence[FloatArray]) -> LaneGraph:
-    """Make lanelets of centre lines.
+    """Construct lanelets from centre lines.
 
-    A line is split where another one begins or ends on it, and of lines that lie on each other one
-    is taken. A bound runs parallel to its centre line, at the median distance of the borders beside
-    it, or at 1.75 m where there are none.
+    A line is split where another one begins or ends on it, and only one of several lines on top of
+    each other is used. A bound is parallel to its centre line, at the median distance of the
+    borders beside it, or at 1.75 m if there are none.
 
     Args:
         centerlines: Lines in the direction of travel, in metres. each (n >= 2, 2)
         borders: Dividers and boundaries, in metres. each (n, 2)
+
+    Returns:
+        Lanelets and nodes.
     """
-    distinct = [_without_repeats(np.asarray(line)[:, :2]) for line in centerlines]
+    distinct = [_drop_repeats(np.asarray(line)[:, :2]) for line in centerlines]
     lines = _split([line for line in distinct if len(line) > 1])
     if not lines:
-        return LaneGraph([], np.empty((0, 2)), np.empty((0, 2)))
-    ends = np.array([line[index] for line in lines for index in (0, -1)])  # (2 lanes, 2)
-    headings = np.array([_directions(line)[index] for line in lines for index in (0, -1)])
+        return LaneGraph([], left=np.empty((0, 2)), right=np.empty((0, 2)))
     tree = shapely.STRtree([shapely.LineString(border) for border in borders if len(border) > 1])
-    widths = np.array([[_half_width(line, side, tree) for side in (1, -1)] for line in lines])
-    of_ends = np.repeat(widths, 2, axis=0)  # left and right. (2 lanes, 2)
-    groups = _places(ends, headings)
-    place_of = np.empty(len(ends), np.int64)
-    left = np.empty((len(groups), 2))
-    right = np.empty((len(groups), 2))
-    for place, members in enumerate(groups):
-        place_of[members] = place
-        middle = ends[members].mean(axis=0)
-        heading = headings[members].mean(axis=0)
-        to_left = _to_left(heading / np.linalg.norm(heading))
-        left_m, right_m = of_ends[members].mean(axis=0)
-        left[place] = middle + left_m * to_left
-        right[place] = middle - right_m * to_left
+    directions = []
+    half_widths = []
+    ends = []
+    end_directions = []
+    for line in lines:
+        line_directions = _directions(line)
+        left_m = _half_width(line, side=1, borders=tree)
+        right_m = _half_width(line, side=-1, borders=tree)
+        directions.append(line_directions)
+        half_widths.append((left_m, right_m))
+        ends += [line[0], line[-1]]
+        end_directions += [line_directions[0], line_directions[-1]]
+    nodes = _Nodes(
+        ends=np.array(ends),
+        directions=np.array(end_directions),
+        half_widths_m=np.repeat(half_widths, 2, axis=0),
+    )
     lanelets: list[Lanelet] = []
-    known: dict[tuple[int, int], list[shapely.LineString]] = {}
-    for number, line in enumerate(lines):
-        entry = int(place_of[2 * number])
-        end = int(place_of[2 * number + 1])
-        shape = shapely.LineString(line)
-        alike = known.setdefault((entry, end), [])
-        if any(shapely.hausdorff_distance(shape, other) <= _JOIN_M for other in alike):
-            continue  # lines that lie on each other make one lane
-        alike.append(shape)
-        to_left = _to_left(_directions(line))[1:-1]
+    lanes_between: dict[tuple[int, int], list[shapely.LineString]] = {}
+    for index, line in enumerate(lines):
+        entry = int(nodes.node_of_end[2 * index])
+        end = int(nodes.node_of_end[2 * index + 1])
+        lane = shapely.LineString(line)
+        known_lanes = lanes_between.setdefault((entry, end), [])
+        if any(shapely.hausdorff_distance(lane, known) <= _JOIN_M for known in known_lanes):
+            continue
+        known_lanes.append(lane)
         inner = line[1:-1]
-        left_m, right_m = widths[number]
-        lanelets.append(
-            Lanelet(inner + left_m * to_left, inner - right_m * to_left, entry=entry, exit=end)
-        )
-    return LaneGraph(lanelets, left, right)
+        to_left = _to_left(directions[index])[1:-1]
+        left_m, right_m = half_widths[index]
+        left = inner + left_m * to_left
+        right = inner - right_m * to_left
+        lanelets.append(Lanelet(left, right, entry=entry, exit=end))
+    return LaneGraph(lanelets, left=nodes.left, right=nodes.right)
+
+
+class _Nodes:
+    """Nodes of a lane graph: groups of ends of lanes that are near and have about one direction.
+
+    Args:
+        ends: Ends of the centre lines in metres; lane i begins at end 2 i and stops at end
+            2 i + 1. (E, 2)
+        directions: Unit direction of travel at each end. (E, 2)
+        half_widths_m: Distances of the left and the right bound from the centre line of the lane
+            of each end, in metres. (E, 2)
+    """
+
+    def __init__(self, ends: FloatArray, directions: FloatArray, half_widths_m: FloatArray) -> None:
+        pairs = cKDTree(ends).query_pairs(_JOIN_M, output_type="ndarray")
+        first, second = pairs.T
+        cosines = (directions[first] * directions[second]).sum(axis=1)
+        agree = cosines > _MIN_SUCCESSOR_COSINE
+        groups = components(len(ends), first[agree], second[agree])
+        self.node_of_end = np.empty(len(ends), np.int64)
+        self.left = np.empty((len(groups), 2))
+        self.right = np.empty((len(groups), 2))
+        for node, members in enumerate(groups):
+            self.node_of_end[members] = node
+            middle = ends[members].mean(axis=0)
+            direction = directions[members].mean(axis=0)
+            to_left = _to_left(direction / np.linalg.norm(direction))
+            left_m, right_m = half_widths_m[members].mean(axis=0)
+            self.left[node] = middle + left_m * to_left
+            self.right[node] = middle - right_m * to_left
 
 
 def _to_left(directions: FloatArray) -> FloatArray:
-    """Turn directions to the left by a right angle. (..., 2)"""
+    """Rotate vectors to the left by a right angle. (..., 2)"""
     return np.stack([-directions[..., 1], directions[..., 0]], axis=-1)
 
 
-def _without_repeats(line: FloatArray) -> FloatArray:
-    """Line without vertices that equal the one before, which have no direction. (n, 2)"""
+def _drop_repeats(line: FloatArray) -> FloatArray:
+    """Drop vertices that equal their predecessor, where a line has no direction. (n, 2)"""
     differs = (np.diff(line, axis=0) != 0).any(axis=1)
     return line[np.append(True, differs)]
 
@@ -154,84 +192,94 @@ def _directions(line: FloatArray) -> FloatArray:
     return mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
 
 
-def _resampled(line: FloatArray) -> FloatArray:
-    """Points of a line at most `_STEP_M` apart, its ends among them. (n >= 2, 2)"""
+def _resample(line: FloatArray) -> FloatArray:
+    """Sample a line at equal steps of at most ``_STEP_M``, with both ends. -> (n >= 2, 2)"""
     shape = shapely.LineString(line)
     count = max(int(np.ceil(shape.length / _STEP_M)), 1) + 1
     distances = np.linspace(0.0, shape.length, count)
     return shapely.get_coordinates(shapely.line_interpolate_point(shape, distances))
 
 
-def _directed(lines: Sequence[FloatArray], pieces: Sequence[FloatArray]) -> list[FloatArray]:
-    """Turn lines into the direction that most of the pieces along them have. each (n, 2)"""
-    points = [_resampled(piece[:, :2]) for piece in pieces if len(piece) > 1]
+def _orient_lines(lines: Sequence[FloatArray], pieces: Sequence[FloatArray]) -> list[FloatArray]:
+    """Reverse the lines along which most pieces run in the opposite direction. each (n, 2)"""
+    points = [_resample(piece[:, :2]) for piece in pieces if len(piece) > 1]
     if not points:
         return list(lines)
     tree = cKDTree(np.concatenate(points))
     directions = np.concatenate([_directions(piece) for piece in points])
-    directed = []
+    oriented = []
     for line in lines:
-        samples = _resampled(line[:, :2])
-        _, nearest = tree.query(samples, k=8, distance_upper_bound=_JOIN_M)
-        rows, columns = np.nonzero(nearest < len(directions))
-        found = directions[nearest[rows, columns]]
-        cosines = (_directions(samples)[rows] * found).sum(axis=1)
-        votes = np.sign(cosines[np.abs(cosines) > _ALONG]).sum()
-        directed.append(line[::-1] if votes < 0 else line)
-    return directed
+        samples = _resample(line[:, :2])
+        _, neighbours = tree.query(samples, k=8, distance_upper_bound=_JOIN_M)
+        rows, columns = np.nonzero(neighbours < len(directions))  # others are missing neighbours
+        neighbour_directions = directions[neighbours[rows, columns]]
+        cosines = (_directions(samples)[rows] * neighbour_directions).sum(axis=1)
+        is_parallel = np.abs(cosines) > _MIN_PARALLEL_COSINE
+        votes = np.sign(cosines[is_parallel]).sum()
+        oriented.append(line[::-1] if votes < 0 else line)
+    return oriented
 
 
 def _split(lines: Sequence[FloatArray]) -> list[FloatArray]:
-    """Split lines where another one begins or ends on them in its direction. each (n, 2)"""
+    """Split lines where another line begins or ends on them in their direction.
+
+    Args:
+        lines: Lines in metres; those of 2 m and less are dropped. each (n, 2)
+
+    Returns:
+        Parts of the lines, sampled at most ``_STEP_M`` apart. each (n, 2)
+    """
     long_lines = []
     ends = []
-    headings = []
+    end_directions = []
     for line in lines:
         if shapely.LineString(line).length <= _SHORTEST_M:
             continue
         directions = _directions(line)
         long_lines.append(line)
         ends += [line[0], line[-1]]
-        headings += [directions[0], directions[-1]]
+        end_directions += [directions[0], directions[-1]]
     tree = shapely.STRtree(shapely.points(ends) if ends else [])
     parts = []
-    for number, line in enumerate(long_lines):
+    for index, line in enumerate(long_lines):
         shape = shapely.LineString(line)
-        cuts = [0.0, shape.length]
-        for end in sorted(tree.query(shape, predicate="dwithin", distance=_JOIN_M).tolist()):
-            if end // 2 == number:
+        cuts = [0.0, shape.length]  # positions along the line in metres
+        near_ends = tree.query(shape, predicate="dwithin", distance=_JOIN_M)
+        for end in sorted(near_ends.tolist()):
+            if end // 2 == index:
                 continue
             cut = shape.project(shapely.Point(ends[end]))
             around = np.clip([cut - 0.5, cut + 0.5], 0.0, shape.length)
             before, after = shapely.get_coordinates(shapely.line_interpolate_point(shape, around))
-            follows = (after - before) @ headings[end] > _ALIKE
+            follows = (after - before) @ end_directions[end] > _MIN_SUCCESSOR_COSINE
             if follows and min(abs(cut - other) for other in cuts) > _SHORTEST_M:
                 cuts.append(cut)
         cuts.sort()
-        for low, high in pairwise(cuts):
-            part = shapely.ops.substring(shape, low, high)
-            parts.append(_resampled(shapely.get_coordinates(part)))
+        for start, stop in pairwise(cuts):
+            part = shapely.ops.substring(shape, start, stop)
+            parts.append(_resample(shapely.get_coordinates(part)))
     return parts
 
 
-def _places(ends: FloatArray, headings: FloatArray) -> list[IntArray]:
-    """Group ends of lanes that are near each other and have about one direction. each (n,)"""
-    pairs = cKDTree(ends).query_pairs(_JOIN_M, output_type="ndarray")
-    first, second = pairs.T
-    alike = (headings[first] * headings[second]).sum(axis=1) > _ALIKE
-    return components(len(ends), first[alike], second[alike])
-
-
 def _half_width(line: FloatArray, side: int, borders: shapely.STRtree) -> float:
-    """Distance from a centre line to the border beside it, in metres; side 1 is left, -1 right."""
+    """Median distance from a centre line to the borders beside it.
+
+    Args:
+        line: Centre line in metres. (n, 2)
+        side: 1 for the left side, -1 for the right side.
+        borders: Dividers and boundaries.
+
+    Returns:
+        Distance in metres, ``HALF_WIDTH_M`` if most vertices have no border beside them.
+    """
     across = side * _MOST_HALF_WIDTH_M * _to_left(_directions(line))
     rays = shapely.linestrings(np.stack([line, line + across], axis=1))
-    rows, found = borders.query(rays, predicate="intersects")
-    nearest = np.full(len(line), np.inf)
+    rows, border_indices = borders.query(rays, predicate="intersects")
     starts = shapely.points(line[rows])
-    crossings = shapely.intersection(rays[rows], borders.geometries[found])
-    np.minimum.at(nearest, rows, shapely.distance(starts, crossings))
-    hits = nearest[np.isfinite(nearest)]
-    if 2 * len(hits) < len(line):
+    crossings = shapely.intersection(rays[rows], borders.geometries[border_indices])
+    nearest_m = np.full(len(line), np.inf)
+    np.minimum.at(nearest_m, rows, shapely.distance(starts, crossings))
+    finite_m = nearest_m[np.isfinite(nearest_m)]
+    if 2 * len(finite_m) < len(line):
         return HALF_WIDTH_M
-    return max(float(np.median(hits)), 0.5)
+    return max(float(np.median(finite_m)), _MIN_HALF_WIDTH_M)

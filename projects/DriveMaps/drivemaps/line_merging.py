@@ -1,8 +1,9 @@
-"""Lines of many frames merged into one set of lines.
+"""Merging of the lines of many frames into one set of lines.
 
-Each vertex looks across its line for the same line in the other frames and moves to their mean,
-weighted by certainty. The lines of one object then lie on each other; the longest well-supported
-ones are kept, others add what these do not cover, and ends that meet are joined.
+Each vertex is matched, across its line, with the lines of the other frames and moves to their
+mean, weighted by certainty. The lines of one object then lie on top of each other. The longest
+well-supported lines are selected first, other lines add the parts that are not covered yet, and
+ends that meet are joined.
 """
 
 from dataclasses import dataclass, replace
@@ -19,27 +20,28 @@ from gsmap.structures.elements import BoolArray, FloatArray, IntArray
 from gsmap.structures.polylines import arc_lengths
 from gsmap.utils.errors import InputError
 
-_REACH_M = 1.5  # how far across its line a vertex looks for the same line in another frame
-_MAX_TURN_DEG = 30.0  # between two lines that may be the same
+_REACH_M = 1.5  # largest distance, across a line, of a vertex from its matches
+_MAX_TURN_DEG = 30.0  # largest angle between two lines that are matched
 _STEP_M = 1.0  # largest distance between vertices while lines are merged
-_AT_ONCE = 2000  # vertices whose crossings are looked for together; memory grows with them
-_ROUNDS = 3  # how many times vertices move to the mean
-_MOST_M = 250_000.0  # length of all lines of a class of a drive, beside _MOST_PER_FRAME_M
-_MOST_PER_FRAME_M = 5_000.0
-_MOST_PAIRS = 2 * 10**7  # of vertices and segments that are near each other
-_MOST_PAIRS_PER_FRAME = 16  # of a vertex, where there are more
+_CHUNK_SIZE = 2000  # vertices that are matched at once; memory grows with it
+_NUM_ROUNDS = 3  # times that all vertices move to the mean
+_MOST_M = 250_000.0  # a class of a drive may have so much length,
+_MOST_PER_FRAME_M = 5_000.0  # and so much more for each frame
+_MOST_PAIRS = 2 * 10**7  # pairs of a vertex and a segment near it
+_MOST_PAIRS_PER_FRAME = 16  # pairs per vertex and frame, if that allows more
 
 
 @dataclass(frozen=True, eq=False)
-class _Strands:
-    """The lines of one class in all frames, as dense vertices.
+class _DenseLines:
+    """Densely sampled lines of one class from all frames.
 
     Args:
-        points: Vertices of all lines. (M, 2)
-        offsets: Line i owns ``offsets[i]:offsets[i + 1]``. (N + 1,)
-        frames: Frame of each vertex. (M,)
-        scores: Score of its line. (M,)
-        weights: Its weight in a mean: score over variance across the line. (M,)
+        points: Vertices of all lines in metres, in the global frame. (M, 2)
+        offsets: Line i has the vertices ``offsets[i]:offsets[i + 1]``. (N + 1,)
+        frames: Index of the frame of each vertex. (M,)
+        scores: Score of the line of each vertex, in [0, 1]. (M,)
+        weights: Weight of each vertex in a mean: score over variance across the line, in 1 / m^2.
+            (M,)
     """
 
     points: FloatArray
@@ -49,76 +51,87 @@ class _Strands:
     weights: FloatArray
 
     @cached_property
-    def owners(self) -> IntArray:
-        """Line of each vertex. (M,)"""
+    def line_indices(self) -> IntArray:
+        """Index of the line of each vertex. (M,)"""
         return np.repeat(np.arange(len(self.offsets) - 1), np.diff(self.offsets))
 
     @cached_property
-    def inner(self) -> IntArray:
-        """Vertices that a segment starts at. (S,)"""
+    def segment_starts(self) -> IntArray:
+        """Vertices at which a segment starts: all but the last one of each line. (S,)"""
         return np.setdiff1d(np.arange(len(self.points)), self.offsets[1:] - 1)
 
 
 @dataclass(frozen=True, eq=False)
-class _Crossings:
-    """Where the line across a vertex meets the same line in another frame.
+class _Matches:
+    """Matches of vertices with segments of other lines, C in number.
 
     Args:
-        vertices: The vertex. (C,)
-        segments: First vertex of the segment that is met. (C,)
-        distances: How far to the left of the vertex's line that is, in metres. (C,)
-        normals: Direction to the left at every vertex. (M, 2)
+        vertices: Index of the vertex. (C,)
+        segments: Index of the first vertex of the segment. (C,)
+        distances: Distance from the vertex to the segment along the normal of the vertex, in
+            metres; positive on the left. (C,)
     """
 
     vertices: IntArray
     segments: IntArray
     distances: FloatArray
-    normals: FloatArray
+
+    def select(self, index: IntArray | BoolArray) -> "_Matches":
+        """Select matches by their indices (K,) or a mask (C,)."""
+        return _Matches(
+            vertices=self.vertices[index],
+            segments=self.segments[index],
+            distances=self.distances[index],
+        )
 
 
 def merge_lines(drive: Drive, label: int, config: MergeConfig) -> list[tuple[FloatArray, float]]:
     """Merge the lines of one class.
 
+    The confidence at a vertex is the sum of the scores of the frames that have a line there,
+    divided by the number of frames that have the vertex in their range, and at most 1.
+
     Args:
         drive: Frames with their predictions.
-        label: The class.
-        config: Rules.
+        label: Index of the class.
+        config: Parameters of merging.
 
     Returns:
-        Vertices (n, 2) and confidence of each line: the mean over its length of the share of
-        frames, of those that see the place, that found it, weighted by their scores.
+        Vertices in metres in the global frame, (n, 2), and mean confidence in [0, 1] of each line.
 
     Raises:
-        InputError: If the lines are longer or lie closer together than those of a drive do.
+        InputError: If the lines are too long or too close together to be merged in bounded time.
     """
-    _require_moderate_length(drive, label)
-    strands = _strands(drive, label, config)
-    if not len(strands.points):
+    _check_total_length(drive, label)
+    lines = _sample_lines(drive, label=label, config=config)
+    num_vertices = len(lines.points)
+    if num_vertices == 0:
         return []
-    for _ in range(_ROUNDS):
-        strands = _contracted(strands, _crossings(strands))
-    crossings = _crossings(strands)
-    support = strands.scores + np.bincount(
-        crossings.vertices, strands.scores[crossings.segments], len(strands.points)
-    )
-    share = support / np.maximum(drive.times_seen(strands.points), 1)
-    confidence = np.minimum(median_filter(share, 3), 1.0)  # a sharp corner's vertex meets no line
-    parts = _uncovered_parts(strands, crossings, confidence, confidence >= config.min_confidence)
-    merged = stitch([np.column_stack([strands.points[p], confidence[p]]) for p in parts])
-    long = [line for line in merged if arc_lengths(line)[-1] >= MIN_LENGTH_M]
-    return [(line[:, :2], float(line[:, 2].mean())) for line in long]
+    for _ in range(_NUM_ROUNDS):
+        normals = _normals(lines)
+        lines = _move_to_means(lines, normals, _match_vertices(lines, normals))
+    matches = _match_vertices(lines, _normals(lines))
+    matched_scores = lines.scores[matches.segments]
+    support = lines.scores + np.bincount(matches.vertices, matched_scores, minlength=num_vertices)
+    share = support / np.maximum(drive.times_seen(lines.points), 1)
+    smooth_share = median_filter(share, 3)  # the vertex of a sharp corner has no match
+    confidence = np.minimum(smooth_share, 1.0)
+    is_confident = confidence >= config.min_confidence
+    parts = _select_parts(lines, matches=matches, confidence=confidence, is_confident=is_confident)
+    columns = np.column_stack([lines.points, confidence])  # x, y, confidence. (M, 3)
+    merged = []
+    for line in stitch([columns[part] for part in parts]):
+        if arc_lengths(line)[-1] >= MIN_LENGTH_M:
+            merged.append((line[:, :2], float(line[:, 2].mean())))
+    return merged
 
 
-def _require_moderate_length(drive: Drive, label: int) -> None:
-    """Refuse lines that take longer to merge than any drive does.
-
-    Raises:
-        InputError: If the lines of a class are too long.
-    """
+def _check_total_length(drive: Drive, label: int) -> None:
+    """Raise InputError if the lines of a class are too long to be merged in bounded time."""
     total_m = 0.0
     for frame in drive.frames:
-        chosen = frame.elements.select(frame.elements.labels == label)
-        total_m += sum(float(arc_lengths(line)[-1]) for line in chosen.polylines)
+        elements = frame.elements.select(frame.elements.labels == label)
+        total_m += sum(float(arc_lengths(line)[-1]) for line in elements.polylines)
     most_m = _MOST_M + _MOST_PER_FRAME_M * len(drive.frames)
     if total_m > most_m:
         raise InputError(
@@ -128,166 +141,215 @@ def _require_moderate_length(drive: Drive, label: int) -> None:
         )
 
 
-def _strands(drive: Drive, label: int, config: MergeConfig) -> _Strands:
-    """Gather the lines of one class, with vertices at most a step apart."""
-    rows, counts = [np.zeros((0, 5))], [0]
-    for number, frame in enumerate(drive.frames):
+def _sample_lines(drive: Drive, label: int, config: MergeConfig) -> _DenseLines:
+    """Sample the lines of one class, with vertices at most ``_STEP_M`` apart."""
+    points = [np.zeros((0, 2))]
+    variances = [np.zeros(0)]
+    frames = [np.zeros(0, np.int64)]
+    scores = [np.zeros(0)]
+    counts = [0]
+    for frame_index, frame in enumerate(drive.frames):
         elements = frame.elements
-        columns = np.column_stack([elements.points, config.variances(frame)])
-        for i in np.flatnonzero(elements.labels == label).tolist():
-            line = columns[elements.offsets[i] : elements.offsets[i + 1]]
+        vertex_variances = config.variances(frame)
+        for index in np.flatnonzero(elements.labels == label).tolist():
+            vertices = slice(elements.offsets[index], elements.offsets[index + 1])
+            line = elements.points[vertices]
             along = arc_lengths(line)
             if along[-1] == 0.0:
                 continue
-            stops = np.union1d(along, np.arange(0.0, along[-1], _STEP_M))
-            dense = np.stack([np.interp(stops, along, column) for column in line.T], axis=1)
-            score = np.full(len(dense), elements.confidence[i])
-            rows.append(np.column_stack([dense, np.full(len(dense), number), score]))
-            counts.append(len(dense))
-    x, y, variance, frames, scores = np.concatenate(rows).T
-    return _Strands(
-        np.stack([x, y], axis=1),
-        np.cumsum(counts),
-        frames.astype(np.int64),
-        scores,
-        scores / variance,
+            steps = np.arange(0.0, along[-1], _STEP_M)
+            positions = np.union1d(along, steps)
+            x = np.interp(positions, along, line[:, 0])
+            y = np.interp(positions, along, line[:, 1])
+            points.append(np.stack([x, y], axis=1))
+            variances.append(np.interp(positions, along, vertex_variances[vertices]))
+            frames.append(np.full(len(positions), frame_index))
+            scores.append(np.full(len(positions), elements.confidence[index]))
+            counts.append(len(positions))
+    all_scores = np.concatenate(scores)
+    return _DenseLines(
+        points=np.concatenate(points),
+        offsets=np.cumsum(counts),
+        frames=np.concatenate(frames),
+        scores=all_scores,
+        weights=all_scores / np.concatenate(variances),
     )
 
 
-def _normals(strands: _Strands) -> FloatArray:
-    """Return the unit vector to the left of the line at every vertex. (M, 2)"""
-    after, before = np.arange(len(strands.points)) + 1, np.arange(len(strands.points)) - 1
-    after[strands.offsets[1:] - 1] -= 1
-    before[strands.offsets[:-1]] += 1
-    along = strands.points[after] - strands.points[before]
+def _normals(lines: _DenseLines) -> FloatArray:
+    """Unit vector to the left of the line at each vertex. (M, 2)"""
+    vertices = np.arange(len(lines.points))
+    following = vertices + 1
+    following[lines.offsets[1:] - 1] -= 1
+    previous = vertices - 1
+    previous[lines.offsets[:-1]] += 1
+    along = lines.points[following] - lines.points[previous]
     left = np.stack([-along[:, 1], along[:, 0]], axis=1)
     return left / np.maximum(np.linalg.norm(left, axis=1, keepdims=True), 1e-9)
 
 
-def _crossings(strands: _Strands) -> _Crossings:
-    """Find each vertex's line in the other frames.
+def _match_vertices(lines: _DenseLines, normals: FloatArray) -> _Matches:
+    """Match each vertex with the nearest line of about its direction in each other frame.
 
-    In every frame that is the nearest line with about the same direction, unless the vertex's own
-    frame has a line that is nearer to it: lines of one frame are different things.
+    There is no match if the frame of the vertex has another line at less than twice the distance:
+    lines of one frame belong to different objects.
+
+    Args:
+        lines: Lines of all frames.
+        normals: Unit vector to the left of the line at each vertex. (M, 2)
+
+    Returns:
+        At most one match per vertex and frame, ordered by vertex.
+
+    Raises:
+        InputError: If more vertices and segments than ``_MOST_PAIRS`` are near each other.
     """
-    normals, inner, points = _normals(strands), strands.inner, strands.points
-    ends = np.stack([points[inner], points[inner + 1]])
-    low, high = ends.min(axis=0), ends.max(axis=0)
-    tree = shapely.STRtree(shapely.box(*low.T, *high.T))
-    frames = len(np.unique(strands.frames))
-    budget = max(_MOST_PAIRS, _MOST_PAIRS_PER_FRAME * frames * len(points))
-    found = []
-    for start in range(0, len(points), _AT_ONCE):
-        chosen = np.arange(start, min(start + _AT_ONCE, len(points)))
-        pairs = _near_pairs(chosen, strands, normals, tree)
-        budget -= pairs.shape[1]
-        if budget < 0:
+    points = lines.points
+    starts = points[lines.segment_starts]
+    ends = points[lines.segment_starts + 1]
+    tree = shapely.STRtree(_boxes(np.minimum(starts, ends), np.maximum(starts, ends)))
+    num_frames = len(np.unique(lines.frames))
+    num_pairs_left = max(_MOST_PAIRS, _MOST_PAIRS_PER_FRAME * num_frames * len(points))
+    reach = np.abs(_REACH_M * normals)
+    chunks = []
+    for start in range(0, len(points), _CHUNK_SIZE):
+        chunk = slice(start, start + _CHUNK_SIZE)
+        boxes = _boxes(points[chunk] - reach[chunk], points[chunk] + reach[chunk])
+        positions, segments = tree.query(boxes)
+        num_pairs_left -= len(positions)
+        if num_pairs_left < 0:
             raise InputError(
                 f"the {len(points)} vertices of lines of one class, at most {_STEP_M:g} m apart, "
                 f"lie too close together: more than {_MOST_PAIRS:.0e} pairs, and "
                 f"{_MOST_PAIRS_PER_FRAME} of a vertex and frame, are within {_REACH_M:g} m; raise "
                 "--score-thr."
             )
-        found.append(_crossings_of(chosen, strands, normals, pairs))
-    vertices, segments, distances = map(np.concatenate, zip(*found, strict=True))
-    return _Crossings(vertices, segments, distances, normals)
+        candidates = _match_pairs(
+            lines, normals, vertices=start + positions, segments=lines.segment_starts[segments]
+        )
+        chunks.append(_select_matches(lines, candidates))
+    return _concatenate(chunks)
 
 
-def _near_pairs(
-    chosen: IntArray, strands: _Strands, normals: FloatArray, tree: shapely.STRtree
-) -> IntArray:
-    """Find the segments near some vertices: positions in ``chosen`` and in the tree. (2, n)
-
-    Args:
-        chosen: The vertices, one after another. (m,)
-        strands: The lines.
-        normals: Direction to the left at every vertex. (M, 2)
-        tree: Boxes of the segments, in the order of ``strands.inner``.
-    """
-    centres = strands.points[chosen]
-    reach = np.abs(_REACH_M * normals[chosen])
-    across = shapely.box(*(centres - reach).T, *(centres + reach).T)
-    return tree.query(across)
-
-
-def _crossings_of(
-    chosen: IntArray, strands: _Strands, normals: FloatArray, pairs: IntArray
-) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return vertices, segments and distances of the crossings of some vertices. (C,) each
-
-    Args:
-        chosen: The vertices, one after another. (m,)
-        strands: The lines.
-        normals: Direction to the left at every vertex. (M, 2)
-        pairs: Vertices and segments that are near each other (`_near_pairs`). (2, n)
-    """
-    points, owners = strands.points, strands.owners
-    vertices, segments = chosen[pairs[0]], strands.inner[pairs[1]]
-    other = owners[vertices] != owners[segments]
-    vertices, segments = vertices[other], segments[other]
-    n, here = normals[vertices], points[vertices]
-    first, second = points[segments] - here, points[segments + 1] - here
-    before, after = (v[:, 1] * n[:, 0] - v[:, 0] * n[:, 1] for v in (first, second))
-    step = after - before  # the segment's extent along the vertex's line
-    share = -before / np.where(step == 0.0, np.inf, step)
-    distances = (n * (first + share[:, None] * (second - first))).sum(axis=1)
-    lengths = np.linalg.norm(second - first, axis=1)
-    kept = (
-        (before * after <= 0.0)
-        & (np.abs(step) > np.cos(np.radians(_MAX_TURN_DEG)) * lengths)
-        & (np.abs(distances) <= _REACH_M)
+def _concatenate(chunks: list[_Matches]) -> _Matches:
+    """Concatenate matches."""
+    vertices = []
+    segments = []
+    distances = []
+    for chunk in chunks:
+        vertices.append(chunk.vertices)
+        segments.append(chunk.segments)
+        distances.append(chunk.distances)
+    return _Matches(
+        vertices=np.concatenate(vertices),
+        segments=np.concatenate(segments),
+        distances=np.concatenate(distances),
     )
-    vertices, segments, distances = vertices[kept], segments[kept], distances[kept]
-    same_frame = strands.frames[vertices] == strands.frames[segments]
-    nearer = _nearer(vertices - chosen[0], distances, same_frame, len(chosen))
-    mutual = ~same_frame & nearer
-    vertices, segments, distances = vertices[mutual], segments[mutual], distances[mutual]
-    order = np.lexsort((segments, np.abs(distances), strands.frames[segments], vertices))
-    key = np.stack([vertices, strands.frames[segments]])[:, order]
-    new = np.append(True, (key[:, 1:] != key[:, :-1]).any(axis=0))[: len(order)]
-    best = order[new]
-    return vertices[best], segments[best], distances[best]
 
 
-def _nearer(
-    vertices: IntArray, distances: FloatArray, same_frame: BoolArray, count: int
-) -> BoolArray:
-    """Whether what is met is nearer to the vertex than to the next lines of its frame. (C,)"""
-    limits = []
-    for side in (1.0, -1.0):
-        limit = np.full(count, np.inf)
-        beside = same_frame & (side * distances >= 0.0)
-        np.minimum.at(limit, vertices[beside], side * distances[beside])
-        limits.append(side * distances <= limit[vertices] / 2.0)
-    return limits[0] & limits[1]
+def _boxes(low: FloatArray, high: FloatArray) -> np.ndarray:
+    """Axis-aligned rectangles as polygons. (n, 2), (n, 2) -> (n,)"""
+    return shapely.box(low[:, 0], low[:, 1], high[:, 0], high[:, 1])
 
 
-def _contracted(strands: _Strands, crossings: _Crossings) -> _Strands:
-    """Move every vertex across its line to the weighted mean of its line in all frames."""
-    weights, count = strands.weights[crossings.segments], len(strands.points)
-    total = strands.weights + np.bincount(crossings.vertices, weights, count)
-    shift = np.bincount(crossings.vertices, weights * crossings.distances, count) / total
-    return replace(strands, points=strands.points + shift[:, None] * crossings.normals)
+def _match_pairs(
+    lines: _DenseLines, normals: FloatArray, vertices: IntArray, segments: IntArray
+) -> _Matches:
+    """Match vertices with segments that cross their normals at about a right angle.
+
+    Args:
+        lines: Lines of all frames.
+        normals: Unit vector to the left of the line at each vertex. (M, 2)
+        vertices: Index of the vertex of each pair. (pairs,)
+        segments: Index of the first vertex of the segment of each pair. (pairs,)
+
+    Returns:
+        Matches of different lines, also of one frame, in the order of the pairs.
+    """
+    differ = lines.line_indices[vertices] != lines.line_indices[segments]
+    vertices = vertices[differ]
+    segments = segments[differ]
+    normal = normals[vertices]
+    vertex = lines.points[vertices]
+    start = lines.points[segments] - vertex
+    end = lines.points[segments + 1] - vertex
+    start_along = start[:, 1] * normal[:, 0] - start[:, 0] * normal[:, 1]
+    end_along = end[:, 1] * normal[:, 0] - end[:, 0] * normal[:, 1]
+    extent = end_along - start_along  # of the segment along the line of the vertex, in metres
+    fraction = -start_along / np.where(extent == 0.0, np.inf, extent)
+    distances = (normal * (start + fraction[:, None] * (end - start))).sum(axis=1)
+    lengths = np.linalg.norm(end - start, axis=1)
+    crosses = start_along * end_along <= 0.0
+    is_parallel = np.abs(extent) > np.cos(np.radians(_MAX_TURN_DEG)) * lengths
+    is_near = np.abs(distances) <= _REACH_M
+    return _Matches(vertices, segments, distances).select(crosses & is_parallel & is_near)
 
 
-def _uncovered_parts(
-    strands: _Strands, crossings: _Crossings, confidence: FloatArray, kept: BoolArray
+def _select_matches(lines: _DenseLines, candidates: _Matches) -> _Matches:
+    """Select the nearest match of each vertex in each other frame, ordered by vertex and frame."""
+    vertices = candidates.vertices
+    in_one_frame = lines.frames[vertices] == lines.frames[candidates.segments]
+    unambiguous = ~in_one_frame
+    distinct, rows = np.unique(vertices, return_inverse=True)
+    for side in (1.0, -1.0):  # left and right
+        distances = side * candidates.distances
+        is_rival = in_one_frame & (distances >= 0.0)
+        rival_m = np.full(len(distinct), np.inf)
+        np.minimum.at(rival_m, rows[is_rival], distances[is_rival])
+        unambiguous &= distances <= rival_m[rows] / 2.0
+    matches = candidates.select(unambiguous)
+    frames = lines.frames[matches.segments]
+    order = np.lexsort((matches.segments, np.abs(matches.distances), frames, matches.vertices))
+    matches = matches.select(order)
+    is_new_vertex = np.diff(matches.vertices, prepend=-1) != 0
+    is_new_frame = np.diff(frames[order], prepend=-1) != 0
+    return matches.select(is_new_vertex | is_new_frame)
+
+
+def _move_to_means(lines: _DenseLines, normals: FloatArray, matches: _Matches) -> _DenseLines:
+    """Move each vertex along its normal to the weighted mean of its line in all frames."""
+    num_vertices = len(lines.points)
+    weights = lines.weights[matches.segments]
+    moments = weights * matches.distances
+    total = lines.weights + np.bincount(matches.vertices, weights, minlength=num_vertices)
+    shift = np.bincount(matches.vertices, moments, minlength=num_vertices) / total
+    return replace(lines, points=lines.points + shift[:, None] * normals)
+
+
+def _select_parts(
+    lines: _DenseLines, matches: _Matches, confidence: FloatArray, is_confident: BoolArray
 ) -> list[slice]:
-    """Choose parts of lines that together cover all lines once, the best supported first."""
-    owners = strands.owners
-    order = np.argsort(owners[crossings.segments], kind="stable")
-    segments, vertices = crossings.segments[order], crossings.vertices[order]
-    bounds = np.searchsorted(owners[segments], np.arange(len(strands.offsets)))
-    support = np.add.reduceat(confidence * kept, strands.offsets[:-1])
-    free, chosen = kept.copy(), []
-    for i in np.argsort(-support.round(9), kind="stable").tolist():
-        begin, end = strands.offsets[i : i + 2].tolist()
-        edges = np.flatnonzero(np.diff(np.r_[False, free[begin:end], False])).reshape(-1, 2)
-        of_line = slice(bounds[i], bounds[i + 1])
-        for a, b in (begin + edges).tolist():
-            if arc_lengths(strands.points[a:b])[-1] < JOIN_M:
+    """Select parts of lines that together cover all lines once, the best supported line first.
+
+    Args:
+        lines: Lines of all frames, which lie on top of each other.
+        matches: Matches of their vertices.
+        confidence: Confidence of each vertex, in [0, 1]. (M,)
+        is_confident: Vertices that may be selected. (M,)
+
+    Returns:
+        Vertices of each part, of one line.
+    """
+    matched_lines = lines.line_indices[matches.segments]
+    matches = matches.select(np.argsort(matched_lines, kind="stable"))
+    line_bounds = np.searchsorted(
+        lines.line_indices[matches.segments], np.arange(len(lines.offsets))
+    )
+    support = np.add.reduceat(confidence * is_confident, lines.offsets[:-1])
+    is_free = is_confident.copy()
+    parts = []
+    for index in np.argsort(-support.round(9), kind="stable").tolist():
+        line_start = int(lines.offsets[index])
+        line_end = int(lines.offsets[index + 1])
+        line_matches = slice(line_bounds[index], line_bounds[index + 1])
+        vertices = matches.vertices[line_matches]
+        segments = matches.segments[line_matches]
+        changes = np.diff(np.r_[False, is_free[line_start:line_end], False])
+        edges = line_start + np.flatnonzero(changes).reshape(-1, 2)
+        for start, end in edges.tolist():
+            if arc_lengths(lines.points[start:end])[-1] < JOIN_M:
                 continue
-            chosen.append(slice(a, b))
-            met = (segments[of_line] >= a) & (segments[of_line] < b - 1)
-            free[vertices[of_line][met]] = False
-    return chosen
+            parts.append(slice(start, end))
+            is_covered = (segments >= start) & (segments < end - 1)
+            is_free[vertices[is_covered]] = False
+    return parts

@@ -1,4 +1,4 @@
-"""A drive and its map as an MCAP file for Foxglove."""
+"""MCAP files of drives and their maps for Foxglove."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,133 +17,185 @@ from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.extras import import_extra
 from gsmap.utils.files import atomic_write
 
-_GLOBAL, _FRAME, _GROUND = "global", "vehicle", "base_footprint"  # x ahead, y left, on the road
+_GLOBAL = "global"
+_FRAME = "vehicle"  # the annotation frame
+_GROUND = "base_footprint"  # x ahead, y left, on the road
 
 
 def write_mcap(path: str | Path, replay: Replay) -> None:
-    """Write cameras, predictions, their Gaussians as ellipses, and the growing map (``.mcap``).
+    """Write a drive as an MCAP file (``.mcap``).
+
+    It contains cameras, predictions, their Gaussians as ellipses, and the growing map.
+
+    Args:
+        path: File to write.
+        replay: Drive and its map.
 
     Raises:
         FileNotFoundError: If an image is missing.
-        BrokenSampleError: If a file is no image, or damaged; nothing of it is copied.
+        BrokenSampleError: If an image is damaged or not an image; none of its content is written.
         RuntimeError: If ``foxglove-sdk`` is missing.
     """
     foxglove = import_extra("foxglove", "viz")
     log = _Log(foxglove.Context(), replay.colours)
     with atomic_write(path, "wb") as file, foxglove.open_mcap(file, context=log.context):
         for moment in replay.moments():
-            sample, time_ns = moment.frame.sample, moment.frame.sample.timestamp_ns
-            log.transform(_GLOBAL, _FRAME, sample.global_from_frame, time_ns)
-            ground = invert_rigid(ground_from_frame(sample, replay.frame_kind, replay.ground_z_m))
-            log.transform(_FRAME, _GROUND, ground, time_ns)
+            sample = moment.frame.sample
+            time_ns = sample.timestamp_ns
+            frame_from_ground = invert_rigid(
+                ground_from_frame(sample, replay.frame_kind, replay.ground_z_m)
+            )
+            log.transform(_GLOBAL, child=_FRAME, pose=sample.global_from_frame, time_ns=time_ns)
+            log.transform(_FRAME, child=_GROUND, pose=frame_from_ground, time_ns=time_ns)
             for camera in sample.cameras:
                 log.camera(camera, replay.data_root, time_ns)
             log.predictions(moment, time_ns)
-            log.lines("/map", _GLOBAL, moment.seen, time_ns)
+            log.lines("/map", frame=_GLOBAL, lines=moment.map_lines, time_ns=time_ns)
 
 
 class _Log:
-    """Foxglove's messages, each on a channel of its own.
+    """Writer of Foxglove messages, with one channel per topic.
 
     Args:
-        context: Where channels belong.
+        context: Context of the channels.
         colours: Colour of each class, ``#RRGGBB``.
     """
 
     def __init__(self, context: Any, colours: Sequence[str]) -> None:
         self.context = context
         self._messages = import_extra("foxglove.messages", "viz")
-        self._kinds = import_extra("foxglove.channels", "viz")
+        self._channel_kinds = import_extra("foxglove.channels", "viz")
         self._channels: dict[str, Any] = {}
-        self._colours = [
-            self._messages.Color(**dict(zip("rgba", to_rgba(colour), strict=True)))
-            for colour in colours
-        ]
+        self._colours = []
+        for colour in colours:
+            r, g, b, a = to_rgba(colour)
+            self._colours.append(self._messages.Color(r=r, g=g, b=b, a=a))
 
     def _send(self, topic: str, message: Any, time_ns: int) -> None:
+        """Log a message to the channel of its topic, which is created if needed."""
         if topic not in self._channels:
-            kind = getattr(self._kinds, f"{type(message).__name__}Channel")
-            self._channels[topic] = kind(topic, context=self.context)
+            create_channel = getattr(self._channel_kinds, f"{type(message).__name__}Channel")
+            self._channels[topic] = create_channel(topic, context=self.context)
         self._channels[topic].log(message, log_time=time_ns)
 
     def _stamp(self, time_ns: int) -> Any:
-        return self._messages.Timestamp(*divmod(time_ns, 10**9))
+        """Convert a time to a message."""
+        seconds, nanoseconds = divmod(time_ns, 10**9)
+        return self._messages.Timestamp(seconds, nanoseconds)
 
     def transform(self, parent: str, child: str, pose: FloatArray, time_ns: int) -> None:
-        """Log where a frame stands in its parent."""
-        m, (x, y, z) = self._messages, pose[:3, 3].tolist()
-        turn = dict(zip("xyzw", Rotation.from_matrix(pose[:3, :3]).as_quat().tolist(), strict=True))
-        message = m.FrameTransform(
+        """Log the pose of a frame in its parent frame.
+
+        Args:
+            parent: Name of the parent frame.
+            child: Name of the frame.
+            pose: Transform from the frame to its parent, in metres. (4, 4)
+            time_ns: Time in nanoseconds.
+        """
+        messages = self._messages
+        x, y, z = pose[:3, 3].tolist()
+        turn_x, turn_y, turn_z, turn_w = Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
+        message = messages.FrameTransform(
             timestamp=self._stamp(time_ns),
             parent_frame_id=parent,
             child_frame_id=child,
-            translation=m.Vector3(x=x, y=y, z=z),
-            rotation=m.Quaternion(**turn),
+            translation=messages.Vector3(x=x, y=y, z=z),
+            rotation=messages.Quaternion(x=turn_x, y=turn_y, z=turn_z, w=turn_w),
         )
         self._send(f"/tf/{child}", message, time_ns)
 
     def camera(self, camera: CameraRecord, data_root: Path | None, time_ns: int) -> None:
-        """Log a camera's place, calibration and image."""
-        m, stamp = self._messages, self._stamp(time_ns)
-        self.transform(_FRAME, camera.name, invert_rigid(camera.cam_from_frame), time_ns)
+        """Log the pose, the calibration and, with a data root, the image of a camera.
+
+        Args:
+            camera: Camera of a sample.
+            data_root: Folder that image paths are relative to, or None to leave images out.
+            time_ns: Time in nanoseconds.
+        """
+        messages = self._messages
+        name = camera.name
+        frame_from_cam = invert_rigid(camera.cam_from_frame)
+        self.transform(_FRAME, child=name, pose=frame_from_cam, time_ns=time_ns)
         projection = np.column_stack([camera.intrinsics, np.zeros(3)])
-        calibration = m.CameraCalibration(
-            timestamp=stamp,
-            frame_id=camera.name,
+        calibration = messages.CameraCalibration(
+            timestamp=self._stamp(time_ns),
+            frame_id=name,
             width=camera.width,
             height=camera.height,
             K=camera.intrinsics.ravel().tolist(),
             P=projection.ravel().tolist(),
         )
-        self._send(f"/{camera.name}/calibration", calibration, time_ns)
+        self._send(f"/{name}/calibration", calibration, time_ns)
         if data_root is not None:
-            where, size = f"camera {camera.name!r}", (camera.width, camera.height)
-            content, kind = image_content(data_root / camera.path, where, size)
-            image = m.CompressedImage(
-                timestamp=stamp, frame_id=camera.name, data=content, format=kind
+            size_px = (camera.width, camera.height)
+            content, kind = image_content(data_root / camera.path, f"camera {name!r}", size_px)
+            image = messages.CompressedImage(
+                timestamp=self._stamp(time_ns), frame_id=name, data=content, format=kind
             )
-            self._send(f"/{camera.name}/image", image, time_ns)
+            self._send(f"/{name}/image", image, time_ns)
 
     def lines(
         self, topic: str, frame: str, lines: Sequence[tuple[int, FloatArray]], time_ns: int
     ) -> None:
-        """Log labelled lines in one frame."""
-        m = self._messages
-        shapes = [
-            m.LinePrimitive(
-                thickness=0.15,
-                points=[m.Point3(x=x, y=y, z=z) for x, y, z in line.tolist()],
-                color=self._colours[label],
+        """Log lines in the colours of their classes.
+
+        Args:
+            topic: Topic of the lines.
+            frame: Name of the frame of the vertices.
+            lines: Class index and vertices in metres of each line. each (int, (n, 3))
+            time_ns: Time in nanoseconds.
+        """
+        messages = self._messages
+        primitives = []
+        for label, line in lines:
+            points = [messages.Point3(x=x, y=y, z=z) for x, y, z in line.tolist()]
+            primitive = messages.LinePrimitive(
+                thickness=0.15, points=points, color=self._colours[label]
             )
-            for label, line in lines
-        ]
-        self._entity(topic, frame, time_ns, lines=shapes)
+            primitives.append(primitive)
+        self._send_entity(topic, frame, time_ns, lines=primitives)
 
     def predictions(self, moment: Moment, time_ns: int) -> None:
-        """Log one frame's predictions and their Gaussians."""
-        m, elements = self._messages, moment.frame.elements
-        labels = elements.labels.tolist()
-        self.lines("/predictions", _FRAME, list(zip(labels, moment.lines, strict=True)), time_ns)
-        if moment.ellipses is not None:
-            owners = np.repeat(elements.labels, elements.num_points).tolist()
-            columns = (values.tolist() for values in moment.ellipses)
-            ellipses = [
-                m.SpherePrimitive(
-                    pose=m.Pose(
-                        position=m.Vector3(x=x, y=y, z=z),
-                        orientation=m.Quaternion(z=turn[2], w=turn[3]),
-                    ),
-                    size=m.Vector3(x=2 * a, y=2 * b, z=0.02),
-                    color=self._colours[label],
-                )
-                for (x, y, z), (a, b), turn, label in zip(*columns, owners, strict=True)
-            ]
-            self._entity("/gaussians", _FRAME, time_ns, spheres=ellipses)
+        """Log the predictions of one frame and their Gaussians.
 
-    def _entity(self, topic: str, frame: str, time_ns: int, **shapes: Any) -> None:
-        """Log one entity, which replaces the topic's earlier one."""
-        m = self._messages
-        entity = m.SceneEntity(
-            timestamp=self._stamp(time_ns), frame_id=frame, id=topic, frame_locked=True, **shapes
+        Args:
+            moment: Frame of the drive.
+            time_ns: Time in nanoseconds.
+        """
+        elements = moment.frame.elements
+        labels = elements.labels.tolist()
+        lines = list(zip(labels, moment.lines, strict=True))
+        self.lines("/predictions", frame=_FRAME, lines=lines, time_ns=time_ns)
+        if moment.ellipses is None:
+            return
+        messages = self._messages
+        centres, half_axes, quaternions = moment.ellipses
+        vertex_labels = np.repeat(elements.labels, elements.num_points)
+        spheres = []
+        for index, label in enumerate(vertex_labels.tolist()):
+            x, y, z = centres[index].tolist()
+            half_length, half_width = half_axes[index].tolist()
+            _, _, turn_z, turn_w = quaternions[index].tolist()
+            pose = messages.Pose(
+                position=messages.Vector3(x=x, y=y, z=z),
+                orientation=messages.Quaternion(z=turn_z, w=turn_w),
+            )
+            sphere = messages.SpherePrimitive(
+                pose=pose,
+                size=messages.Vector3(x=2 * half_length, y=2 * half_width, z=0.02),
+                color=self._colours[label],
+            )
+            spheres.append(sphere)
+        self._send_entity("/gaussians", _FRAME, time_ns, spheres=spheres)
+
+    def _send_entity(self, topic: str, frame: str, time_ns: int, **shapes: Any) -> None:
+        """Log the shapes of a topic, which replace its previous ones."""
+        messages = self._messages
+        entity = messages.SceneEntity(
+            timestamp=self._stamp(time_ns),
+            frame_id=frame,
+            id=topic,
+            frame_locked=True,
+            **shapes,
         )
-        self._send(topic, m.SceneUpdate(entities=[entity]), time_ns)
+        self._send(topic, messages.SceneUpdate(entities=[entity]), time_ns)

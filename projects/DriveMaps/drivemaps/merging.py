@@ -1,7 +1,6 @@
-"""One map out of the predictions of a drive's frames: merged, or merely thinned out."""
+"""Maps of drives from the predictions of their frames, by merging or by suppression."""
 
 from dataclasses import replace
-from itertools import compress
 
 import numpy as np
 import shapely
@@ -13,44 +12,78 @@ from drivemaps.line_merging import merge_lines
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import MapElements
 
-_RADIUS_M = 1.0  # how far apart polylines may run along each other
-_SHARE = 0.5  # of the length that may do so
+_RADIUS_M = 1.0  # a polyline within this distance of another one runs along it
+_MOST_SHARE = 0.5  # share of a polyline's length that may run along another one
 
 
 def confident(drive: Drive, min_score: float) -> Drive:
-    """Return a drive without the predictions below a score."""
-    frames = [
-        replace(f, elements=f.elements.select(f.elements.confidence >= min_score))
-        for f in drive.frames
-    ]
+    """Select the predictions of a drive by their scores.
+
+    Args:
+        drive: Frames with their predictions.
+        min_score: Smallest score of a selected prediction, in [0, 1].
+
+    Returns:
+        Drive of the selected predictions.
+    """
+    frames = []
+    for frame in drive.frames:
+        is_confident = frame.elements.confidence >= min_score
+        frames.append(replace(frame, elements=frame.elements.select(is_confident)))
     return replace(drive, frames=frames)
 
 
 def merge(drive: Drive, config: MergeConfig | None = None) -> MapElements:
-    """Merge the predictions of all frames into one map; the same input gives the same map.
+    """Merge the predictions of all frames into one map, deterministically.
 
-    Its lines and closed rings are in the global frame, with their confidence as scores.
+    Args:
+        drive: Frames with their predictions.
+        config: Parameters of merging; by default those of ``MergeConfig()``.
+
+    Returns:
+        Lines and closed rings in the global frame, with their confidence as scores.
+
+    Raises:
+        InputError: If the lines are too long or too close together to be merged in bounded time.
     """
-    config, found = config or MergeConfig(), []
+    config = config or MergeConfig()
+    rows = []
     for label, name in enumerate(drive.classes):
         merge_class = merge_areas if name in AREA_CLASSES else merge_lines
-        found += [(label, *merged) for merged in merge_class(drive, label, config)]
-    return drive_map(found)
+        for points, confidence in merge_class(drive, label, config):
+            rows.append((label, points, confidence))
+    return drive_map(rows)
 
 
 def suppress(drive: Drive) -> MapElements:
-    """Thin the predictions of all frames out by non-maximum suppression: the plain baseline.
+    """Select predictions of all frames by non-maximum suppression, the baseline of `merge`.
 
-    By falling score, a polyline is dropped if a kept one of its class is within 1 m of more than
-    half of it. The map is in the global frame and keeps the scores.
+    A polyline is dropped if more than half of it lies within 1 m of a polyline of its class that
+    has a higher score and is not dropped.
+
+    Args:
+        drive: Frames with their predictions.
+
+    Returns:
+        Selected predictions in the global frame, with their scores.
     """
-    rows = [row for frame in drive.frames for row in frame.elements.rows if len(row[0]) > 1]
+    rows = []
+    for frame in drive.frames:
+        for points, label, score in frame.elements.rows:
+            if len(points) > 1:
+                rows.append((points, label, score))
     rows.sort(key=lambda row: -row[2])
-    lines = np.array([shapely.LineString(line) for line, *_ in rows], dtype=object)
+    lines = np.array([shapely.LineString(points) for points, _, _ in rows], dtype=object)
     strips = shapely.buffer(lines, _RADIUS_M)
-    tree, kept = shapely.STRtree(strips), np.zeros(len(rows), dtype=bool)
-    for i, (_, label, _) in enumerate(rows):
-        near = [j for j in tree.query(lines[i]) if kept[j] and rows[j][1] == label]
-        along = shapely.length(shapely.intersection(lines[i], strips[near]))
-        kept[i] = lines[i].length > 0.0 and not (along > _SHARE * lines[i].length).any()
-    return drive_map((label, line, score) for line, label, score in compress(rows, kept))
+    tree = shapely.STRtree(strips)
+    is_selected = np.zeros(len(rows), dtype=bool)
+    selected = []
+    for index, (points, label, score) in enumerate(rows):
+        line = lines[index]
+        rivals = [i for i in tree.query(line) if is_selected[i] and rows[i][1] == label]
+        lengths_along = shapely.length(shapely.intersection(line, strips[rivals]))
+        is_duplicate = (lengths_along > _MOST_SHARE * line.length).any()
+        if line.length > 0.0 and not is_duplicate:
+            is_selected[index] = True
+            selected.append((label, points, score))
+    return drive_map(selected)

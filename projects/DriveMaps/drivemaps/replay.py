@@ -1,4 +1,4 @@
-"""What viewers show of a drive over time, with heights, independent of any viewer's format."""
+"""Drives over time, with heights, for viewers of any format."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -9,54 +9,58 @@ import shapely
 from scipy.spatial import cKDTree
 
 from drivemaps.drive import Drive, DriveFrame
-from gsmap.structures.elements import FloatArray, IntArray, MapElements
+from gsmap.structures.elements import FloatArray, MapElements
 from gsmap.structures.frames import FrameView, frame_view
 
-SHOWN_SIGMAS = 2.0  # ellipses reach so many standard deviations
+SHOWN_SIGMAS = 2.0
+"""Half axes of the ellipses of Gaussians, in standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """One frame of a drive, as viewers show it.
+    """One frame of a drive, with the map up to it.
 
     Args:
         frame: Sensors, pose and predictions.
-        lines: Its predictions in the annotation frame, on the ground. each (n, 3)
-        seen: The part of the drive's map that has been in range so far: label and vertices in the
-            global frame. each (int, (n, 3))
+        lines: Predictions in metres in the annotation frame, on the ground. each (n, 3)
+        map_lines: Part of the map of the drive that has been in range until now: label and
+            vertices in metres in the global frame. each (int, (n, 3))
     """
 
     frame: DriveFrame
     lines: list[FloatArray]
-    seen: list[tuple[int, FloatArray]]
+    map_lines: list[tuple[int, FloatArray]]
 
     @property
     def ellipses(self) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-        """Gaussians of the vertices: centres, half axes in metres, quaternions (x, y, z, w).
+        """Ellipses of the Gaussians of the vertices, on the ground of the annotation frame.
 
-        (M, 3), (M, 2) and (M, 4); None if the results carry no Gaussians.
+        Returns:
+            Centres in metres (M, 3), half axes in metres (M, 2) and rotations as quaternions
+            (x, y, z, w) (M, 4), or None if the results have no Gaussians.
         """
         elements = self.frame.elements
         if elements.scales is None or elements.rotations is None:
             return None
-        half_turns = (elements.rotations - self.frame.yaw_rad) / 2.0
-        quaternions = np.zeros((len(half_turns), 4))
-        quaternions[:, 2], quaternions[:, 3] = np.sin(half_turns), np.cos(half_turns)
         centres = np.concatenate([np.zeros((0, 3)), *self.lines])
+        half_angles = (elements.rotations - self.frame.yaw_rad) / 2.0
+        quaternions = np.zeros((len(half_angles), 4))
+        quaternions[:, 2] = np.sin(half_angles)
+        quaternions[:, 3] = np.cos(half_angles)
         return centres, SHOWN_SIGMAS * elements.scales, quaternions
 
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """A drive and its map with what a viewer needs to show them.
+    """Input of the writers for viewers: a drive, its map, colours and images.
 
     Args:
         drive: Frames with their predictions.
-        elements: The drive's map.
-        frame_kind: The annotation frame, a key of ``FRAME_VIEWS``.
+        elements: Map of the drive in the global frame.
+        frame_kind: Kind of the annotation frame, a key of ``FRAME_VIEWS``.
         colours: Colour of each class, ``#RRGGBB``.
-        data_root: Folder that the paths of images start from; None leaves the images out.
-        ground_z_m: Height of the road in the annotation frame, as in ``AnnotationMeta``.
+        data_root: Folder that image paths are relative to, or None to leave images out.
+        ground_z_m: Height of the road in the annotation frame in metres, as in ``AnnotationMeta``.
     """
 
     drive: Drive
@@ -68,37 +72,63 @@ class Replay:
 
     @property
     def view(self) -> FrameView:
-        """How the annotation frame lies."""
+        """Orientation and ground plane of the annotation frame."""
         return frame_view(self.frame_kind, self.ground_z_m)
 
     def moments(self) -> Iterator[Moment]:
-        """Go through the drive and let its map grow: yield what there is to see at each frame."""
-        view, drive = self.view, self.drive
-        views = [view.with_mounting(frame.sample.ego_from_frame) for frame in drive.frames]
-        places = cKDTree([f.sample.global_from_frame[:2, 3] for f in drive.frames])
+        """Iterate over the frames of the drive, with a map that grows by the range of each frame.
+
+        Yields:
+            Each frame, in the order of time.
+        """
+        frames = self.drive.frames
+        views = [self.view.with_mounting(frame.sample.ego_from_frame) for frame in frames]
+        frame_tree = cKDTree([frame.origin for frame in frames])
+        labels = self.elements.labels.tolist()
         lines = [shapely.linestrings(line) for line in self.elements.polylines]
         explored = shapely.Polygon()
-        for frame, ground in zip(drive.frames, views, strict=True):
-            explored |= drive.footprint(frame)
-            seen = []
-            for label, line in zip(self.elements.labels.tolist(), lines, strict=True):
+        for frame, view in zip(frames, views, strict=True):
+            explored |= self.drive.footprint(frame)
+            map_lines = []
+            for label, line in zip(labels, lines, strict=True):
                 for part in shapely.get_parts(shapely.intersection(line, explored)):
-                    if part.length:
-                        points = shapely.get_coordinates(part)
-                        nearest = places.query(points)[1]
-                        seen.append((label, _raised(drive, views, points, nearest)))
-            local = [ground.lift(frame.to_frame(p)) for p in frame.elements.polylines]
-            yield Moment(frame, local, seen)
+                    if not part.length:
+                        continue
+                    points = shapely.get_coordinates(part)
+                    raised = _raise_to_ground(
+                        points, frames=frames, views=views, frame_tree=frame_tree
+                    )
+                    map_lines.append((label, raised))
+            predictions = []
+            for line in frame.elements.polylines:
+                predictions.append(view.lift(frame.to_frame(line)))
+            yield Moment(frame, lines=predictions, map_lines=map_lines)
 
 
-def _raised(
-    drive: Drive, views: list[FrameView], points: FloatArray, nearest: IntArray
+def _raise_to_ground(
+    points: FloatArray,
+    frames: Sequence[DriveFrame],
+    views: Sequence[FrameView],
+    frame_tree: cKDTree,
 ) -> FloatArray:
-    """Put points of the global frame on the ground of the frames that are nearest. (n, 3)"""
+    """Add the height of the ground, by the ground plane of the nearest frame.
+
+    Args:
+        points: Points (x, y) in metres in the global frame. (n, 2)
+        frames: Frames of the drive.
+        views: Ground plane of each frame.
+        frame_tree: Origins of the frames in the global frame.
+
+    Returns:
+        Points (x, y, z) in metres in the global frame. (n, 3)
+    """
+    _, nearest = frame_tree.query(points)
     raised = np.empty((len(points), 3))
-    for number in np.unique(nearest):
-        frame, rows = drive.frames[number], nearest == number
-        local = views[number].lift(frame.to_frame(points[rows]))
+    for index in np.unique(nearest):
+        frame = frames[index]
+        rows = nearest == index
+        local = views[index].lift(frame.to_frame(points[rows]))
         pose = frame.sample.global_from_frame
-        raised[rows] = np.column_stack([points[rows], local @ pose[2, :3] + pose[2, 3]])
+        height = local @ pose[2, :3] + pose[2, 3]
+        raised[rows] = np.column_stack([points[rows], height])
     return raised

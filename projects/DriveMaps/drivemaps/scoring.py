@@ -1,4 +1,4 @@
-"""How good a map of a drive is: AP of its elements, completeness and accuracy of its length."""
+"""Scores of maps of drives: AP of elements, completeness and accuracy of their length."""
 
 from collections.abc import Mapping, Sequence
 
@@ -14,65 +14,86 @@ from gsmap.structures.elements import FloatArray, MapElements
 from gsmap.structures.polylines import clip_to_box
 from gsmap.utils.words import markdown_table
 
-NUM_POINTS = 1000  # elements are hundreds of metres long
+NUM_POINTS = 1000
+"""Number of points that elements of drives, hundreds of metres long, are resampled to."""
+_NUM_POINTS_OF_SAMPLES = 100
 
 
 def chamfer_ap(
     pairs: Sequence[tuple[str, MapElements, MapElements]], classes: Sequence[str], num_points: int
 ) -> dict[str, float]:
-    """Return AP_chamfer per class and its mean over the classes that there are.
+    """Compute AP_chamfer per class.
 
     Args:
-        pairs: Name, predicted and true map of each drive or sample.
-        classes: Names of the classes.
-        num_points: Points that each line is resampled to.
+        pairs: Name, predicted map and true map of each drive or sample.
+        classes: Class names in label order.
+        num_points: Number of points that each line is resampled to.
+
+    Returns:
+        AP in [0, 1] of each class that has ground truth, and their ``mean``, which is NaN without
+        any ground truth.
     """
-    config = ChamferConfig(tuple(classes), num_points=num_points)
-    evaluator = MapEvaluator(config)
-    figures = flat_metrics(evaluator.reports([evaluator.match(*pair) for pair in pairs]))
-    there = [name for name in classes if figures[f"chamfer/{name}/num_gts"]]
-    found = {name: figures[f"chamfer/{name}/AP"] for name in there}
-    return found | {"mean": float(np.mean(list(found.values()))) if there else np.nan}
+    evaluator = MapEvaluator(ChamferConfig(tuple(classes), num_points=num_points))
+    matches = []
+    for name, predicted, true in pairs:
+        matches.append(evaluator.match(name, predicted, true))
+    metrics = flat_metrics(evaluator.reports(matches))
+    ap_of_class = {}
+    for name in classes:
+        if metrics[f"chamfer/{name}/num_gts"]:
+            ap_of_class[name] = metrics[f"chamfer/{name}/AP"]
+    return _with_mean(ap_of_class)
+
+
+def _with_mean(value_of_class: dict[str, float]) -> dict[str, float]:
+    """Add the mean of all classes, NaN if there is none."""
+    mean = float(np.mean(list(value_of_class.values()))) if value_of_class else np.nan
+    return value_of_class | {"mean": mean}
 
 
 def near_and_total_m(
     lines: MapElements, other: MapElements, label: int, within_m: float
 ) -> FloatArray:
-    """Return how much of a class's length lies near the other map, and how much there is.
+    """Measure the length of the lines of a class, near another map and in all.
 
     Args:
-        lines: The map whose length counts.
-        other: The map that it should lie near.
-        label: The class.
-        within_m: How near, in metres.
+        lines: Map whose lines are measured.
+        other: Map that the lines are compared with.
+        label: Index of the class.
+        within_m: Largest distance from a line of the other map, in metres.
 
     Returns:
-        Both lengths in metres. (2,)
+        Length near the other map and total length, in metres. (2,)
     """
-    own, others = (
-        np.array([shapely.linestrings(line) for line in of_class.polylines], dtype=object)
-        for of_class in (m.select(m.labels == label) for m in (lines, other))
-    )
-    strip = shapely.union_all(shapely.buffer(others, within_m, quad_segs=32))
-    near = shapely.length(shapely.intersection(own, strip)).sum()
-    return np.array([near, shapely.length(own).sum()])
+    measured = _linestrings(lines, label)
+    strips = shapely.buffer(_linestrings(other, label), within_m, quad_segs=32)
+    near = shapely.intersection(measured, shapely.union_all(strips))
+    return np.array([shapely.length(near).sum(), shapely.length(measured).sum()])
+
+
+def _linestrings(elements: MapElements, label: int) -> np.ndarray:
+    """Convert the elements of one class to shapely geometries. (N,)"""
+    polylines = elements.select(elements.labels == label).polylines
+    return np.array([shapely.linestrings(line) for line in polylines], dtype=object)
 
 
 def cut_to_frame(elements: MapElements, drive: Drive, frame: DriveFrame) -> MapElements:
-    """Cut what a frame sees out of the map of its drive, as ground truth is cut out of a map.
+    """Cut the range of a frame out of the map of a drive, as ground truth is cut out of a map.
 
     Args:
-        elements: The map in the global frame.
-        drive: The drive.
-        frame: One of its frames.
+        elements: Map in the global frame.
+        drive: Drive of the frame.
+        frame: Frame whose range is cut out.
 
     Returns:
-        The elements inside the frame's range, in the annotation frame.
+        Elements inside the range, in the annotation frame.
     """
-    (x0, x1), (y0, y1) = drive.x_range, drive.y_range
+    x0, x1 = drive.x_range
+    y0, y1 = drive.y_range
     box = shapely.box(x0, y0, x1, y1)
+    lines: list[FloatArray] = []
+    labels: list[int] = []
     scores: list[float] = []
-    lines, labels = [], []
     for line, label, score in drive.nearby(frame, elements).rows:
         local = frame.to_frame(line)
         if drive.classes[label] in AREA_CLASSES and len(local) > 3:
@@ -83,7 +104,7 @@ def cut_to_frame(elements: MapElements, drive: Drive, frame: DriveFrame) -> MapE
         lines += pieces
         labels += [label] * len(pieces)
         scores += [score] * len(pieces)
-    return MapElements.from_polylines(lines, labels, scores)
+    return MapElements.from_polylines(lines, labels=labels, scores=scores)
 
 
 def map_figures(
@@ -92,55 +113,74 @@ def map_figures(
     """Score the maps of drives.
 
     Args:
-        maps: The found maps. (D,)
-        truths: The true maps. (D,)
-        drives: The drives, of the same classes. (D,)
+        maps: Predicted maps. (D,)
+        truths: True maps. (D,)
+        drives: Drives with equal classes. (D,)
 
     Returns:
-        By figure, then by class or ``mean``: ``AP`` of whole elements; ``AP per sample`` of what
-        each sample sees of the map; ``completeness@T`` and ``accuracy@T`` in T metres, of the
-        length of all drives.
+        Values in [0, 1] by figure, then by class or ``mean``. ``AP`` is the AP of whole elements,
+        ``AP per sample`` the AP of the maps cut to the range of each sample. ``completeness@T`` is
+        the share of the true length within T metres of the predicted map, and ``accuracy@T`` the
+        share of the predicted length within T metres of the true map, over all drives.
     """
     classes = drives[0].classes
-    triples = list(zip(drives, maps, truths, strict=True))
-    whole = [(drive.scene, found, true) for drive, found, true in triples]
-    cut = [
-        (f.sample.token, cut_to_frame(found, drive, f), cut_to_frame(true, drive, f))
-        for drive, found, true in triples
-        for f in drive.frames
-    ]
+    whole_pairs = []
+    sample_pairs = []
+    for drive, predicted, true in zip(drives, maps, truths, strict=True):
+        whole_pairs.append((drive.scene, predicted, true))
+        for frame in drive.frames:
+            predicted_part = cut_to_frame(predicted, drive, frame)
+            true_part = cut_to_frame(true, drive, frame)
+            sample_pairs.append((frame.sample.token, predicted_part, true_part))
     figures = {
-        "AP": chamfer_ap(whole, classes, NUM_POINTS),
-        "AP per sample": chamfer_ap(cut, classes, 100),
+        "AP": chamfer_ap(whole_pairs, classes, num_points=NUM_POINTS),
+        "AP per sample": chamfer_ap(sample_pairs, classes, num_points=_NUM_POINTS_OF_SAMPLES),
     }
-    sides = {"completeness": (truths, maps), "accuracy": (maps, truths)}
-    for name, (first, second) in sides.items():
-        for within_m in CHAMFER_THRESHOLDS:
-            shares = {}
-            for label, class_name in enumerate(classes):
-                lengths = [
-                    near_and_total_m(*pair, label, within_m)
-                    for pair in zip(first, second, strict=True)
-                ]
-                near, total = np.sum(lengths, axis=0)
-                if total:
-                    shares[class_name] = float(near / total)
-            mean = float(np.mean(list(shares.values()))) if shares else np.nan
-            figures[f"{name}@{within_m}"] = shares | {"mean": mean}
+    for within_m in CHAMFER_THRESHOLDS:
+        completeness = _near_shares(truths, others=maps, classes=classes, within_m=within_m)
+        figures[f"completeness@{within_m}"] = completeness
+    for within_m in CHAMFER_THRESHOLDS:
+        accuracy = _near_shares(maps, others=truths, classes=classes, within_m=within_m)
+        figures[f"accuracy@{within_m}"] = accuracy
     return figures
 
 
+def _near_shares(
+    measured: Sequence[MapElements],
+    others: Sequence[MapElements],
+    classes: Sequence[str],
+    within_m: float,
+) -> dict[str, float]:
+    """Share of the length of each class within a distance of the other maps, and their mean."""
+    share_of_class = {}
+    for label, name in enumerate(classes):
+        lengths_m = []
+        for lines, other in zip(measured, others, strict=True):
+            lengths_m.append(near_and_total_m(lines, other, label=label, within_m=within_m))
+        near_m, total_m = np.sum(lengths_m, axis=0)
+        if total_m:
+            share_of_class[name] = float(near_m / total_m)
+    return _with_mean(share_of_class)
+
+
 def figures_table(figures: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
-    """Return a Markdown table: a row per figure and way of making the map, a column per class.
+    """Format scores of maps as a Markdown table.
 
     Args:
-        figures: What ``map_figures`` returns, by the way of making the map.
+        figures: Results of ``map_figures`` by the name of each map.
+
+    Returns:
+        A table with a row per figure and map, and a column per class, in percent.
     """
-    of_first = next(iter(figures.values()))
-    columns = [*dict.fromkeys(c for row in of_first.values() for c in row if c != "mean"), "mean"]
-    rows = [
-        [name, way, *(f"{100 * found[name][c]:.1f}" if c in found[name] else "-" for c in columns)]
-        for name in of_first
-        for way, found in figures.items()
-    ]
+    first_figures = next(iter(figures.values()))
+    columns: list[str] = []
+    for values in first_figures.values():
+        columns += [key for key in values if key not in (*columns, "mean")]
+    columns.append("mean")
+    rows = []
+    for figure in first_figures:
+        for name, figures_of_map in figures.items():
+            values = figures_of_map[figure]
+            cells = [f"{100 * values[key]:.1f}" if key in values else "-" for key in columns]
+            rows.append([figure, name, *cells])
     return markdown_table(["figure", "map", *columns], rows)

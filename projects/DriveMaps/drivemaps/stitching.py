@@ -1,4 +1,4 @@
-"""Polylines whose ends meet become one; one that meets itself becomes a ring."""
+"""Stitching of polylines whose ends meet; a line that meets itself becomes a ring."""
 
 from collections.abc import Sequence
 
@@ -9,80 +9,102 @@ from scipy.spatial import cKDTree
 from gsmap.structures.elements import FloatArray
 from gsmap.structures.polylines import arc_lengths
 
-JOIN_M = 2.0  # widest gap that is closed
-_HEADING_M = 2.0  # an end's direction is that of its last metres
-_DISTANCE_STEP_M = 0.25  # of gaps about as wide, the straightest is closed first
-_RING_M = 10.0  # a shorter line is not closed
+JOIN_M = 2.0  # largest gap that is closed
+_HEADING_M = 2.0  # length at an end of a line that defines its direction there
+_GAP_STEP_M = 0.25  # gaps are rounded to this; of equal ones the straightest is closed first
+_RING_M = 10.0  # smallest length of a line that is closed to a ring
 
 
 def stitch(lines: Sequence[FloatArray]) -> list[FloatArray]:
     """Join lines at their ends, the narrowest and straightest gaps first.
 
     Two ends are joined if they are near, the line turns by less than a right angle there, and
-    neither is joined to another.
+    neither is joined to another end.
 
     Args:
-        lines: Open lines or rings; columns after (x, y) are carried along. each (n, D)
+        lines: Open lines or rings in metres; columns after (x, y) are carried along. N x (n, D)
 
     Returns:
-        The joined lines; a ring's last vertex equals its first. each (m, D)
+        Joined lines; the last vertex of a ring equals its first. each (m, D)
     """
-    closed = [bool(np.array_equal(line[0, :2], line[-1, :2])) for line in lines]
-    partner: dict[int, int] = {}
-    for a, b in _candidates(lines):
-        own_ends = a // 2 == b // 2
-        short = own_ends and arc_lengths(lines[a // 2])[-1] < _RING_M
-        if not (a in partner or b in partner or closed[a // 2] or closed[b // 2] or short):
-            partner[a], partner[b] = b, a
-    joined, used = [], [False] * len(lines)
-    for first in range(len(lines)):
-        if not used[first]:
-            joined.append(_chain(lines, partner, first, used))
-    return joined
+    is_closed = [bool(np.array_equal(line[0, :2], line[-1, :2])) for line in lines]
+    partner_of: dict[int, int] = {}  # by end; line i starts at end 2 * i and stops at 2 * i + 1
+    for first, second in _candidates(lines):
+        first_line = first // 2
+        second_line = second // 2
+        if first in partner_of or second in partner_of:
+            continue
+        if is_closed[first_line] or is_closed[second_line]:
+            continue
+        if first_line == second_line and arc_lengths(lines[first_line])[-1] < _RING_M:
+            continue
+        partner_of[first] = second
+        partner_of[second] = first
+    chains = []
+    visited: set[int] = set()  # indices of lines
+    for index in range(len(lines)):
+        if index not in visited:
+            chains.append(_join_chain(lines, partner_of, index, visited))
+    return chains
 
 
 def _candidates(lines: Sequence[FloatArray]) -> list[tuple[int, int]]:
-    """Return pairs of ends that may be joined, the best first; start and end of lines by turns."""
-    ends, headings = [], []  # the latter point outwards
+    """Pairs of ends that may be joined, the best pair first."""
+    ends = []
+    headings = []
     for line in lines:
         for part in (line[:, :2], line[::-1, :2]):
-            within = shapely.line_interpolate_point(shapely.LineString(part), _HEADING_M)
-            inner = shapely.get_coordinates(within)[0]
-            ends.append(part[0])
-            headings.append((part[0] - inner) / max(np.linalg.norm(part[0] - inner), 1e-9))
+            end = part[0]
+            inner = shapely.line_interpolate_point(shapely.LineString(part), _HEADING_M)
+            outward = end - shapely.get_coordinates(inner)[0]
+            ends.append(end)
+            headings.append(outward / max(np.linalg.norm(outward), 1e-9))
     if not ends:
         return []
-    points, outward = np.array(ends), np.array(headings)
+    points = np.array(ends)  # (2 N, 2)
+    outward = np.array(headings)  # (2 N, 2)
     pairs = cKDTree(points).query_pairs(JOIN_M, output_type="ndarray")
     first, second = pairs.T
     cosine = (outward[first] * outward[second]).sum(axis=1)
     gap = np.linalg.norm(points[first] - points[second], axis=1)
-    steps = np.round(gap / _DISTANCE_STEP_M)
-    order = np.lexsort((second, first, cosine.round(6), steps))
-    return [(int(a), int(b)) for a, b in pairs[order[cosine[order] < 0.0]]]
+    rounded_gap = np.round(gap / _GAP_STEP_M)
+    order = np.lexsort((second, first, cosine.round(6), rounded_gap))
+    continues = cosine[order] < 0.0
+    return [(int(a), int(b)) for a, b in pairs[order[continues]]]
 
 
-def _chain(
-    lines: Sequence[FloatArray], partner: dict[int, int], first: int, used: list[bool]
+def _join_chain(
+    lines: Sequence[FloatArray], partner_of: dict[int, int], index: int, visited: set[int]
 ) -> FloatArray:
-    """Walk from line to line over joined ends, from an open end or around a ring. (m, D)"""
-    entry = 2 * first
-    seen = {first}
-    while entry in partner and partner[entry] // 2 not in seen:  # back to where the chain starts
-        entry = partner[entry] ^ 1
-        seen.add(entry // 2)
-    start, parts = entry, []
-    while True:
-        used[entry // 2] = True
+    """Concatenate the lines of a chain, from an open end or around a ring.
+
+    Args:
+        lines: All lines. N x (n, D)
+        partner_of: End that each joined end is joined to; line i has the ends 2 i and 2 i + 1.
+        index: Index of a line of the chain.
+        visited: Indices of lines in previous chains; those of this chain are added.
+
+    Returns:
+        Vertices without successive equal ones. (m, D)
+    """
+    entry = 2 * index
+    passed = {index}
+    # Walk back to an open end, or once around a ring.
+    while entry in partner_of and partner_of[entry] // 2 not in passed:
+        entry = partner_of[entry] ^ 1
+        passed.add(entry // 2)
+    start = entry
+    parts = []
+    following: int | None = start
+    while following is not None:
+        entry = following
+        visited.add(entry // 2)
         line = lines[entry // 2]
         parts.append(line if entry % 2 == 0 else line[::-1])
-        following = partner.get(entry ^ 1)
-        if following is None:
-            break
+        following = partner_of.get(entry ^ 1)
         if following == start:
             parts.append(parts[0][:1])
             break
-        entry = following
     points = np.concatenate(parts)
-    moved = np.append(True, (points[1:, :2] != points[:-1, :2]).any(axis=1))
-    return points[moved]
+    has_moved = (points[1:, :2] != points[:-1, :2]).any(axis=1)
+    return points[np.append(True, has_moved)]

@@ -1,7 +1,6 @@
-"""The true map of a drive: its samples' ground truth, which is cut from one map, put together."""
+"""True maps of drives, put together from the ground truth of their samples."""
 
 from collections.abc import Sequence
-from itertools import chain
 
 import numpy as np
 import shapely
@@ -13,62 +12,89 @@ from drivemaps.stitching import stitch
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
 
-GRID_M = 0.002  # equal points of two samples differ by the rounding of their frames, far less
-_OVERLAP_M = 0.2  # pieces that share so much length are of one line
+GRID_M = 0.002  # snaps equal points of two samples, which differ by far less, by rounding
+_OVERLAP_M = 0.2  # pieces that share more length than this belong to one line
 
 
 def true_map(drive: Drive) -> MapElements:
-    """Put the samples' ground truth together.
+    """Put the ground truth of the samples of a drive together.
 
-    Pieces that run along each other are one line; areas that overlap are one area. The map is in
-    the global frame and has no scores.
+    The samples are cut out of one map. Pieces that run along each other belong to one line, and
+    areas that overlap belong to one area.
+
+    Args:
+        drive: Frames with their ground truth.
+
+    Returns:
+        Elements in the global frame, without scores.
     """
-    found = []
+    rows = []
     for label, name in enumerate(drive.classes):
-        pieces = chain.from_iterable(
-            frame.elements.select(frame.elements.labels == label).polylines
-            for frame in drive.frames
-        )
-        merge = _united_areas if name in AREA_CLASSES else _united_lines
-        found += [(label, line, 1.0) for line in merge([p for p in pieces if len(p) > 1])]
-    return drive_map(found, scored=False)
+        pieces = []
+        for frame in drive.frames:
+            elements = frame.elements.select(frame.elements.labels == label)
+            for line in elements.polylines:
+                if len(line) > 1:
+                    pieces.append(line)
+        unite = _unite_areas if name in AREA_CLASSES else _unite_lines
+        for line in unite(pieces):
+            rows.append((label, line, 1.0))
+    return drive_map(rows, scored=False)
 
 
 def components(count: int, first: IntArray, second: IntArray) -> list[IntArray]:
-    """Return the groups that pairs connect, in the order of their first members. each (n,)
+    """Group members that are connected by pairs.
 
     Args:
         count: Number of members.
-        first: One member of each pair. (pairs,)
-        second: The other. (pairs,)
+        first: Index of one member of each pair. (pairs,)
+        second: Index of the other member of each pair. (pairs,)
+
+    Returns:
+        Indices of the members of each group, ordered by their first members. each (n,)
     """
-    graph = coo_array((np.ones(len(first)), (first, second)), shape=(count, count))
-    groups, member_of = connected_components(graph, directed=False)
-    return [np.flatnonzero(member_of == group) for group in range(groups)]
+    links = (np.ones(len(first)), (first, second))
+    graph = coo_array(links, shape=(count, count))
+    num_groups, group_of = connected_components(graph, directed=False)
+    return [np.flatnonzero(group_of == group) for group in range(num_groups)]
 
 
 def polygons_of(rings: Sequence[FloatArray]) -> list[shapely.Geometry]:
-    """Return the areas inside rings; what is too small is left out."""
-    areas = [shapely.make_valid(shapely.Polygon(ring)) for ring in rings if len(ring) > 2]
-    return [area for area in areas if area.area >= MIN_AREA_M2]
+    """Convert rings to the areas that they enclose, without areas below ``MIN_AREA_M2``.
+
+    Args:
+        rings: Vertices of the rings in metres. each (n, 2)
+
+    Returns:
+        Valid polygons or multipolygons.
+    """
+    areas = []
+    for ring in rings:
+        if len(ring) < 3:
+            continue
+        area = shapely.make_valid(shapely.Polygon(ring))
+        if area.area >= MIN_AREA_M2:
+            areas.append(area)
+    return areas
 
 
-def _united_areas(rings: Sequence[FloatArray]) -> list[FloatArray]:
-    """Return the outer rings of the union."""
+def _unite_areas(rings: Sequence[FloatArray]) -> list[FloatArray]:
+    """Outer rings of the union of areas. each (n, 2)"""
     parts = shapely.get_parts(shapely.union_all(polygons_of(rings), grid_size=GRID_M))
     return [shapely.get_coordinates(p.exterior) for p in parts if p.area >= MIN_AREA_M2]
 
 
-def _united_lines(pieces: Sequence[FloatArray]) -> list[FloatArray]:
-    """Return the lines that the pieces cover."""
-    lines = np.array([shapely.LineString(piece) for piece in pieces], dtype=object)
+def _unite_lines(pieces: Sequence[FloatArray]) -> list[FloatArray]:
+    """Lines that are covered by overlapping pieces. each (n, 2)"""
+    lines = np.array([shapely.LineString(piece) for piece in pieces], dtype=object)  # (N,)
     strips = shapely.buffer(lines, 2 * GRID_M, cap_style="flat")
     first, second = shapely.STRtree(strips).query(lines, predicate="intersects")
-    shared = shapely.length(shapely.intersection(lines[first], strips[second])) > _OVERLAP_M
-    merged = [
-        shapely.line_merge(shapely.union_all(lines[group], grid_size=GRID_M))
-        for group in components(len(lines), first[shared], second[shared])
-    ]
-    parts = shapely.get_parts(np.array(merged, dtype=object))
-    kept = parts[shapely.length(parts) >= MIN_LENGTH_M]
-    return stitch([shapely.get_coordinates(line) for line in kept])
+    shared_m = shapely.length(shapely.intersection(lines[first], strips[second]))
+    overlap = shared_m > _OVERLAP_M
+    united = []
+    for group in components(len(lines), first[overlap], second[overlap]):
+        union = shapely.union_all(lines[group], grid_size=GRID_M)
+        united.append(shapely.line_merge(union))
+    parts = shapely.get_parts(np.array(united, dtype=object))
+    is_long = shapely.length(parts) >= MIN_LENGTH_M
+    return stitch([shapely.get_coordinates(part) for part in parts[is_long]])

@@ -1,4 +1,4 @@
-"""A drive as a film: cameras with predictions, predictions and the growing map from above."""
+"""Videos of drives: cameras with predictions, and the growing map in bird's-eye view."""
 
 from pathlib import Path
 
@@ -15,41 +15,53 @@ from gsmap.visualization.style import MapStyle
 
 
 def write_video(path: str | Path, replay: Replay, width_px: int = 1280) -> None:
-    """Write a film (``.mp4``) in H.264, as fast as the drive was; an empty map has no panel.
+    """Write a drive as a video in H.264 (``.mp4``) that plays in real time.
+
+    A panel with the predictions of the frame is followed by one with the map so far, unless the
+    map is empty.
 
     Args:
         path: File to write.
-        replay: The drive and its map.
-        width_px: Width of the film in pixels.
+        replay: Drive and its map.
+        width_px: Width of the video in pixels.
 
     Raises:
         ValueError: If an image is missing or damaged.
         RuntimeError: If ``av`` (PyAV) is missing.
     """
     times_ns = [frame.sample.timestamp_ns for frame in replay.drive.frames]
-    pictures = (_picture(moment, replay, width_px) for moment in replay.moments())
+    pictures = (_draw_moment(moment, replay, width_px) for moment in replay.moments())
     write_film(path, pictures, times_ns)
 
 
-def _picture(moment: Moment, replay: Replay, width_px: int) -> np.ndarray:
-    """Draw one moment. (H, W, 3)"""
-    frame, sample, drive = moment.frame, moment.frame.sample, replay.drive
-    found = MapElements.from_polylines(moment.lines, frame.elements.labels, frame.elements.scores)
-    panels, cameras = [BEVPanel("Prediction", found)], []
+def _draw_moment(moment: Moment, replay: Replay, width_px: int) -> np.ndarray:
+    """Draw one frame of a drive as RGB. (H, W, 3) uint8"""
+    frame = moment.frame
+    sample = frame.sample
+    drive = replay.drive
+    elements = frame.elements
+    predictions = MapElements.from_polylines(
+        moment.lines, labels=elements.labels, scores=elements.scores
+    )
+    panels = [BEVPanel("Prediction", predictions)]
     if len(replay.elements):
-        lines = [frame.to_frame(points[:, :2]) for _, points in moment.seen]
-        seen = MapElements.from_polylines(lines, [label for label, _ in moment.seen])
-        panels.append(BEVPanel("Map so far", seen))
+        lines = []
+        labels = []
+        for label, points in moment.map_lines:
+            lines.append(frame.to_frame(points[:, :2]))
+            labels.append(label)
+        panels.append(BEVPanel("Map so far", MapElements.from_polylines(lines, labels)))
+    cameras = []
     if replay.data_root is not None:
         cameras = camera_views(sample.cameras, replay.data_root, sample.token)
     figure = compose_figure(
         cameras,
         panels,
-        BEVGrid(drive.x_range, drive.y_range),
-        replay.view.with_mounting(sample.ego_from_frame),
-        MapStyle(classes=drive.classes),
-        found,
-        drive.scene,
-        width_px,
+        grid=BEVGrid(drive.x_range, drive.y_range),
+        view=replay.view.with_mounting(sample.ego_from_frame),
+        style=MapStyle(classes=drive.classes),
+        camera_elements=predictions,
+        title=drive.scene,
+        width_px=width_px,
     )
     return figure_to_rgb(figure)
