@@ -183,11 +183,11 @@ def test_transforms_that_read_pixels_get_them():
 
 def test_steps_join_only_with_their_like():
     row = (0, 1, 1, 1, 1, 1, 3.0, 1.1, 0.9, 5.0, (2, 0, 1))
-    assert Resize((4, 3)).joined([Resize((4, 3))]) == Resize((4, 3))
-    assert Resize((4, 3)).joined([Resize((4, 4))]) is None
-    assert CropTop(2).joined([CropTop(3)]) is None
-    assert Distortion((row,)).joined([Distortion((row, row))]) == Distortion((row,) * 3)
-    assert Distortion((row,)).joined([CropTop(3)]) is None
+    assert Resize((4, 3)).join([Resize((4, 3))]) == Resize((4, 3))
+    assert Resize((4, 3)).join([Resize((4, 4))]) is None
+    assert CropTop(2).join([CropTop(3)]) is None
+    assert Distortion((row,)).join([Distortion((row, row))]) == Distortion((row,) * 3)
+    assert Distortion((row,)).join([CropTop(3)]) is None
 
 
 def test_a_switch_of_the_config_leaves_pixels_to_the_device(tmp_path):

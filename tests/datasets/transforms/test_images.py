@@ -41,8 +41,8 @@ def test_images_of_another_size_become_as_long_as_those_of_the_training(
     size, expected, monkeypatch
 ):
     said = []
-    monkeypatch.setattr(images, "print_log", lambda text, _: said.append(text))
-    images._say_scaled.cache_clear()
+    monkeypatch.setattr(images, "print_log", lambda text, logger: said.append(text))
+    images._log_other_scale.cache_clear()
     matrices = {"lidar2img": [np.eye(4)], "img_aug_matrix": [np.eye(4)]}
     image = np.zeros((*size[::-1], 3), np.uint8)
     results = ScaleImages(0.4, trained_size=(160, 90)).transform({"img": [image], **matrices})

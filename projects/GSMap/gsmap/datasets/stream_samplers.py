@@ -1,8 +1,8 @@
-"""Samplers of drives: consecutive samples of a scene for each place of the batch, or in order."""
+"""Samplers that keep the temporal order of the samples of each scene."""
 
 from collections import deque
 from collections.abc import Iterator, Sequence
-from itertools import chain, islice
+from itertools import chain, count, islice
 
 import numpy as np
 from mmengine.dist import get_dist_info
@@ -14,10 +14,13 @@ from gsmap.utils.errors import InputError, InputTypeError
 
 
 def scenes_of(dataset: VectorizedMapDataset) -> list[list[int]]:
-    """Return the samples of each scene in the order of their times.
+    """Return the indices of the samples of each scene in the order of their times.
+
+    Args:
+        dataset: Data set without a wrapper.
 
     Raises:
-        TypeError: If the data set does not know its scenes, as a wrapped one.
+        TypeError: If the data set is not a `VectorizedMapDataset`.
     """
     if not isinstance(dataset, VectorizedMapDataset):
         raise InputTypeError(
@@ -28,64 +31,73 @@ def scenes_of(dataset: VectorizedMapDataset) -> list[list[int]]:
 
 
 class _Scene:
-    """Hands out a scene's samples, single ones or pieces in order.
+    """Iterator over the samples of a scene, as single frames or as pieces in temporal order.
 
     Args:
-        samples: Its samples in order.
-        rng: Draws what is handed out.
-        pieces: Pieces that a pass in order is cut into, at random places.
-        finish_singles: Hand out every single frame before the first piece, as released.
+        samples: Indices of the samples in temporal order.
+        rng: Generator for the order of the frames and pieces and for the cuts between pieces.
+        pieces: Number of pieces that the scene is cut into at random places.
+        finish_singles: Whether all single frames come before the first piece, as in the release.
     """
 
     def __init__(
         self, samples: Sequence[int], rng: np.random.Generator, pieces: int, finish_singles: bool
     ) -> None:
-        self.samples, self.rng = list(samples), rng
-        self.pieces, self.finish_singles = pieces, finish_singles
+        self.samples = list(samples)
+        self.rng = rng
+        self.pieces = pieces
+        self.finish_singles = finish_singles
         self.waiting: deque[list[int]] = deque()
-        self.singles = True
+        self.has_singles = True  # whether ``waiting`` has single frames
 
     def visit(self, in_order: bool) -> list[int]:
-        """Return the samples of the next visit."""
-        if self.waiting and in_order and self.singles and not self.finish_singles:
+        """Return the next piece if ``in_order``, else the next single frame."""
+        drops_singles = in_order and self.has_singles and not self.finish_singles
+        if drops_singles:
             self.waiting.clear()
         if not self.waiting:
-            self.waiting = self._sequences() if in_order else self._single_frames()
-            self.singles = not in_order
+            self.waiting = self._draw_pieces() if in_order else self._draw_single_frames()
+            self.has_singles = not in_order
         return self.waiting.popleft()
 
-    def _single_frames(self) -> deque[list[int]]:
+    def _draw_single_frames(self) -> deque[list[int]]:
+        """Draw a random order of all samples."""
         order = self.rng.permutation(len(self.samples))
         return deque([self.samples[index]] for index in order)
 
-    def _sequences(self) -> deque[list[int]]:
-        count = min(self.pieces, len(self.samples))
-        cuts = self.rng.choice(np.arange(1, len(self.samples)), count - 1, replace=False)
-        parts = np.split(np.array(self.samples), np.sort(cuts))
-        return deque(parts[index].tolist() for index in self.rng.permutation(count))
+    def _draw_pieces(self) -> deque[list[int]]:
+        """Cut the scene at random places and draw a random order of the pieces."""
+        num_pieces = min(self.pieces, len(self.samples))
+        places = np.arange(1, len(self.samples))
+        cuts = self.rng.choice(places, size=num_pieces - 1, replace=False)
+        pieces = np.split(np.array(self.samples), np.sort(cuts))
+        order = self.rng.permutation(num_pieces)
+        return deque(pieces[index].tolist() for index in order)
 
 
 @DATA_SAMPLERS.register_module()
 class StreamTrainSampler(Sampler[int]):
-    """Hand each place of the batch the samples of one scene after another, in order.
+    """Sampler for streaming training: each place of the batch receives scenes in temporal order.
 
-    Over all ranks there are ``slots`` x ranks streams. Stream j takes scenes j, j + streams, ... of
-    endless random permutations, and its next one when a piece of a scene is used up, so the streams
-    change scenes at different times. The first iterations are single random frames. What comes
-    depends on the seed, the ranks and the epoch alone, so a resumed run sees the same samples.
+    There are ``slots`` x ranks streams, one for each place of the batch on each rank. An endless
+    sequence of random permutations of the scenes is dealt to the streams in turn: stream j takes
+    entries j, j + streams, j + 2 streams and so on. A stream goes to the next scene at the end of a
+    piece, so the streams change scenes at different times. The first iterations have single random
+    frames. The samples depend only on the seed, the ranks and the epoch, so a resumed run continues
+    with the samples of an uninterrupted run.
 
     Args:
-        dataset: The data set.
-        slots: The loader's ``batch_size``.
-        single_frame_iters: Iterations of single frames.
-        pieces: Pieces that a pass through a scene is cut into.
-        late_switch: Let a scene change to pieces only when all of its single frames were handed
-            out, as released: half of the samples are continued at 1.6 times the iterations.
-        seed: Seed of all draws, the same on all ranks.
+        dataset: Data set without a wrapper.
+        slots: ``batch_size`` of the data loader.
+        single_frame_iters: Number of iterations with single frames.
+        pieces: Number of pieces that a scene is cut into.
+        late_switch: Whether a scene switches to pieces only after all single frames, as in the
+            release. Half of the samples continue a stream after 1.6 x ``single_frame_iters``.
+        seed: Seed of the random numbers, equal on all ranks.
 
     Raises:
-        TypeError: If the data set does not know its scenes.
-        ValueError: If a number is not positive.
+        TypeError: If the data set is not a `VectorizedMapDataset`.
+        ValueError: If ``slots`` or ``pieces`` is less than 1, or ``single_frame_iters`` negative.
     """
 
     def __init__(
@@ -104,16 +116,20 @@ class StreamTrainSampler(Sampler[int]):
             )
         self.scenes = scenes_of(dataset)
         self.rank, self.ranks = get_dist_info()
-        self.slots, self.pieces, self.late_switch = slots, pieces, late_switch
-        self.single_frame_iters, self.seed, self.epoch = single_frame_iters, seed or 0, 0
+        self.slots = slots
+        self.pieces = pieces
+        self.late_switch = late_switch
+        self.single_frame_iters = single_frame_iters
+        self.seed = seed or 0
+        self.epoch = 0
         self.iterations = max(1, len(dataset) // (slots * self.ranks))
 
     def __len__(self) -> int:
-        """Return the samples of one epoch on this rank."""
+        """Return the number of samples of one epoch on this rank."""
         return self.iterations * self.slots
 
     def set_epoch(self, epoch: int) -> None:
-        """Go to an epoch; the streams continue over its border."""
+        """Set the epoch, which continues the streams of the previous epoch."""
         self.epoch = epoch
 
     def __iter__(self) -> Iterator[int]:
@@ -122,38 +138,39 @@ class StreamTrainSampler(Sampler[int]):
             yield from batch
 
     def batches(self) -> Iterator[list[int]]:
-        """Yield the endless batches of this rank, from the first iteration on."""
-        scenes = [
-            _Scene(
-                samples,
-                np.random.default_rng([self.seed, self.rank, number]),
-                self.pieces,
-                self.late_switch,
-            )
-            for number, samples in enumerate(self.scenes)
-        ]
-        orders = [self._scene_order(self.rank * self.slots + slot) for slot in range(self.slots)]
-        waiting: list[deque[int]] = [deque() for _ in orders]
-        iteration = 0
-        while True:
-            for slot, order in zip(waiting, orders, strict=True):
-                if not slot:
-                    in_order = iteration >= self.single_frame_iters
-                    slot.extend(scenes[next(order)].visit(in_order))
-            yield [slot.popleft() for slot in waiting]
-            iteration += 1
+        """Yield the batches of this rank without end, from the first iteration on."""
+        scenes = []
+        for number, samples in enumerate(self.scenes):
+            rng = np.random.default_rng([self.seed, self.rank, number])
+            scene = _Scene(samples, rng=rng, pieces=self.pieces, finish_singles=self.late_switch)
+            scenes.append(scene)
+        first_stream = self.rank * self.slots
+        orders = []
+        queues: list[deque[int]] = []
+        for slot in range(self.slots):
+            orders.append(self._scene_order(first_stream + slot))
+            queues.append(deque())
+        for iteration in count():
+            in_order = iteration >= self.single_frame_iters
+            for queue, order in zip(queues, orders, strict=True):
+                if not queue:
+                    scene = scenes[next(order)]
+                    queue.extend(scene.visit(in_order))
+            yield [queue.popleft() for queue in queues]
 
     def _scene_order(self, stream: int) -> Iterator[int]:
-        """Yield the scenes of a stream, none twice in a row if there are several."""
-        last = -1
-        for number in islice(self._permutations(), stream, None, self.slots * self.ranks):
-            if number != last or len(self.scenes) == 1:
+        """Yield the numbers of the scenes of a stream, not twice in a row if there are several."""
+        previous = -1
+        num_streams = self.slots * self.ranks
+        for number in islice(self._permutations(), stream, None, num_streams):
+            if number != previous or len(self.scenes) == 1:
                 yield number
-                last = number
+                previous = number
             else:
-                last = -1  # it is skipped once only
+                previous = -1  # a further repetition is not skipped
 
     def _permutations(self) -> Iterator[int]:
+        """Yield the numbers of all scenes in random order, without end."""
         rng = np.random.default_rng(self.seed)
         while True:
             yield from rng.permutation(len(self.scenes)).tolist()
@@ -161,24 +178,28 @@ class StreamTrainSampler(Sampler[int]):
 
 @DATA_SAMPLERS.register_module()
 class StreamTestSampler(Sampler[int]):
-    """Hand out whole scenes, each on one rank, one after another with their samples in order.
+    """Sampler for streaming tests: whole scenes one after another, in temporal order.
+
+    Each scene is on one rank. The scenes are distributed so that ranks have similar numbers of
+    samples.
 
     Args:
-        dataset: The data set.
-        seed: Not used; mmengine gives it to every sampler.
+        dataset: Data set without a wrapper.
+        seed: Not used; mmengine passes it to all samplers.
 
     Raises:
-        TypeError: If the data set does not know its scenes.
+        TypeError: If the data set is not a `VectorizedMapDataset`.
     """
 
     def __init__(self, dataset: VectorizedMapDataset, seed: int | None = None) -> None:
         rank, ranks = get_dist_info()
-        loads = [0] * ranks
+        num_samples = [0] * ranks
         self.scenes: list[list[int]] = []
-        for scene in sorted(scenes_of(dataset), key=len, reverse=True):  # to whom has least to do
-            chosen = loads.index(min(loads))
-            loads[chosen] += len(scene)
-            if chosen == rank:
+        longest_first = sorted(scenes_of(dataset), key=len, reverse=True)
+        for scene in longest_first:
+            least_loaded = num_samples.index(min(num_samples))
+            num_samples[least_loaded] += len(scene)
+            if least_loaded == rank:
                 self.scenes.append(scene)
 
     def __len__(self) -> int:
@@ -190,18 +211,19 @@ class StreamTestSampler(Sampler[int]):
 
 @DATA_SAMPLERS.register_module()
 class StreamBatches(Sampler[list[int]]):
-    """Batches of a `StreamTestSampler`: as many scenes side by side, each with its next sample.
+    """Batch sampler for streaming tests with one sample of each of ``batch_size`` scenes.
 
-    For a loader's ``batch_sampler``. The last batches are smaller: no batch has two samples of one
-    scene.
+    A scene that ends is replaced by the next one. No batch has two samples of one scene, so the
+    last batches are smaller. The sampler is for the ``batch_sampler`` of a data loader.
 
     Args:
-        sampler: The sampler.
-        batch_size: Scenes side by side.
+        sampler: Sampler of whole scenes.
+        batch_size: Number of scenes in a batch.
     """
 
     def __init__(self, sampler: StreamTestSampler, batch_size: int) -> None:
-        self.sampler, self.batch_size = sampler, batch_size
+        self.sampler = sampler
+        self.batch_size = batch_size
         waiting = deque(sampler.scenes)
         active: list[deque[int]] = []
         self.batches: list[list[int]] = []

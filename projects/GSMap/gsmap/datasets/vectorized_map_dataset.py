@@ -1,4 +1,4 @@
-"""The data set: samples of an annotation file, with their images, for training and testing."""
+"""Data set of annotated samples with camera images and LiDAR sweeps."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -22,55 +22,57 @@ from gsmap.utils.errors import InputError, WorkError
 from gsmap.utils.model_facts import MOUNT, RIG
 from gsmap.utils.split_lists import SPLIT_LIST
 
-_BROKEN = ("raise", "skip")
-_OF_FILE = (
+_BROKEN_MODES = ("raise", "skip")
+_METAINFO_OF_FILE = (
     "classes", "x_range", "y_range", "dataset", "split", "frame", "ground_z_m", SPLIT_LIST,
 )  # fmt: skip
-_NEIGHBOUR_S = 5.0  # how far the next pose of a drive may be for its speed
+_MAX_POSE_GAP_S = 5.0  # between neighbouring poses that vehicle signals are computed from
 
 
 @DATASETS.register_module()
 class VectorizedMapDataset(BaseDataset):
-    """Samples with their map elements, read from a memory-mapped annotation file.
+    """Samples of a memory-mapped annotation file, with map elements as ground truth.
 
-    ``tools/create_data.py`` makes the file; one for another range, class list, split or frame is
-    refused.
+    ``tools/create_data.py`` writes the annotation file. A file with another range, class list,
+    split or frame than expected is an error.
 
     Args:
         ann_file: Annotation file; relative to ``data_root`` unless absolute.
         data_root: Folder that image and LiDAR paths are relative to.
-        pipeline: Transforms.
-        classes: Class names that the file must have, in label order; None takes the file's.
-        grid: ``x_range`` and ``y_range`` in metres, which the file must have (further keys are the
-            model's affair); None takes the file's.
-        split: Split that the file must hold; None takes any.
-        frame: ``lidar`` or ``ego``, which the file must have; None takes any.
-        dim: Coordinates per point of the ground truth, 2 or 3; None takes the file's. A file with
-            heights also serves 2, which drops them; one without is refused for 3.
-        rate_hz: Samples per second of a drive that the file must have; None takes any.
-        crossings: Rule of the crossings that the file must follow (``--crossings`` of
-            ``tools/create_data.py nuscenes``); None takes any.
-        cameras: Names of the cameras to use, in order; None takes all of each sample.
-        test_mode: Whether every sample is delivered, in order, ground truth or not.
-        filter_empty_gt: Whether training leaves out samples without any map element.
-        shuffle_images_seed: If given, each sample gets the images of another one, drawn with this
-            seed: what a model then still scores, it does not see in the images.
-        signals_from_poses: Whether vehicle signals (``can_bus``) of samples that have none are
-            computed from the poses of the drive; otherwise they are zero.
-        pose_only_signals: Whether vehicle signals are those that MapTR's code for Argoverse 2 makes
-            of the pose (`vehicle_signals.pose_only_signals`), whatever a sample has.
-        ground_z_m: Height of the road in the frame, as in ``AnnotationMeta``, for files that do not
-            have it; that of others must be the same.
-        broken_samples: ``raise`` stops at a sample with a missing or damaged file; ``skip`` takes
-            another one in its place, and counts and logs it (in training only).
-        max_refetch: How many samples in a row may be skipped.
-        indices: Of the samples that are left, the first N, the last -N, or the listed ones.
-        lazy_init: As in mmengine's ``BaseDataset``.
-        serialize_data: As in mmengine's ``BaseDataset``.
+        pipeline: Transforms or their configs.
+        classes: Expected class names of the file in label order; None for any.
+        grid: Expected ``x_range`` and ``y_range`` of the file in metres, among the arguments of
+            `BEVGrid`; None for any.
+        split: Expected split of the file; None for any.
+        frame: Expected annotation frame of the file, ``lidar`` or ``ego``; None for any.
+        dim: Coordinates per point of the ground truth, 2 or 3; None for the number in the file.
+            With 2, heights in the file are left out; with 3, a file without heights is an error.
+        rate_hz: Expected number of samples per second of a drive; None for any.
+        crossings: Expected rule for pedestrian crossings (``--crossings`` of
+            ``tools/create_data.py nuscenes``); None for any.
+        cameras: Names of the cameras to use, in order; None for all cameras of each sample.
+        test_mode: Whether to return all samples in order, with or without ground truth.
+        filter_empty_gt: Whether to leave out samples without map elements in training.
+        shuffle_images_seed: Seed of an assignment of images to other samples, which measures how
+            well a model scores without matching images; None for the images of each sample.
+        signals_from_poses: Whether to compute missing vehicle signals (``can_bus``) from the poses
+            of the drive; otherwise they are zero.
+        pose_only_signals: Whether to replace the vehicle signals of all samples by signals that
+            are computed from the pose alone, like in MapTR's code for Argoverse 2
+            (`vehicle_signals.pose_only_signals`).
+        ground_z_m: Height of the road in the frame in metres, as in ``AnnotationMeta``, for a file
+            without it. For other files it must agree with the file.
+        broken_samples: ``raise`` for an error at a sample with a missing or damaged file; ``skip``
+            to log and count the sample and use another one instead, in training only.
+        max_refetch: Largest number of consecutive samples to skip.
+        indices: First N samples, last -N samples or a list of samples to use, after filtering;
+            None for all samples.
+        lazy_init: See ``BaseDataset`` of mmengine.
+        serialize_data: See ``BaseDataset`` of mmengine.
 
     Raises:
         FileNotFoundError: If there is no annotation file.
-        ValueError: If it does not fit, or an option is out of its domain.
+        ValueError: If the file differs from an expected value, or an argument is out of its domain.
     """
 
     def __init__(
@@ -98,8 +100,10 @@ class VectorizedMapDataset(BaseDataset):
         lazy_init: bool = False,
         serialize_data: bool = True,
     ) -> None:
-        if broken_samples not in _BROKEN:
-            raise InputError(f"broken_samples must be one of {_BROKEN}, got {broken_samples!r}.")
+        if broken_samples not in _BROKEN_MODES:
+            raise InputError(
+                f"broken_samples must be one of {_BROKEN_MODES}, got {broken_samples!r}."
+            )
         if dim not in (None, 2, 3):
             raise InputError(f"dim must be 2, 3 or None, got {dim!r}.")
         if broken_samples == "skip" and test_mode:
@@ -110,9 +114,10 @@ class VectorizedMapDataset(BaseDataset):
         self.cameras = None if cameras is None else tuple(cameras)
         self.broken_samples = broken_samples
         self.broken_tokens: dict[str, str] = {}
-        self.images_in_memory: Mapping[str, np.ndarray] = {}  # BGR, by camera, in place of files
-        self.can_bus_in_memory: np.ndarray | None = None  # (18,), in place of a sample's
-        self.frame_in_memory: Frame | None = None  # token, scene, time and pose in place of its own
+        # Values in memory, which replace the values of the annotation file:
+        self.images_in_memory: Mapping[str, np.ndarray] = {}  # BGR images by camera, (H, W, 3)
+        self.can_bus_in_memory: np.ndarray | None = None  # vehicle signals, (18,)
+        self.frame_in_memory: Frame | None = None  # token, scene, time and pose
         self._broken_in_a_row = 0
         self._expected = {
             "classes": None if classes is None else tuple(classes),
@@ -142,7 +147,11 @@ class VectorizedMapDataset(BaseDataset):
         )
 
     def load_data_list(self) -> list[dict[str, int]]:
-        """Open the annotation file, check it, and list its rows."""
+        """Open and check the annotation file, and list its rows.
+
+        Returns:
+            ``row`` of each sample and ``image_row``, the row of the sample with its images.
+        """
         self.annotations = AnnotationFile(self.ann_file)
         self.annotations.require(**self._expected)
         if self._rate_hz is not None:
@@ -153,53 +162,64 @@ class VectorizedMapDataset(BaseDataset):
                 f"go unnoticed until you {self.annotations.remedy}",
                 "current",
             )
-        for name in _OF_FILE:
+        for name in _METAINFO_OF_FILE:
             self._metainfo[name] = getattr(self.annotations.meta, name)
-        self._metainfo["ground_z_m"] = self._height()
-        self._metainfo[MOUNT] = self._mount()
+        self._metainfo["ground_z_m"] = self._ground_height()
+        self._metainfo[MOUNT] = self._ground_from_first_frame()
         self._metainfo["dim"] = self._dim or self.annotations.meta.dim
         self._metainfo["cameras"] = self.cameras
-        self._metainfo[RIG] = self._rig()
+        self._metainfo[RIG] = self._first_rig()
         return [{"row": row, "image_row": row} for row in range(len(self.annotations))]
 
-    def _mount(self) -> list[list[float]] | None:
-        """Return where the first sample's frame lies over the ground, if that is known. (4, 4)"""
-        frame = self._metainfo["frame"]
-        height_m = self._metainfo["ground_z_m"]
+    def _ground_from_first_frame(self) -> list[list[float]] | None:
+        """Return the transform from the first sample's frame to the ground, None if unknown. (4, 4)
+
+        It is known if the height of the road is known, or the mounting of a LiDAR.
+        """
         if not len(self.annotations):
             return None
+        frame = self._metainfo["frame"]
+        ground_z_m = self._metainfo["ground_z_m"]
         sample = self.annotations[0]
-        known = height_m is not None or (frame == "lidar" and sample.ego_from_frame is not None)
-        return ground_from_frame(sample, frame, height_m).tolist() if known else None
+        has_mounting = frame == "lidar" and sample.ego_from_frame is not None
+        if ground_z_m is None and not has_mounting:
+            return None
+        return ground_from_frame(sample, frame=frame, ground_z_m=ground_z_m).tolist()
 
-    def _rig(self) -> dict[str, list[float]]:
-        """Return size and focal lengths of the first sample's images, by camera, in pixels."""
+    def _first_rig(self) -> dict[str, list[float]]:
+        """Return width, height, fx, fy, cx and cy in pixels of the first sample's cameras."""
+        rig = {}
         cameras = self.annotations[0].cameras if len(self.annotations) else []
-        return {
-            c.name: [
-                float(v) for v in (c.width, c.height, *c.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]])
-            ]
-            for c in cameras
-            if self.cameras is None or c.name in self.cameras
-        }
+        for camera in cameras:
+            if self.cameras is not None and camera.name not in self.cameras:
+                continue
+            fx, fy, cx, cy = camera.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+            rig[camera.name] = [float(camera.width), float(camera.height), fx, fy, cx, cy]
+        return rig
 
-    def _height(self) -> float | None:
-        """Return the height of the road in the frame: the file's, or the config's if it has none.
+    def _ground_height(self) -> float | None:
+        """Return the height of the road in metres in the file, or in the config if it has none.
 
         Raises:
-            ValueError: If both have one, and they differ.
+            ValueError: If the heights in the file and in the config differ.
         """
-        of_file = self.annotations.meta.ground_z_m
-        of_config = self._ground_z_m
-        if of_file is not None and of_config is not None and abs(of_file - of_config) > 1e-6:
+        file_z_m = self.annotations.meta.ground_z_m
+        config_z_m = self._ground_z_m
+        if file_z_m is None:
+            return config_z_m
+        if config_z_m is not None and abs(file_z_m - config_z_m) > 1e-6:
             raise InputError(
-                f"{self.ann_file} has the road at z = {of_file:g} m of its frame, the config at "
-                f"{of_config:g} m (ground_z_m): set both to one height."
+                f"{self.ann_file} has the road at z = {file_z_m:g} m of its frame, the config at "
+                f"{config_z_m:g} m (ground_z_m): set both to one height."
             )
-        return self._ground_z_m if of_file is None else of_file
+        return file_z_m
 
     def filter_data(self) -> list[dict[str, int]]:
-        """Leave out samples without elements, and shuffle images, where that is asked for."""
+        """Leave out samples without map elements and shuffle images, depending on the arguments.
+
+        Raises:
+            ValueError: If samples for training have no ground truth, or no sample is left.
+        """
         rows = np.array([entry["row"] for entry in self.data_list], np.int64)
         if self._filter_empty_gt:
             counts = self.annotations.instance_counts()[rows]
@@ -208,58 +228,86 @@ class VectorizedMapDataset(BaseDataset):
                     f"{(counts < 0).sum()} samples of {self.ann_file} have no ground truth, so it "
                     "cannot be trained on."
                 )
-            if empty := int((counts == 0).sum()):
-                text = f"{self.ann_file}: {empty} samples without any map element are left out."
-                print_log(text, "current")
+            num_empty = int((counts == 0).sum())
+            if num_empty:
+                text = f"{self.ann_file}: {num_empty} samples without any map element are left out."
+                print_log(text, logger="current")
             rows = rows[counts > 0]
         if not len(rows):
             raise InputError(f"{self.ann_file} has no sample to use (of {len(self.annotations)}).")
-        donors = rows
-        if self._shuffle_images_seed is not None:  # no sample keeps its own
+        image_rows = rows
+        if self._shuffle_images_seed is not None:
+            # A cycle through all samples in random order: no sample keeps its images.
             order = np.random.default_rng(self._shuffle_images_seed).permutation(len(rows))
-            donors = np.empty_like(rows)
-            donors[order] = rows[np.roll(order, 1)]
-        pairs = zip(rows.tolist(), donors.tolist(), strict=True)
-        return [{"row": row, "image_row": donor} for row, donor in pairs]
+            image_rows = np.empty_like(rows)
+            image_rows[order] = rows[np.roll(order, shift=1)]
+        entries = []
+        for row, image_row in zip(rows.tolist(), image_rows.tolist(), strict=True):
+            entries.append({"row": row, "image_row": image_row})
+        return entries
 
     def _copy_without_annotation(self, memo: dict[int, Any] | None = None) -> BaseDataset:
-        """Copy with a memo of its own: mmengine's is shared by all calls and mixes objects up."""
+        """Copy with a new memo: the default memo of mmengine is shared by all calls."""
         return super()._copy_without_annotation({} if memo is None else memo)
 
     def sample(self, idx: int) -> MapSample:
-        """Return a sample as the annotation file has it."""
-        row = super().get_data_info(idx)["row"]  # opens the file, if that is yet to be done
+        """Read the record of a sample from the annotation file."""
+        row = super().get_data_info(idx)["row"]  # opens the file if necessary
         return self.annotations[row]
 
     def scenes(self) -> list[list[int]]:
-        """Return the samples of each scene, sorted by its name, in the order of their times."""
+        """Return the indices of the samples of each scene in the order of their times.
+
+        Returns:
+            One list for each scene, sorted by the names of the scenes.
+        """
         self.full_init()
-        names, times = (self.annotations.column(name) for name in ("scene", "timestamp_ns"))
-        found: dict[str, list[tuple[int, int]]] = {}
+        names = self.annotations.column("scene")
+        times_ns = self.annotations.column("timestamp_ns")
+        samples: dict[str, list[tuple[int, int]]] = {}
         for index in range(len(self)):
             row = super().get_data_info(index)["row"]
-            found.setdefault(names[row], []).append((times[row], index))
-        return [[index for _, index in sorted(found[name])] for name in sorted(found)]
+            scene = samples.setdefault(names[row], [])
+            scene.append((times_ns[row], index))
+        scenes = []
+        for name in sorted(samples):
+            scenes.append([index for _, index in sorted(samples[name])])
+        return scenes
 
     def scaled_image_size(self) -> tuple[int, int]:
-        """Return width and height that the first sample's images are scaled to, in pixels."""
-        cameras = [c for c in self.sample(0).cameras if c.name in (self.cameras or [c.name])]
-        size = max(c.width for c in cameras), max(c.height for c in cameras)
+        """Return width and height of the first sample's images after scaling, in pixels."""
+        widths = []
+        heights = []
+        for camera in self.sample(0).cameras:
+            if not self.cameras or camera.name in self.cameras:
+                widths.append(camera.width)
+                heights.append(camera.height)
+        width = max(widths)
+        height = max(heights)
         for step in self.pipeline.transforms:
-            size = step.scaled(*size) if isinstance(step, ScaleImages) else size
-        return size
+            if isinstance(step, ScaleImages):
+                width, height = step.output_size(width, height)
+        return width, height
 
     def get_cat_ids(self, idx: int) -> list[int]:
-        """Return the labels of a sample's elements, for mmengine's ``ClassBalancedDataset``."""
+        """Return the labels of a sample's elements for ``ClassBalancedDataset`` of mmengine."""
         return [instance.label for instance in self.sample(idx).instances or []]
 
     def get_data_info(self, idx: int) -> dict[str, Any]:
-        """Return a sample as the pipeline takes it; BrokenSampleError if a camera is absent.
+        """Return the input of the pipeline for a sample.
 
-        It has the keys of mmdet3d's multi-view pipelines (``images``, ``lidar_points``,
-        ``lidar_sweeps``, ``timestamp``), those of the packed metainfo, ``dim`` and
-        ``map_instances``: the elements at full resolution with ``dim`` coordinates per point.
-        ``map_heights`` has the heights of their points (n,), if the file has any.
+        Args:
+            idx: Index of the sample.
+
+        Returns:
+            Dictionary with the keys of mmdet3d's multi-view pipelines (``images``,
+            ``lidar_points``, ``lidar_sweeps``, ``timestamp``), the keys of the packed metainfo,
+            ``dim``, ``map_instances``, which are the elements at full resolution with ``dim``
+            coordinates per point in metres, and ``map_heights``, the heights of their points in
+            metres, K x (n,), or None for a file without heights.
+
+        Raises:
+            BrokenSampleError: If the sample lacks a camera of ``cameras``.
         """
         entry = super().get_data_info(idx)
         sample = self.annotations[entry["row"]]
@@ -268,109 +316,136 @@ class VectorizedMapDataset(BaseDataset):
         heights = None
         if instances is not None and self.annotations.meta.dim == 3:
             heights = [instance.points[:, 2] for instance in instances]
+        ground_truth = None
         if instances is not None:
-            instances = [MapInstance(i.label, i.points[:, :dim]) for i in instances]
+            instances = [MapInstance(i.label, points=i.points[:, :dim]) for i in instances]
+            labels = [instance.label for instance in instances]
+            ground_truth = {
+                "polylines": [instance.points for instance in instances],
+                "labels": np.array(labels, np.int64),
+            }
+        images = self._images(sample, entry)
         info: dict[str, Any] = {
             "sample_idx": entry["sample_idx"],
-            **{key: getattr(sample, key) for key in ("token", "scene", "map_name", "timestamp_ns")},
-            **{key: self._metainfo[key] for key in ("x_range", "y_range", "dim")},
+            "token": sample.token,
+            "scene": sample.scene,
+            "map_name": sample.map_name,
+            "timestamp_ns": sample.timestamp_ns,
+            "x_range": self._metainfo["x_range"],
+            "y_range": self._metainfo["y_range"],
+            "dim": dim,
             "seconds": self.annotations.seconds_into_scene[entry["row"]],
             "timestamp": sample.timestamp_ns / 1e9,
             "lidar2global": sample.global_from_frame if self._has_poses else None,
             "lidar2ego": sample.ego_from_frame,
             "can_bus": self._vehicle_signals(sample, entry["row"]),
-            "images": self._images(sample, entry),
+            "images": images,
+            "cam_names": list(images),
             "map_instances": instances,
             "map_heights": heights,
-            "eval_ann_info": None,
+            "eval_ann_info": ground_truth,
         }
-        info["cam_names"] = list(info["images"])
-        if instances is not None:
-            info["eval_ann_info"] = {
-                "polylines": [instance.points for instance in instances],
-                "labels": np.array([instance.label for instance in instances], np.int64),
-            }
         if sample.lidar is not None:
             info.update(self._lidar(sample.lidar))
         if self.frame_in_memory is not None:
             frame = self.frame_in_memory
-            info.update({key: getattr(frame, key) for key in ("token", "scene", "timestamp_ns")})
-            info.update(timestamp=frame.timestamp_ns / 1e9, lidar2global=frame.pose)
+            info["token"] = frame.token
+            info["scene"] = frame.scene
+            info["timestamp_ns"] = frame.timestamp_ns
+            info["timestamp"] = frame.timestamp_ns / 1e9
+            info["lidar2global"] = frame.pose
         return info
 
     @property
     def _has_poses(self) -> bool:
-        """Whether the samples' poses are known."""
+        """Whether the poses of the vehicle are known."""
         return bool(self.annotations.meta.options.get("poses", True))
 
     def _vehicle_signals(self, sample: MapSample, row: int) -> np.ndarray:
-        """Return ``can_bus`` without history; of poses, or zero, where a sample has none. (18,)"""
-        signals = sample.can_bus if self.can_bus_in_memory is None else self.can_bus_in_memory
-        if self._pose_only_signals and self.can_bus_in_memory is None:
+        """Return the vehicle signals of a sample without history, zero if unknown. (18,)"""
+        if self.can_bus_in_memory is not None:
+            return without_history(self.can_bus_in_memory)
+        if self._pose_only_signals:
             from gsmap.structures.vehicle_signals import pose_only_signals
 
-            ego_from_frame = sample.ego_from_frame
-            pose_of_ego = sample.global_from_frame
-            if ego_from_frame is not None:
-                pose_of_ego = pose_of_ego @ invert_rigid(ego_from_frame)
-            return without_history(pose_only_signals(pose_of_ego))
-        if signals is not None:
-            return without_history(signals)
+            global_from_ego = sample.global_from_frame
+            if sample.ego_from_frame is not None:
+                global_from_ego = global_from_ego @ invert_rigid(sample.ego_from_frame)
+            return without_history(pose_only_signals(global_from_ego))
+        if sample.can_bus is not None:
+            return without_history(sample.can_bus)
         if not self._signals_from_poses or not self._has_poses:
             return np.zeros(NUM_CAN_BUS)
+        return without_history(self._signals_of_motion(sample, row))
+
+    def _signals_of_motion(self, sample: MapSample, row: int) -> np.ndarray:
+        """Compute vehicle signals from the poses of a sample and its neighbours. (18,)"""
         from gsmap.structures.vehicle_signals import motion_signals
 
-        def pose(other: MapSample) -> tuple[float, np.ndarray]:
-            seconds = (other.timestamp_ns - sample.timestamp_ns) / 1e9
-            frame = self._metainfo["frame"]
-            height_m = self._metainfo["ground_z_m"]
-            ground = ground_from_frame(other, frame, height_m)
-            return seconds, other.global_from_frame @ invert_rigid(ground)
+        before = None
+        after = None
+        for neighbour_row in (row - 1, row + 1):
+            if not 0 <= neighbour_row < len(self.annotations):
+                continue
+            neighbour = self.annotations[neighbour_row]
+            seconds = (neighbour.timestamp_ns - sample.timestamp_ns) / 1e9
+            if neighbour.scene != sample.scene or abs(seconds) > _MAX_POSE_GAP_S:
+                continue
+            pose = (seconds, self._global_from_ground(neighbour))
+            if seconds < 0 and before is None:
+                before = pose
+            if seconds > 0 and after is None:
+                after = pose
+        now = (0.0, self._global_from_ground(sample))
+        return motion_signals(now, before=before, after=after)
 
-        places = [i for i in (row - 1, row + 1) if 0 <= i < len(self.annotations)]
-        beside = [o for o in map(self.annotations.__getitem__, places) if o.scene == sample.scene]
-        poses = [p for p in map(pose, beside) if 0 < abs(p[0]) <= _NEIGHBOUR_S]
-        before, after = (next((p for p in poses if p[0] * s > 0), None) for s in (-1, 1))
-        return without_history(motion_signals(pose(sample), before, after))
+    def _global_from_ground(self, sample: MapSample) -> np.ndarray:
+        """Return the pose of the ground below the rear axle of a sample, in metres. (4, 4)"""
+        frame = self._metainfo["frame"]
+        ground_z_m = self._metainfo["ground_z_m"]
+        ground = ground_from_frame(sample, frame=frame, ground_z_m=ground_z_m)
+        return sample.global_from_frame @ invert_rigid(ground)
 
     def has_signals(self) -> bool:
-        """Return whether samples have vehicle signals that are not computed from several poses."""
+        """Test whether samples have vehicle signals that need no poses of other samples."""
         return self._pose_only_signals or self.sample(0).can_bus is not None
 
     def _images(self, sample: MapSample, entry: dict[str, int]) -> dict[str, dict[str, Any]]:
-        """Return path and calibration of each camera; paths may come from another sample."""
-        donor = sample
+        """Return path, size and calibration by camera, with the paths of ``image_row``."""
+        cameras = {camera.name: camera for camera in sample.cameras}
+        image_cameras = cameras
         if entry["image_row"] != entry["row"]:
-            donor = self.annotations[entry["image_row"]]
-        cameras, images = ({c.name: c for c in s.cameras} for s in (sample, donor))
-        found = {}
+            image_sample = self.annotations[entry["image_row"]]
+            image_cameras = {camera.name: camera for camera in image_sample.cameras}
+        images = {}
         for name in tuple(cameras) if self.cameras is None else self.cameras:
-            if name not in cameras or name not in images:
+            if name not in cameras or name not in image_cameras:
                 raise BrokenSampleError(
                     f"sample {sample.token!r} has no camera {name!r}, only {list(cameras)}: name "
                     "the cameras that all samples have (`cameras=[...]`), or train with "
                     "broken_samples='skip'."
                 )
-            image = images[name]
+            image = image_cameras[name]
+            path = str(Path(self.data_root, image.path))
             cam2img = np.eye(4)
             cam2img[:3, :3] = cameras[name].intrinsics
-            found[name] = {
-                "img_path": self.images_in_memory.get(name, str(Path(self.data_root, image.path))),
+            images[name] = {
+                "img_path": self.images_in_memory.get(name, path),
                 "size": (image.width, image.height),
                 "cam2img": cam2img,
                 "lidar2cam": cameras[name].cam_from_frame,
             }
-        return found
+        return images
 
     def _lidar(self, lidar: LidarRecord) -> dict[str, Any]:
-        """Return LiDAR paths in the form that mmdet3d's point transforms read."""
+        """Return LiDAR paths and transforms in the format of mmdet3d's point transforms."""
         sweeps = []
         for sweep in lidar.sweeps:
-            # mmdet3d computes points @ R - t with R, t out of "lidar2sensor"
+            # mmdet3d computes points @ R - t with R and t of "lidar2sensor"
             rotation = sweep.frame_from_lidar[:3, :3]
             shift = sweep.frame_from_lidar[:3, 3]
             path = str(Path(self.data_root, sweep.path))
-            points = {"lidar_path": path, "lidar2sensor": rigid(rotation.T, -shift)}
+            points = {"lidar_path": path, "lidar2sensor": rigid(rotation.T, translation=-shift)}
             sweeps.append({"lidar_points": points, "timestamp": sweep.timestamp_ns / 1e9})
         return {
             "lidar_points": {"lidar_path": str(Path(self.data_root, lidar.path))},
@@ -379,11 +454,17 @@ class VectorizedMapDataset(BaseDataset):
         }
 
     def prepare_data(self, idx: int) -> Any:
-        """Run the pipeline on a sample; None if that is broken and may be skipped.
+        """Apply the pipeline to a sample.
+
+        Args:
+            idx: Index of the sample.
+
+        Returns:
+            Output of the pipeline, or None for a broken sample that is skipped.
 
         Raises:
             BrokenSampleError: If a file is missing or damaged and ``broken_samples`` is ``raise``.
-            RuntimeError: If more than ``max_refetch`` samples in a row are broken.
+            RuntimeError: If more than ``max_refetch`` consecutive samples are broken.
         """
         try:
             data = self.pipeline(self.get_data_info(idx))

@@ -105,7 +105,7 @@ def _join_steps(steps: Sequence[Sequence[Any]]) -> list[Any] | None:
         return None
     joined = []
     for first, *others in zip(*steps, strict=True):
-        step = first.joined(others)
+        step = first.join(others)
         if step is None:
             return None
         joined.append(step)

@@ -1,1 +1,1 @@
-"""Pipeline transforms; importing the modules registers them in mmdet3d's ``TRANSFORMS``."""
+"""Transforms of the data pipeline, which are registered in ``TRANSFORMS`` of mmdet3d."""

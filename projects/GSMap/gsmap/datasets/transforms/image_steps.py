@@ -1,9 +1,9 @@
-"""What is done to all images of a sample: at once on the host, or later on a GPU.
+"""Image steps, which transform all images of a sample on the host or on a GPU.
 
-With ``LoadCameraImages(on_device=True)`` images stay as they were decoded, uint8, and transforms
-only note their steps (``results['image_steps']``). `MapDataPreprocessor` takes them on its device,
-in their order and with the numbers that the transforms drew. The results equal the host's up to
-rounding.
+With ``LoadCameraImages(on_device=True)``, images remain in uint8 as decoded, and transforms only
+record their steps in ``results['image_steps']``. `MapDataPreprocessor` applies the steps on the GPU
+in the recorded order and with the random numbers of the transforms. The results on host and GPU
+agree up to rounding.
 """
 
 from collections.abc import Sequence
@@ -18,28 +18,29 @@ from mmdet3d.datasets.transforms import PhotoMetricDistortion3D
 from mmdet3d.registry import TRANSFORMS
 from torch import Tensor
 
-_EPSILON = float(np.finfo(np.float32).eps)  # what OpenCV adds to a divisor
+_EPSILON = float(np.finfo(np.float32).eps)  # OpenCV adds it to divisors
 
 
 class ImageStep(Protocol):
-    """A step that all images of a sample take."""
+    """Interface of a step that transforms all images of a sample."""
 
     def on_host(self, images: list[np.ndarray]) -> list[np.ndarray]:
-        """Images after the step, as the published pipelines compute it. (H, W, 3) each"""
+        """Transform images like the published pipelines. V x (H, W, 3) -> V x (H', W', 3)"""
 
     def on_device(self, images: Tensor) -> Tensor:
-        """Images after the step, in float32. (V, 3, H, W)"""
+        """Transform images with torch. (V, 3, H, W) -> (V, 3, H', W')"""
 
-    def joined(self, others: "Sequence[Any]") -> "ImageStep | None":
-        """One step for the images of several samples, or None if they differ in kind."""
+    def join(self, others: "Sequence[Any]") -> "ImageStep | None":
+        """Join with the steps of other samples to one step; None if that is not possible."""
 
 
 def take_step(results: dict[str, Any], step: ImageStep) -> None:
-    """Let the images of a sample take a step now, or note it for the device.
+    """Apply a step to the images of a sample, or record it for the GPU.
 
     Args:
-        results: What the pipeline knows of the sample; ``image_steps`` are noted steps.
-        step: The step.
+        results: Results of the pipeline so far. If they have ``image_steps``, the list of recorded
+            steps, the step is added there.
+        step: Image step.
     """
     if "image_steps" in results:
         results["image_steps"].append(step)
@@ -48,10 +49,10 @@ def take_step(results: dict[str, Any], step: ImageStep) -> None:
 
 
 def shape_after_steps(results: dict[str, Any]) -> tuple[int, int]:
-    """Rows and columns of the images of a sample after all steps, noted ones included.
+    """Return height and width of the images after all steps, including recorded ones, in pixels.
 
     Args:
-        results: What the pipeline knows of the sample.
+        results: Results of the pipeline so far.
     """
     if results.get("image_steps"):
         return results["img_shape"]
@@ -59,10 +60,12 @@ def shape_after_steps(results: dict[str, Any]) -> tuple[int, int]:
 
 
 def finish_on_host(results: dict[str, Any]) -> None:
-    """Take all noted steps, in float32, for a transform that reads pixels.
+    """Apply all recorded steps in float32, before a transform that reads pixels.
+
+    Later steps are applied directly.
 
     Args:
-        results: What the pipeline knows of the sample; later steps are taken at once.
+        results: Results of the pipeline so far; ``image_steps`` is removed.
     """
     if "image_steps" not in results:
         return
@@ -76,13 +79,13 @@ FILTERS = ("bilinear", "bicubic")
 
 @dataclass(frozen=True)
 class Resize:
-    """Resizing.
+    """Image step that resizes images.
 
     Args:
-        size: Width and height after it, in pixels.
-        rounded: Whether whole grey levels stay whole, as those of uint8 do.
-        kernel: Of ``FILTERS``: ``bilinear`` is OpenCV's, which reads four pixels; ``bicubic`` is
-            Pillow's, antialiased, whose results are whole grey levels.
+        size: Width and height after the step, in pixels.
+        rounded: Whether images with integer values have integer values after the step.
+        kernel: ``bilinear``, the kernel of OpenCV, which reads four pixels, or ``bicubic``, the
+            antialiased kernel of Pillow, whose results are integers.
     """
 
     size: tuple[int, int]
@@ -93,43 +96,47 @@ class Resize:
         """See `ImageStep`."""
         if self.kernel == "bilinear":
             return [mmcv.imresize(image, self.size) for image in images]
-        whole = [np.clip(np.rint(image), 0, 255).astype(np.uint8) for image in images]
-        scaled = [
-            mmcv.imresize(image, self.size, interpolation="bicubic", backend="pillow")
-            for image in whole
-        ]
-        return [new.astype(old.dtype) for new, old in zip(scaled, images, strict=True)]
+        resized_images = []
+        for image in images:
+            grey_levels = np.clip(np.rint(image), 0, 255).astype(np.uint8)
+            resized = mmcv.imresize(
+                grey_levels, self.size, interpolation="bicubic", backend="pillow"
+            )
+            resized_images.append(resized.astype(image.dtype))
+        return resized_images
 
     def on_device(self, images: Tensor) -> Tensor:
         """See `ImageStep`."""
         if self.kernel == "bicubic":
-            wide = _bicubic(images, (images.shape[2], self.size[0]))  # rows last, as Pillow does
-            return _bicubic(wide, self.size[::-1])
-        whole = self.rounded and not images.is_floating_point()
-        scaled = F.interpolate(
-            images.float(), self.size[::-1], mode="bilinear", align_corners=False
+            # Pillow resizes the width first.
+            images = _resize_bicubic(images, size=(images.shape[2], self.size[0]))
+            return _resize_bicubic(images, size=self.size[::-1])
+        resized = F.interpolate(
+            images.float(), size=self.size[::-1], mode="bilinear", align_corners=False
         )
-        return (scaled + 0.5).to(torch.uint8) if whole else scaled  # a half is rounded up
+        if self.rounded and not images.is_floating_point():
+            return (resized + 0.5).to(torch.uint8)  # rounds halves up
+        return resized
 
-    def joined(self, others: "Sequence[Any]") -> "Resize | None":
+    def join(self, others: "Sequence[Any]") -> "Resize | None":
         """See `ImageStep`."""
         return self if all(other == self for other in others) else None
 
 
-def _bicubic(images: Tensor, size: tuple[int, int]) -> Tensor:
-    """Resize to rows and columns with an antialiased bicubic kernel, to whole grey levels."""
-    scaled = F.interpolate(
-        images.float(), size, mode="bicubic", align_corners=False, antialias=True
+def _resize_bicubic(images: Tensor, size: tuple[int, int]) -> Tensor:
+    """Resize images to (height, width) with an antialiased bicubic kernel and round to uint8."""
+    resized = F.interpolate(
+        images.float(), size=size, mode="bicubic", align_corners=False, antialias=True
     )
-    return (scaled.clamp(0, 255) + 0.5).to(torch.uint8)
+    return (resized.clamp(0, 255) + 0.5).to(torch.uint8)
 
 
 @dataclass(frozen=True)
 class CropTop:
-    """Rows cut off the top.
+    """Image step that crops rows at the top.
 
     Args:
-        rows: Their number.
+        rows: Number of rows to remove.
     """
 
     rows: int
@@ -142,18 +149,19 @@ class CropTop:
         """See `ImageStep`."""
         return images[:, :, self.rows :]
 
-    def joined(self, others: "Sequence[Any]") -> "CropTop | None":
+    def join(self, others: "Sequence[Any]") -> "CropTop | None":
         """See `ImageStep`."""
         return self if all(other == self for other in others) else None
 
 
 @dataclass(frozen=True)
 class Distortion:
-    """Photometric distortion of each image by its own numbers, see `DistortImages`.
+    """Image step of a photometric distortion with separate parameters for each image.
 
     Args:
-        numbers: Of each image what ``PhotoMetricDistortion3D`` draws: order, five flags,
-            brightness, contrast, saturation, hue, order of the channels.
+        numbers: Parameters of each image, drawn by ``PhotoMetricDistortion3D``: place of the change
+            of contrast, five flags, brightness, contrast, saturation, hue and order of the
+            channels.
     """
 
     numbers: tuple[tuple[Any, ...], ...]
@@ -161,97 +169,108 @@ class Distortion:
     def on_host(self, images: list[np.ndarray]) -> list[np.ndarray]:
         """See `ImageStep`."""
         distort = PhotoMetricDistortion3D().transform
-        return [
-            distort({"img": image, "photometric_param": numbers})["img"]
-            for image, numbers in zip(images, self.numbers, strict=True)
-        ]
+        distorted_images = []
+        for image, numbers in zip(images, self.numbers, strict=True):
+            distorted = distort({"img": image, "photometric_param": numbers})
+            distorted_images.append(distorted["img"])
+        return distorted_images
 
     def on_device(self, images: Tensor) -> Tensor:
         """See `ImageStep`."""
-        table = np.array([_distortion_row(numbers) for numbers in self.numbers], np.float32)
-        on_device = torch.from_numpy(table)
+        rows = [_distortion_row(numbers) for numbers in self.numbers]
+        table = torch.from_numpy(np.array(rows, np.float32))  # (V, 8)
         if images.is_cuda:
-            on_device = on_device.pin_memory().to(images.device, non_blocking=True)
-        return distort_images(images, on_device.to(images.device))
+            table = table.pin_memory().to(images.device, non_blocking=True)
+        return distort_images(images, table.to(images.device))
 
-    def joined(self, others: "Sequence[Any]") -> "Distortion | None":
+    def join(self, others: "Sequence[Any]") -> "Distortion | None":
         """See `ImageStep`."""
         if not all(isinstance(other, Distortion) for other in others):
             return None
-        return Distortion(sum((other.numbers for other in others), self.numbers))
+        numbers = self.numbers
+        for other in others:
+            numbers += other.numbers
+        return Distortion(numbers)
 
 
 def _distortion_row(numbers: tuple[Any, ...]) -> list[float]:
-    """Return factors and shifts that are neutral where a flag is not set, see `distort_images`."""
-    mode, brightens, contrasts, saturates, shifts_hue, swaps = numbers[:6]
-    delta, alpha, saturation, hue, order = numbers[6:]
-    early, late = (alpha, 1.0) if mode == 1 else (1.0, alpha)
+    """Return the parameters of `distort_images`, which are neutral for flags that are not set."""
+    mode, has_brightness, has_contrast, has_saturation, has_hue, has_order = numbers[:6]
+    brightness, contrast, saturation, hue, order = numbers[6:]
+    contrast_first = mode == 1
     return [
-        delta if brightens else 0.0,
-        early if contrasts else 1.0,
-        saturation if saturates else 1.0,
-        hue if shifts_hue else 0.0,
-        late if contrasts else 1.0,
-        *(order if swaps else range(3)),
+        brightness if has_brightness else 0.0,
+        contrast if has_contrast and contrast_first else 1.0,
+        saturation if has_saturation else 1.0,
+        hue if has_hue else 0.0,
+        contrast if has_contrast and not contrast_first else 1.0,
+        *(order if has_order else range(3)),
     ]
 
 
 def distort_images(images: Tensor, numbers: Tensor) -> Tensor:
-    """Photometric distortion as OpenCV computes it in float32.
+    """Apply a photometric distortion with the arithmetic of OpenCV in float32.
 
     Args:
-        images: Blue, green and red of each image, 0 to 255. (N, 3, H, W)
-        numbers: Brightness that is added, early contrast, factor of the saturation, degrees that
-            are added to the hue, late contrast, and which channel each of the three becomes. (N, 8)
+        images: BGR images, from 0 to 255. (N, 3, H, W)
+        numbers: Shift of the brightness; factor of the contrast before the change of colours;
+            factor of the saturation; shift of the hue in degrees; factor of the contrast after the
+            change of colours; and the input channel of each of the three output channels. (N, 8)
 
     Returns:
-        The images, not clipped. (N, 3, H, W)
+        Distorted images, float32, not clipped to [0, 255]. (N, 3, H, W)
     """
-    brightness, early, saturation, hue, late = numbers[:, :5, None, None].unbind(1)  # (N, 1, 1)
-    images = (images.float() + brightness[:, None]) * early[:, None]
+    factors = numbers[:, :5, None, None]
+    brightness, early_contrast, saturation, hue, late_contrast = factors.unbind(1)  # (N, 1, 1)
+    images = (images.float() + brightness[:, None]) * early_contrast[:, None]
     blue, green, red = images.unbind(1)  # (N, H, W)
     value = images.amax(1)
     spread = value - images.amin(1)
-    share = spread / (value.abs() + _EPSILON) * saturation
+    new_saturation = spread / (value.abs() + _EPSILON) * saturation
     slope = 60.0 / (spread + _EPSILON)
-    of_blue = (red - green) * slope + 240.0
-    of_green = (blue - red) * slope + 120.0
-    of_red = (green - blue) * slope
-    angle = torch.where(value == red, of_red, torch.where(value == green, of_green, of_blue))
+    hue_near_blue = (red - green) * slope + 240.0
+    hue_near_green = (blue - red) * slope + 120.0
+    hue_near_red = (green - blue) * slope
+    hue_not_near_red = torch.where(value == green, hue_near_green, hue_near_blue)
+    angle = torch.where(value == red, hue_near_red, hue_not_near_red)
     angle = torch.where(angle < 0, angle + 360.0, angle) + hue  # degrees
-    chroma = value * share
+    chroma = value * new_saturation
     channels = []
     for sector in (1.0, 3.0, 5.0):  # blue, green, red
         turn = (angle / 60.0 + sector) % 6.0
-        channels.append(value - chroma * torch.minimum(turn, 4.0 - turn).clamp(0.0, 1.0))
-    distorted = torch.stack(channels, 1) * late[:, None]
-    order = numbers[:, 5:].long()[:, :, None, None].expand(-1, -1, *images.shape[2:])
-    return distorted.gather(1, order)
+        weight = torch.minimum(turn, 4.0 - turn).clamp(0.0, 1.0)
+        channels.append(value - chroma * weight)
+    distorted = torch.stack(channels, dim=1) * late_contrast[:, None]
+    height, width = images.shape[2:]
+    order = numbers[:, 5:].long()[:, :, None, None]  # (N, 3, 1, 1)
+    return distorted.gather(1, order.expand(-1, -1, height, width))
 
 
 @TRANSFORMS.register_module()
 class DistortImages(PhotoMetricDistortion3D):
-    """Photometric distortion of all images, each by numbers of its own.
+    """Photometric distortion of all images with separate random parameters for each image.
 
-    It draws and computes what ``MultiViewWrapper`` of mmdet3d's ``PhotoMetricDistortion3D`` with
-    ``override_aug_config=False`` does (MapTR).
+    The random numbers and the results are equal to ``PhotoMetricDistortion3D`` of mmdet3d in a
+    ``MultiViewWrapper`` with ``override_aug_config=False``, as in MapTR.
 
     Args:
-        swap_channels: Whether half of the images get their channels in a random order.
+        swap_channels: Whether the channels of half of the images are permuted at random.
         kwargs: Further arguments of ``PhotoMetricDistortion3D``.
     """
 
-    _SWAP = 5  # place of the flag among the numbers
+    _SWAP_FLAG = 5  # index among the parameters of an image
 
     def __init__(self, swap_channels: bool = True, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self.swap_channels = swap_channels
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Distort ``results['img']``."""
-        numbers = [list(self._random_flags()) for _ in results["img"]]
-        if not self.swap_channels:
-            for of_image in numbers:
-                of_image[self._SWAP] = 0
-        take_step(results, Distortion(tuple(map(tuple, numbers))))
+        """Distort ``results['img']``, or record the distortion for the GPU."""
+        numbers = []
+        for _ in results["img"]:
+            image_numbers = list(self._random_flags())
+            if not self.swap_channels:
+                image_numbers[self._SWAP_FLAG] = 0
+            numbers.append(tuple(image_numbers))
+        take_step(results, Distortion(tuple(numbers)))
         return results

@@ -1,4 +1,4 @@
-"""Camera images: loading with checks, and scaling with the matrices kept right."""
+"""Loading, resizing and cropping of camera images, with an update of the projections."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -22,40 +22,51 @@ from gsmap.datasets.transforms.image_steps import (
 )
 from gsmap.utils.errors import InputError
 
-_MOST_SHRUNK = 2.0  # by bilinear sampling, which reads four pixels
+_MAX_BILINEAR_SHRINKAGE = 2.0  # beyond it, bilinear sampling of four pixels leaves pixels out
 
 
 @TRANSFORMS.register_module()
 @dataclass(eq=False)
 class LoadCameraImages(BaseTransform):
-    """Load the images of all cameras, naming sample and file when one is damaged.
+    """Load and check the images of all cameras.
 
-    Adds the keys of mmdet3d's ``LoadMultiViewImageFromFiles`` that others read, and ``lidar2img``,
-    ``img_aug_matrix`` (lists of (4, 4)) and ``img_path``. Images of different size are padded at
-    the bottom and right to the largest; ``raw_shapes`` are (height, width) before that. Unlike
-    there, no image is a strided view of a stack, which costs as much as decoding.
+    Adds the keys of ``LoadMultiViewImageFromFiles`` of mmdet3d that other transforms read, and
+    ``lidar2img``, ``img_aug_matrix`` (lists of (4, 4)) and ``img_path``. Smaller images are padded
+    at the bottom and right to the size of the largest; ``raw_shapes`` has (height, width) of each
+    image before the padding. Unlike in mmdet3d, images are contiguous arrays and not strided views
+    of a stack, which are as slow to copy as the image is to decode.
 
     Args:
-        to_float32: Whether to convert to float32 before anything else.
-        on_device: Whether later steps are noted for a GPU (`image_steps`); images stay uint8.
+        to_float32: Whether to convert the images to float32 directly after loading.
+        on_device: Whether to record later image steps for the GPU (`image_steps`) and to leave the
+            images in uint8.
     """
 
     to_float32: bool = True
     on_device: bool = False
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Load ``results['images']``; BrokenSampleError if one is not as its record says."""
-        cameras, token = results["images"], results["token"]
-        images = [
-            read_image(camera["img_path"], f"sample {token!r}, camera {name}", camera.get("size"))
-            for name, camera in cameras.items()
-        ]
-        results["to_float32"] = self.to_float32
-        results["raw_shapes"] = [image.shape[:2] for image in images]
-        shape = tuple(map(max, zip(*results["raw_shapes"], strict=True)))
-        padded = [i if i.shape[:2] == shape else mmcv.impad(i, shape=shape) for i in images]
+        """Load the images of ``results['images']``.
+
+        Raises:
+            BrokenSampleError: If a file is missing or damaged, or does not match the record.
+        """
+        cameras = results["images"]
+        images = []
+        for name, camera in cameras.items():
+            where = f"sample {results['token']!r}, camera {name}"
+            image = read_image(camera["img_path"], where=where, size=camera.get("size"))
+            images.append(image)
+        raw_shapes = [image.shape[:2] for image in images]
+        shape = (max(rows for rows, _ in raw_shapes), max(cols for _, cols in raw_shapes))
         converts = self.to_float32 and not self.on_device
-        results["img"] = [i.astype(np.float32) if converts else i for i in padded]
+        results["img"] = []
+        for image in images:
+            if image.shape[:2] != shape:
+                image = mmcv.impad(image, shape=shape)
+            results["img"].append(image.astype(np.float32) if converts else image)
+        results["to_float32"] = self.to_float32
+        results["raw_shapes"] = raw_shapes
         if self.on_device:
             results["image_steps"] = []
         results["img_shape"] = results["ori_shape"] = results["pad_shape"] = shape
@@ -63,10 +74,9 @@ class LoadCameraImages(BaseTransform):
         for key in ("img_path", "cam2img", "lidar2cam"):
             results[key] = [camera[key] for camera in cameras.values()]
         results["img_aug_matrix"] = [np.eye(4) for _ in images]
-        results["lidar2img"] = [
-            cam2img @ lidar2cam
-            for cam2img, lidar2cam in zip(results["cam2img"], results["lidar2cam"], strict=True)
-        ]
+        results["lidar2img"] = []
+        for camera in cameras.values():
+            results["lidar2img"].append(camera["cam2img"] @ camera["lidar2cam"])
         return results
 
 
@@ -76,19 +86,19 @@ class ScaleImages(BaseTransform):
     """Resize all images and update ``lidar2img`` and ``img_aug_matrix``.
 
     Args:
-        scale: Factor, > 0; sizes are rounded down, and the matrices take the exact ratio of each
-            axis.
-        size: In place of a factor, the width and height of every image, without the padding that
-            made them equal.
-        trained_size: Width and height, in pixels, that a model was trained at: images that
-            ``scale`` would make larger or smaller get the longer side of it in place of that. They
-            are neither cropped nor padded. Beyond a factor of 2 they shrink by area, so that no
-            pixel is left out; what ``scale`` does is that of the training.
+        scale: Factor, > 0. Sizes are rounded down, and the matrices are multiplied by the exact
+            ratio of each axis. Either ``scale`` or ``size`` must be given.
+        size: Width and height of all images after the transform, in pixels. The padding of smaller
+            images is removed before.
+        trained_size: Width and height of the training images in pixels. If ``scale`` leads to
+            another length of the longer side, the images are resized to the longer side of
+            ``trained_size`` instead, without cropping or padding. They are averaged by area if they
+            shrink by more than a factor of 2. None always uses ``scale``.
         kernel: ``bilinear`` or ``bicubic``, see `Resize`.
 
     Raises:
-        ValueError: If there is not one of factor and size, it is not positive, or the kernel is
-            unknown.
+        ValueError: If both or none of ``scale`` and ``size`` are given, the given one is not
+            positive, or the kernel is unknown.
     """
 
     scale: float | None = None
@@ -101,55 +111,60 @@ class ScaleImages(BaseTransform):
             raise InputError(f"kernel must be one of {FILTERS}, got {self.kernel!r}.")
         if (self.scale is None) == (self.size is None):
             raise InputError(f"give scale or size, got {self.scale} and {self.size}.")
-        if not min(self.size or (cast(float, self.scale),)) > 0:
+        smallest = min(self.size) if self.size else cast(float, self.scale)
+        if not smallest > 0:
             raise InputError(f"scale or size must be > 0, got {self.size or self.scale}.")
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Scale ``results['img']``."""
+        """Resize ``results['img']``.
+
+        Raises:
+            ValueError: If the images would have no pixel.
+        """
         if self.size is not None:
-            return self._to_size(results, (int(self.size[0]), int(self.size[1])))
+            return self._resize_to_size(results, (int(self.size[0]), int(self.size[1])))
         height, width = shape_after_steps(results)
-        size, by_area = self.scaled(width, height), False
+        size = self.output_size(width, height)
+        by_area = False
         if self.trained_size is not None and max(size) != max(self.trained_size):
-            size = _times((width, height), max(self.trained_size) / max(width, height))
-            by_area = min(size) > 0 and width / size[0] > _MOST_SHRUNK
-            _say_scaled((width, height), size, tuple(self.trained_size), by_area)
+            factor = max(self.trained_size) / max(width, height)
+            size = _scaled_size((width, height), factor)
+            by_area = min(size) > 0 and width / size[0] > _MAX_BILINEAR_SHRINKAGE
+            _log_other_scale(
+                (width, height), size, trained_size=tuple(self.trained_size), by_area=by_area
+            )
         if min(size) < 1:
             raise InputError(f"scale {self.scale} leaves nothing of a {width} x {height} image.")
         matrix = np.diag([size[0] / width, size[1] / height, 1.0, 1.0])
         if by_area:
             finish_on_host(results)
-            results["img"] = [
-                mmcv.imresize(img, size, interpolation="area") for img in results["img"]
-            ]
+            images = results["img"]
+            results["img"] = [mmcv.imresize(img, size, interpolation="area") for img in images]
         elif size != (width, height):
-            take_step(results, self._resize(results, size))
+            take_step(results, self._resize_step(results, size))
         for key in ("lidar2img", "img_aug_matrix"):
             results[key] = [matrix @ m for m in results[key]]
         results["img_shape"] = results["pad_shape"] = size[::-1]
         results["scale_factor"] = size[0] / width
         return results
 
-    def _resize(self, results: dict[str, Any], size: tuple[int, int]) -> Resize:
-        """Return the step that brings all images to a size (width, height)."""
+    def _resize_step(self, results: dict[str, Any], size: tuple[int, int]) -> Resize:
+        """Return the step that resizes all images to (width, height)."""
         return Resize(size, rounded=not results.get("to_float32", True), kernel=self.kernel)
 
-    def _to_size(self, results: dict[str, Any], size: tuple[int, int]) -> dict[str, Any]:
-        """Bring each image, as large as it was loaded, to a size (width, height)."""
-        step = self._resize(results, size)
-        if len(set(results["raw_shapes"])) > 1:
+    def _resize_to_size(self, results: dict[str, Any], size: tuple[int, int]) -> dict[str, Any]:
+        """Resize each image without its padding to (width, height)."""
+        step = self._resize_step(results, size)
+        raw_shapes = results["raw_shapes"]
+        if len(set(raw_shapes)) > 1:
             finish_on_host(results)
-            results["img"] = step.on_host(
-                [
-                    img[:height, :width]
-                    for img, (height, width) in zip(
-                        results["img"], results["raw_shapes"], strict=True
-                    )
-                ]
-            )
+            cropped_images = []
+            for image, (height, width) in zip(results["img"], raw_shapes, strict=True):
+                cropped_images.append(image[:height, :width])
+            results["img"] = step.on_host(cropped_images)
         else:
             take_step(results, step)
-        for view, (height, width) in enumerate(results["raw_shapes"]):
+        for view, (height, width) in enumerate(raw_shapes):
             matrix = np.diag([size[0] / width, size[1] / height, 1.0, 1.0])
             for key in ("lidar2img", "img_aug_matrix"):
                 results[key][view] = matrix @ results[key][view]
@@ -157,20 +172,23 @@ class ScaleImages(BaseTransform):
         results["img_shape"] = results["pad_shape"] = size[::-1]
         return results
 
-    def scaled(self, width: int, height: int) -> tuple[int, int]:
-        """Return width and height of an image after it, in pixels."""
+    def output_size(self, width: int, height: int) -> tuple[int, int]:
+        """Return (width, height) after the transform, for images of any size. In pixels."""
         if self.size is not None:
             return self.size
-        return _times((width, height), cast(float, self.scale))
+        return _scaled_size((width, height), cast(float, self.scale))
 
 
 @TRANSFORMS.register_module()
 @dataclass(eq=False)
 class CropImages(BaseTransform):
-    """Cut rows off the top of all images, the sky, and update the matrices.
+    """Crop rows, usually of the sky, at the top of all images and update the matrices.
 
     Args:
-        top: Rows, > 0; ValueError if not, or if an image has no more.
+        top: Number of rows to remove, at least 1.
+
+    Raises:
+        ValueError: If ``top`` is less than 1.
     """
 
     top: int
@@ -180,7 +198,11 @@ class CropImages(BaseTransform):
             raise InputError(f"top must be >= 1 row, got {self.top}.")
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Crop ``results['img']``."""
+        """Crop ``results['img']``.
+
+        Raises:
+            ValueError: If the images have no more than ``top`` rows.
+        """
         height, width = shape_after_steps(results)
         if height <= self.top:
             raise InputError(f"top={self.top} leaves nothing of images of {height} rows.")
@@ -189,28 +211,33 @@ class CropImages(BaseTransform):
         take_step(results, CropTop(self.top))
         for key in ("lidar2img", "img_aug_matrix"):
             results[key] = [matrix @ m for m in results[key]]
-        results["raw_shapes"] = [(rows - self.top, cols) for rows, cols in results["raw_shapes"]]
+        raw_shapes = results["raw_shapes"]
+        results["raw_shapes"] = [(rows - self.top, cols) for rows, cols in raw_shapes]
         results["img_shape"] = results["pad_shape"] = (height - self.top, width)
         return results
 
 
-def _times(size: tuple[int, int], scale: float) -> tuple[int, int]:
-    """Return width and height of a scaled image, in pixels."""
-    # 1e-6: a factor such as 0.58 * 100 must not round down to 57
-    return int(size[0] * scale + 1e-6), int(size[1] * scale + 1e-6)
+def _scaled_size(size: tuple[int, int], scale: float) -> tuple[int, int]:
+    """Multiply (width, height) by a factor and round down, in pixels."""
+    width, height = size
+    # 1e-6: 0.58 * 100 is 57.99..., which must not be rounded down to 57
+    return int(width * scale + 1e-6), int(height * scale + 1e-6)
 
 
 @cache
-def _say_scaled(
-    found: tuple[int, int], size: tuple[int, int], trained: tuple[int, ...], by_area: bool
+def _log_other_scale(
+    input_size: tuple[int, int],
+    output_size: tuple[int, int],
+    trained_size: tuple[int, ...],
+    by_area: bool,
 ) -> None:
-    """Say once that images are not scaled as the config says."""
+    """Log once that images are not resized by the factor in the config; sizes in pixels."""
     worker = get_worker_info()
     if worker is None or worker.id == 0:
+        kernel = ", by area" if by_area else ""
         print_log(
-            "images of {} x {} are scaled to {} x {}, without cropping or padding{}, as the model "
-            "was trained at {} x {}; --image-scale gives another factor.".format(
-                *found, *size, ", by area" if by_area else "", *trained
-            ),
-            "current",
+            f"images of {input_size[0]} x {input_size[1]} are scaled to {output_size[0]} x "
+            f"{output_size[1]}, without cropping or padding{kernel}, as the model was trained at "
+            f"{trained_size[0]} x {trained_size[1]}; --image-scale gives another factor.",
+            logger="current",
         )
