@@ -1,4 +1,4 @@
-"""From nuScenes-format data (nuScenes, MiniCity) to annotation files, with the official devkit."""
+"""Conversion of nuScenes-format data (nuScenes, MiniCity) to annotation files."""
 
 import argparse
 from collections import defaultdict
@@ -54,16 +54,23 @@ _OFFICIAL_SPLITS = {
     "v1.0-trainval": ("train", "val"), "v1.0-mini": ("mini_train", "mini_val"),
     "v1.0-test": ("test",),
 }  # fmt: skip
-_FRAMES_PER_WORKER = 500  # a process takes about as long to start as these take
-_Scene = tuple[dict[str, Any], NuScenesTables]  # its record, and the tables that it is of
+_FRAMES_PER_WORKER = 500  # a process starts in about the time that these frames take
+_Scene = tuple[dict[str, Any], NuScenesTables]  # record of a scene, and the tables of its version
 
 
 @dataclass(frozen=True)
 class NuScenesOptions(FileOptions):
-    """What to convert and how: the options of ``tools/create_data.py nuscenes``.
+    """Options of a conversion of nuScenes-format data (``tools/create_data.py nuscenes``).
 
-    Without ``split_name`` and ``split_file``, ``<root>/<version>/splits.json`` counts if it is
-    there, else the official splits. Several versions may be joined, as published splits need it.
+    Without ``split_name`` and ``split_file`` the splits are read from
+    ``<root>/<version>/splits.json`` or, if this file is missing, are the official ones.
+
+    Args:
+        version: Folder of the tables, or several folders to join, as some published splits need.
+        dataset: Name of the data set in the annotation files.
+        max_sweeps: Number of earlier LiDAR sweeps per sample.
+        frame: Annotation frame, ``lidar`` or ``ego``.
+        crossings: Rule of the crossings (`NuScenesLocalMap`).
     """
 
     version: str | tuple[str, ...]
@@ -75,12 +82,12 @@ class NuScenesOptions(FileOptions):
 
     @property
     def versions(self) -> tuple[str, ...]:
-        """The folders with tables."""
+        """Names of the folders of the tables."""
         return (self.version,) if isinstance(self.version, str) else self.version
 
 
 def _check_root(root: Path, version: str) -> None:
-    """Raise a ``FileNotFoundError`` if the data root, the version or the maps are not there."""
+    """Raise a ``FileNotFoundError`` if the data root, the version or all maps are missing."""
     if not root.is_dir():
         raise FileNotFoundError(
             f"no data set at {root}: give the folder that holds `maps`, `samples` and `v1.0-...`; "
@@ -88,10 +95,9 @@ def _check_root(root: Path, version: str) -> None:
             f"minicity --root {root}` makes MiniCity."
         )
     if not (root / version / "scene.json").is_file():
-        found = versions_in(root)
+        versions = ", ".join(versions_in(root)) or "no version at all"
         raise FileNotFoundError(
-            f"no version {version!r} in {root}: it has {', '.join(found) or 'no version at all'}. "
-            "Name one with --version."
+            f"no version {version!r} in {root}: it has {versions}. Name one with --version."
         )
     if not maps_in(root):
         raise FileNotFoundError(
@@ -100,50 +106,67 @@ def _check_root(root: Path, version: str) -> None:
         )
 
 
-def _wanted(options: NuScenesOptions) -> tuple[SplitList, str]:
-    """Return the splits to make, and what files say of them: nothing of a data set's own splits."""
+def _select_splits(options: NuScenesOptions) -> tuple[SplitList, str]:
+    """Select the list of splits to convert.
+
+    Returns:
+        The list, and its identity for the annotation files (empty for ``splits.json``).
+    """
     from nuscenes.utils.splits import create_splits_scenes
 
-    if (asked := asked_split(options, "nuscenes")) is not None:
-        return asked, asked.identity
-    own = options.root / options.versions[0] / "splits.json"
-    if own.is_file():
-        return read_split_file(own), ""
+    published_or_file = asked_split(options, "nuscenes")
+    if published_or_file is not None:
+        return published_or_file, published_or_file.identity
+    splits_path = options.root / options.versions[0] / "splits.json"
+    if splits_path.is_file():
+        return read_split_file(splits_path), ""
     official = create_splits_scenes()
+    scenes = {}
     for each in options.versions:
         if each not in _OFFICIAL_SPLITS:
             raise InputError(
-                f"version {each!r} has no official splits: give --split-file, or write {own} "
-                "(docs/data.md says how)."
+                f"version {each!r} has no official splits: give --split-file, or write "
+                f"{splits_path} (docs/data.md says how)."
             )
-    parts = [part for each in options.versions for part in _OFFICIAL_SPLITS[each]]
-    everything = {part: official[part] for part in ("train", "val", "test")}  # mini is of these
-    wanted = SplitList(OFFICIAL, {part: official[part] for part in parts})
-    return wanted, list_identity(OFFICIAL, everything)
+        for part in _OFFICIAL_SPLITS[each]:
+            scenes[part] = official[part]
+    # the mini splits are parts of these three
+    all_scenes = {part: official[part] for part in ("train", "val", "test")}
+    return SplitList(OFFICIAL, scenes), list_identity(OFFICIAL, all_scenes)
 
 
-def _resolved(
-    wanted: SplitList, options: NuScenesOptions, scenes: list[dict[str, Any]]
+def _resolve_splits(
+    split_list: SplitList, options: NuScenesOptions, scenes: list[_Scene]
 ) -> tuple[dict[str, str], list[str]]:
-    """Return the split of each scene, by name, and notes of scenes that the data set lacks."""
-    names = {scene["token"]: scene["name"] for scene in scenes}
+    """Find the split of each scene.
+
+    Returns:
+        Split by name of the scene, and a note if scenes of the list are missing in the data set.
+    """
+    names = {}
+    for scene, _ in scenes:
+        names[scene["token"]] = scene["name"]
     where = " and ".join(str(options.root / version) for version in options.versions)
-    with naming(
-        options.split_file or f"split {wanted.name!r} of {where}", "list each scene in one split"
-    ):
-        split_of, missing = resolve_scenes(wanted.scenes, names)
+    source = options.split_file or f"split {split_list.name!r} of {where}"
+    with naming(source, "list each scene in one split"):
+        split_of, missing = resolve_scenes(split_list.scenes, names)
     if not split_of:
         raise InputError(
             f"none of the split's scenes is in {where}: it has {sorted(names.values())[:5]}; give "
             "--split-file."
         )
-    total = len(missing) + len(split_of)
-    note = missing and wanted.missing_note(missing, total, where, options.allow_missing)
-    return split_of, [note] if note else []
+    notes = []
+    if missing:
+        total = len(missing) + len(split_of)
+        note = split_list.missing_note(missing, total, where=where, allowed=options.allow_missing)
+        notes.append(note)
+    return split_of, notes
 
 
-def _instances_of(local_map: NuScenesLocalMap, poses: np.ndarray) -> list[list[MapInstance] | str]:
-    """Return the instances at each pose (n, 4, 4), or why there are none."""
+def _extract_instances(
+    local_map: NuScenesLocalMap, poses: np.ndarray
+) -> list[list[MapInstance] | str]:
+    """Extract the map elements at each pose (n, 4, 4); a text is the reason of a failure."""
     results: list[list[MapInstance] | str] = []
     for pose in poses:
         try:
@@ -153,39 +176,63 @@ def _instances_of(local_map: NuScenesLocalMap, poses: np.ndarray) -> list[list[M
     return results
 
 
-def _location(of_version: _Scene) -> str:
-    """Return the name of a scene's map."""
-    scene, tables = of_version
+def _location(scene_of_version: _Scene) -> str:
+    """Name of the map of a scene."""
+    scene, tables = scene_of_version
     return tables.location_of(scene)
 
 
+def _count_samples(scenes: list[_Scene]) -> int:
+    """Number of samples of all scenes, by their records."""
+    return sum(scene["nbr_samples"] for scene, _ in scenes)
+
+
+def _stack_poses(samples: list[MapSample]) -> np.ndarray:
+    """Poses of the annotation frame of the samples. (n, 4, 4)"""
+    return np.array([sample.global_from_frame for sample in samples])
+
+
 class _Conversion:
-    """One run over all scenes."""
+    """Conversion of all scenes of the selected splits.
+
+    Args:
+        options: Options of the conversion.
+    """
 
     def __init__(self, options: NuScenesOptions) -> None:
         self.options = options
         self.summary = ConversionSummary(options.classes)
-        of_each = [
-            NuScenesTables(version, options.root, options.max_sweeps, options.frame)
-            for version in options.versions
-        ]
-        self.scenes = [(scene, tables) for tables in of_each for scene in tables.scene]
-        wanted, self.identity = _wanted(options)
-        self.split_of, notes = _resolved(wanted, options, [scene for scene, _ in self.scenes])
+        self.scenes: list[_Scene] = []
+        for each in options.versions:
+            tables = NuScenesTables(
+                each, options.root, max_sweeps=options.max_sweeps, frame=options.frame
+            )
+            for scene in tables.scene:
+                self.scenes.append((scene, tables))
+        split_list, self.identity = _select_splits(options)
+        self.split_of, notes = _resolve_splits(split_list, options, scenes=self.scenes)
         self.summary.notes += notes
-        self.positions: Positions = {split: defaultdict(list) for split in self.split_of.values()}
+        self.positions: Positions = {}
+        for split in self.split_of.values():
+            self.positions[split] = defaultdict(list)
 
     def run(self, writers: dict[str, AnnotationWriter]) -> None:
-        """Convert map by map, so that one map at a time is in memory."""
-        scenes = [each for each in self.scenes if each[0]["name"] in self.split_of]
+        """Convert map by map, so that one map at a time is in memory.
+
+        Args:
+            writers: Writer of each split.
+        """
+        scenes = [scene for scene in self.scenes if scene[0]["name"] in self.split_of]
         scenes = self.options.shard.part(sorted(scenes, key=_location))
-        with Progress(
+        progress = Progress(
             desc=f"{self.options.dataset} {'+'.join(self.options.versions)}",
-            unit="samples", smoothing=0.05,
-            total=sum(scene["nbr_samples"] for scene, _ in scenes),
-        ) as bar:  # fmt: skip
-            for location, local in groupby(scenes, key=_location):
-                for sample, instances in self._with_instances(location, list(local)):
+            unit="samples",
+            smoothing=0.05,
+            total=_count_samples(scenes),
+        )
+        with progress as bar:
+            for location, scenes_of_map in groupby(scenes, key=_location):
+                for sample, instances in self._with_instances(location, list(scenes_of_map)):
                     bar.update()
                     if isinstance(instances, str):
                         self.summary.add_problem(f"sample left out: {instances}", sample.token)
@@ -194,55 +241,77 @@ class _Conversion:
                     split = self.split_of[sample.scene]
                     writers[split].write(sample)
                     self.summary.add_sample(split, sample)
-                    place = sample.global_from_frame[:2, 3]
-                    self.positions[split][sample.map_name].append(place)
+                    position = sample.global_from_frame[:2, 3]
+                    self.positions[split][sample.map_name].append(position)
 
     def _with_instances(
         self, location: str, scenes: list[_Scene]
     ) -> Iterator[tuple[MapSample, list[MapInstance] | str]]:
-        """Yield the samples of one map with their instances, or why there are none."""
-        options = self.options
-        layers = open_layers(options.root, location, options.classes)
-        for reason, count in layers.skipped.items():
-            self.summary.add_problem(f"{reason} left out", location, count)
-        local_map = NuScenesLocalMap(
-            layers, options.classes, options.x_range, options.y_range, options.crossings
-        )
-        frames = sum(scene["nbr_samples"] for scene, _ in scenes)
-        workers = max(1, min(options.workers, len(scenes), frames // _FRAMES_PER_WORKER))
-        samples, ahead = tee(map(self._scene_samples, scenes))
-        poses = (np.array([s.global_from_frame for s in scene]) for scene in ahead)
-        results = ordered_map(partial(_instances_of, local_map), poses, workers)
-        for of_scene, instances in zip(samples, results, strict=True):
-            yield from zip(of_scene, instances, strict=True)
+        """Yield the samples of one map with their map elements, or the reason of a failure.
 
-    def _scene_samples(self, of_version: _Scene) -> list[MapSample]:
-        """Read a scene's samples without ground truth, counting what is missing."""
+        Args:
+            location: Name of the map.
+            scenes: Scenes on this map.
+        """
+        options = self.options
+        layers = open_layers(options.root, location, classes=options.classes)
+        for reason, count in layers.skipped.items():
+            self.summary.add_problem(f"{reason} left out", location, count=count)
+        local_map = NuScenesLocalMap(
+            layers,
+            options.classes,
+            x_range=options.x_range,
+            y_range=options.y_range,
+            crossings=options.crossings,
+        )
+        full_workers = _count_samples(scenes) // _FRAMES_PER_WORKER
+        workers = max(1, min(options.workers, len(scenes), full_workers))
+        # Samples are read ahead of the results: their poses are the tasks of the workers.
+        samples, samples_ahead = tee(map(self._scene_samples, scenes))
+        poses = map(_stack_poses, samples_ahead)
+        results = ordered_map(partial(_extract_instances, local_map), poses, workers=workers)
+        for scene_samples, instances in zip(samples, results, strict=True):
+            yield from zip(scene_samples, instances, strict=True)
+
+    def _scene_samples(self, scene_of_version: _Scene) -> list[MapSample]:
+        """Read the samples of a scene without ground truth, and count missing files."""
         samples = []
-        scene, tables = of_version
-        nuscenes_names = set(CAMERAS) if set(CAMERAS) & set(tables.cameras) else set()
-        expected = sorted(nuscenes_names | set(tables.cameras))
+        scene, tables = scene_of_version
+        expected_cameras = set(tables.cameras)
+        if expected_cameras.intersection(CAMERAS):  # a rig with cameras of nuScenes has all six
+            expected_cameras.update(CAMERAS)
         for record in tables.samples_of(scene):
             token = record["token"]
-            if tables.lidar not in record["data"]:  # its frame is not known
+            if tables.lidar not in record["data"]:  # the pose of the sample is unknown
                 self.summary.add_problem(f"sample left out: no {tables.lidar} key frame", token)
                 continue
-            for name in expected:
+            for name in sorted(expected_cameras):
                 if name not in record["data"]:
                     self.summary.add_problem(f"{name} absent (sample kept without it)", token)
             sample = tables.read(record, scene)
-            files = {f"{camera.name} image": camera.path for camera in sample.cameras}
-            for name, path in {**files, tables.lidar: sample.lidar.path}.items():  # type: ignore[union-attr]
-                if not (self.options.root / path).is_file():
-                    self.summary.add_problem(f"{name} file missing", path)
+            for camera in sample.cameras:
+                self._check_file(f"{camera.name} image", camera.path)
+            if sample.lidar is not None:
+                self._check_file(tables.lidar, sample.lidar.path)
             samples.append(sample)
         return samples
 
+    def _check_file(self, name: str, path: str) -> None:
+        """Count a file of a sample if it is missing."""
+        if not (self.options.root / path).is_file():
+            self.summary.add_problem(f"{name} file missing", path)
+
 
 def convert_nuscenes(options: NuScenesOptions) -> ConversionSummary:
-    """Write one annotation file per split; all appear together, when all are whole.
+    """Convert a data set to one annotation file per split.
 
-    Returns what was written and what was left out.
+    The files appear together, once all are complete.
+
+    Args:
+        options: Options of the conversion.
+
+    Returns:
+        Counts of the samples and map elements in the files, and of the problems.
 
     Raises:
         FileNotFoundError: If the data set, its version or a map is missing.
@@ -252,44 +321,62 @@ def convert_nuscenes(options: NuScenesOptions) -> ConversionSummary:
     for each in options.versions:
         _check_root(options.root, each)
     conversion = _Conversion(options)
-    folders = [options.root / each for each in options.versions]
-    maps = [expansion(options.root, name) for name in maps_in(options.root)]
-    sizes = {
-        path.name if folder == folders[0] else f"{folder.name}/{path.name}": path.stat().st_size
-        for folder in folders
-        for path in sorted(folder.glob("*.json"))
-        if not is_hidden(path)
+    source_fingerprint = _source_fingerprint(options)
+    versions = {name: version(name) for name in ("nuscenes-devkit", "shapely", "pyarrow")}
+    choices: dict[str, Any] = {
+        "version": "+".join(options.versions),
+        "max_sweeps": options.max_sweeps,
     }
-    made_from = {
-        "source_fingerprint": fingerprint(sizes, [*(f / "scene.json" for f in folders), *maps]),
-        "versions": {name: version(name) for name in ("nuscenes-devkit", "shapely", "pyarrow")},
-        "options": {
-            "version": "+".join(options.versions),
-            "max_sweeps": options.max_sweeps,
-            **({} if options.crossings == UNITED else {"crossings": options.crossings}),
-            **({SPLIT_LIST: conversion.identity} if conversion.identity else {}),
-        },
-    }
+    if options.crossings != UNITED:
+        choices["crossings"] = options.crossings
+    if conversion.identity:
+        choices[SPLIT_LIST] = conversion.identity
     with ExitStack() as stack:
         writers = {}
         for split in conversion.positions:
-            meta = options.meta(options.dataset, options.frame, split, **made_from)
-            writer = AnnotationWriter(options.path_of(options.dataset, split), meta, options.shard)
+            meta = options.meta(
+                options.dataset,
+                options.frame,
+                split,
+                source_fingerprint=source_fingerprint,
+                versions=versions,
+                options=choices,
+            )
+            target = options.path_of(options.dataset, split)
+            writer = AnnotationWriter(target, meta, shard=options.shard)
             writers[split] = stack.enter_context(writer)
         conversion.run(writers)
-        for writer in writers.values():  # a full disk shows here, before any file appears
+        for writer in writers.values():  # fails on a full disk, before any file appears
             writer.finish()
     notes = conversion.summary.notes
-    foreign = sorted({c for _, tables in conversion.scenes for c in tables.cameras} - set(CAMERAS))
-    if foreign:
-        notes.append(
-            f"cameras {', '.join(foreign)}: name them in `cameras` of a config's data sets."
-        )
+    cameras: set[str] = set()
+    for _, tables in conversion.scenes:
+        cameras.update(tables.cameras)
+    other_cameras = sorted(cameras - set(CAMERAS))
+    if other_cameras:
+        names = ", ".join(other_cameras)
+        notes.append(f"cameras {names}: name them in `cameras` of a config's data sets.")
     if not (options.root / "can_bus").is_dir():
         notes.append("no CAN bus expansion: acceleration, rotation rate and velocity are 0.")
     if not options.shard.count:
         notes += overlap_notes(conversion.positions)
     return conversion.summary
+
+
+def _source_fingerprint(options: NuScenesOptions) -> str:
+    """Digest of the sizes of all tables and the content of the scene tables and maps."""
+    sizes = {}
+    contents = []
+    for each in options.versions:
+        folder = options.root / each
+        contents.append(folder / "scene.json")
+        for path in sorted(folder.glob("*.json")):
+            if not is_hidden(path):
+                is_first = each == options.versions[0]
+                name = path.name if is_first else f"{folder.name}/{path.name}"
+                sizes[name] = path.stat().st_size
+    contents += [expansion(options.root, name) for name in maps_in(options.root)]
+    return fingerprint(sizes, contents)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -320,8 +407,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> str:
-    """Convert as the command line asks and return the summary."""
-    is_minicity = (arguments.root / "minicity.json").is_file()  # it says so in its root
+    """Convert with the options of a command line and return the summary as text."""
+    is_minicity = (arguments.root / "minicity.json").is_file()
     dataset = arguments.dataset or ("minicity" if is_minicity else "nuscenes")
     options = options_from(NuScenesOptions, arguments, dataset=dataset)
     return convert_nuscenes(options).text()

@@ -1,7 +1,7 @@
 """Local vector maps from a nuScenes map expansion, by the rules of MapTR.
 
-Whatever does not depend on the pose is done once per map; a frame then takes a few vectorised
-geometry calls on what lies near.
+Geometry that does not depend on the pose of the vehicle is prepared once per map; each frame then
+takes a few vectorised geometry calls on the elements near the vehicle.
 """
 
 from collections import Counter
@@ -49,19 +49,27 @@ CENTERLINE_STEP_M = 0.5
 
 @dataclass
 class MapLayers:
-    """The geometries of one map in its global frame; plain enough to hand to another process."""
+    """Geometries of one map in metres, global frame. They can be sent to another process.
 
-    lines: list[shapely.LineString]  # the dividers
-    polygons: dict[str, np.ndarray]  # valid ones by layer or class, each (n,) of Polygon
-    skipped: Counter[str]  # how many elements were left out, by reason
-    centerlines: list[np.ndarray] = field(default_factory=list)  # of lanes and connectors, (n, 3)
-    links: LaneLinks = ()  # which of these lead into which
+    Args:
+        lines: Dividers.
+        polygons: Valid polygons by layer or class. Each (n,).
+        skipped: Number of unusable elements, by reason.
+        centerlines: Vertices of the centre lines of lanes and lane connectors. Each (n, 3).
+        links: For each centre line, its pairs of predecessor and successor (`link_lanes`).
+    """
+
+    lines: list[shapely.LineString]
+    polygons: dict[str, np.ndarray]
+    skipped: Counter[str]
+    centerlines: list[np.ndarray] = field(default_factory=list)
+    links: LaneLinks = ()
 
 
 def _read_lines(
     nusc_map: "NuScenesMap", layer: str, skipped: Counter[str]
 ) -> Iterator[shapely.LineString]:
-    """Yield the lines of a layer; those without two nodes are counted."""
+    """Yield the lines of a layer; lines with fewer than two nodes are counted in ``skipped``."""
     for record in getattr(nusc_map, layer):
         tokens = nusc_map.get("line", record["line_token"])["node_tokens"]
         if len(tokens) < 2:
@@ -71,42 +79,45 @@ def _read_lines(
 
 
 def _read_polygons(nusc_map: "NuScenesMap", name: str, skipped: Counter[str]) -> np.ndarray:
-    """Return the polygons of a layer or class; invalid ones are counted. (n,) of Polygon."""
-    records = getattr(nusc_map, "road_segment" if name == "intersection" else name)
-    if name == "intersection":
-        records = [record for record in records if record.get("is_intersection", False)]
-    polygons = [nusc_map.extract_polygon(record["polygon_token"]) for record in records]
-    valid = [polygon for polygon in polygons if polygon.is_valid and not polygon.is_empty]
-    if len(valid) < len(polygons):
-        skipped[f"invalid {name} polygon"] += len(polygons) - len(valid)
-    return np.array(valid, dtype=object)
+    """Polygons of a layer or class; invalid polygons are counted in ``skipped``. (n,)"""
+    layer = "road_segment" if name == "intersection" else name
+    polygons = []
+    for record in getattr(nusc_map, layer):
+        if name == "intersection" and not record.get("is_intersection", False):
+            continue
+        polygon = nusc_map.extract_polygon(record["polygon_token"])
+        if polygon.is_valid and not polygon.is_empty:
+            polygons.append(polygon)
+        else:
+            skipped[f"invalid {name} polygon"] += 1
+    return np.array(polygons, dtype=object)
 
 
 def check_classes(classes: Collection[str]) -> None:
-    """Raise a ``ValueError`` unless the classes are known."""
+    """Raise a ``ValueError`` if a class is not in ``MAP_CLASSES``."""
     unknown = [name for name in classes if name not in MAP_CLASSES]
     if unknown:
         raise InputError(f"classes must be among {MAP_CLASSES}, got {unknown}.")
 
 
 def expansion(root: Path, name: str) -> Path:
-    """Return the file of a map below a data root."""
+    """Path of a map's file below a data root."""
     return root / f"maps/expansion/{name}.json"
 
 
 def open_layers(root: Path, name: str, classes: Collection[str]) -> MapLayers:
-    """Collect the geometries that the classes need from a map, in metres of the map.
+    """Read the geometries of a map that the classes need.
 
-    Lines without two nodes and invalid polygons are left out and counted.
+    Lines with fewer than two nodes and invalid polygons are left out and counted.
 
     Args:
         root: Data root.
         name: Name of the map, such as ``boston-seaport``.
-        classes: Wanted classes, of ``MAP_CLASSES``.
+        classes: Classes of the ground truth, out of ``MAP_CLASSES``.
 
     Raises:
         FileNotFoundError: If the map is missing.
-        ValueError: If it is damaged, or its name is none of a file.
+        ValueError: If the map is damaged, or its name cannot be the name of a file.
     """
     path = expansion(root, name)
     if Path(name).name != name:
@@ -119,15 +130,19 @@ def open_layers(root: Path, name: str, classes: Collection[str]) -> MapLayers:
             "file with mapdata.custom.from_records (docs/custom_data.md)."
         )
     skipped: Counter[str] = Counter()
-    names = set(AREA_CLASSES) & set(classes)
+    area_names = set(AREA_CLASSES) & set(classes)
     if "boundary" in classes:
-        names |= set(SURFACE_LAYERS)
-    marked = LINE_LAYERS if "divider" in classes else ()
+        area_names |= set(SURFACE_LAYERS)
     with naming(path, "unpack the map expansion pack (v1.3) again"):
         nusc_map = _open_map(root, name)
-        areas = {area: _read_polygons(nusc_map, area, skipped) for area in sorted(names)}
-        lines = [line for layer in marked for line in _read_lines(nusc_map, layer, skipped)]
-        layers = MapLayers(lines, areas, skipped)
+        polygons = {}
+        for area in sorted(area_names):
+            polygons[area] = _read_polygons(nusc_map, area, skipped=skipped)
+        lines: list[shapely.LineString] = []
+        if "divider" in classes:
+            for layer in LINE_LAYERS:
+                lines += _read_lines(nusc_map, layer, skipped=skipped)
+        layers = MapLayers(lines, polygons, skipped=skipped)
         if "centerline" in classes:
             _read_centerlines(nusc_map, layers)
         for geometries in (layers.lines, *layers.polygons.values()):
@@ -137,55 +152,61 @@ def open_layers(root: Path, name: str, classes: Collection[str]) -> MapLayers:
 
 
 def maps_in(root: Path) -> list[str]:
-    """Return the names of the maps below a data root."""
+    """Sorted names of the maps below a data root."""
     files = (root / "maps/expansion").glob("*.json")
     return sorted(path.stem for path in files if not is_hidden(path))
 
 
 def _open_map(root: Path, name: str) -> "NuScenesMap":
-    """Open a map with the devkit, which knows nuScenes' four towns alone by itself."""
+    """Open a map with the devkit, whose list of locations is extended meanwhile.
+
+    The devkit accepts only the four locations of nuScenes otherwise.
+    """
     from nuscenes.map_expansion.map_api import NuScenesMap, locations
 
-    own = name not in locations
-    if own:
+    is_unlisted = name not in locations
+    if is_unlisted:
         locations.append(name)
     try:
         return NuScenesMap(str(root), name)
     finally:
-        if own:
+        if is_unlisted:
             locations.remove(name)
 
 
 def _read_centerlines(nusc_map: "NuScenesMap", layers: MapLayers) -> None:
-    """Add the centre lines of lanes and lane connectors, and how they follow one another."""
-    tokens = []
+    """Add the centre lines of lanes and lane connectors, and their links, to ``layers``."""
+    lanes = []
     for record in (*nusc_map.lane, *nusc_map.lane_connector):
-        poses = nusc_map.discretize_lanes([record["token"]], CENTERLINE_STEP_M)[record["token"]]
+        token = record["token"]
+        poses = nusc_map.discretize_lanes([token], CENTERLINE_STEP_M)[token]
         if len(poses) < 2:
             layers.skipped["lane without a centre line"] += 1
             continue
-        layers.centerlines.append(np.pad(np.array(poses)[:, :2], ((0, 0), (0, 1))))
-        tokens.append(record["token"])
-    ways = {token: nusc_map.connectivity.get(token, {}) for token in tokens}
-    links = [(t, ways[t].get("incoming", []), ways[t].get("outgoing", [])) for t in tokens]
-    layers.links = link_lanes(links)
+        points = np.array(poses)[:, :2]
+        layers.centerlines.append(np.pad(points, ((0, 0), (0, 1))))  # height 0
+        connections = nusc_map.connectivity.get(token, {})
+        incoming = connections.get("incoming", [])
+        outgoing = connections.get("outgoing", [])
+        lanes.append((token, incoming, outgoing))
+    layers.links = link_lanes(lanes)
 
 
 class NuScenesLocalMap:
-    """One map, prepared for cutting out what the vehicle sees at many poses.
+    """One map, prepared for extracting the elements around the vehicle at many poses.
 
-    Dividers are the lines of ``road_divider`` and ``lane_divider``, cut with the patch. Crossings
-    (and the extended classes) are areas cut with the patch and united where they overlap: closed
-    rings. Boundaries are the outlines of the union of ``road_segment`` and ``lane``, cut 0.2 m
-    inside the patch.
+    Dividers are the lines of ``road_divider`` and ``lane_divider``, clipped to the patch. Crossings
+    and the extended classes are areas, clipped to the patch and united where they overlap; their
+    outlines are closed rings. Boundaries are the outlines of the union of ``road_segment`` and
+    ``lane``, clipped to the patch shrunk by 0.2 m on each side.
 
     Args:
-        layers: The map's geometries.
-        classes: Names out of ``MAP_CLASSES``, in label order.
-        x_range: Smallest and largest x of the patch in metres.
-        y_range: Smallest and largest y of the patch in metres.
-        crossings: Rule of the crossings, one of ``CROSSINGS``: ``united`` as above, ``edges``
-            (`long_edges`) or ``parallel`` (`open_outlines`).
+        layers: Geometries of the map.
+        classes: Class names in label order, out of ``MAP_CLASSES``.
+        x_range: Smallest and largest x of the patch in metres, annotation frame.
+        y_range: Smallest and largest y of the patch in metres, annotation frame.
+        crossings: Rule of the crossings, one of ``CROSSINGS``: ``united`` (closed rings, see
+            above), ``edges`` (`long_edges`) or ``parallel`` (`open_outlines`).
 
     Raises:
         ValueError: If a class or the rule is unknown.
@@ -204,54 +225,64 @@ class NuScenesLocalMap:
             raise InputError(f"crossings must be one of {CROSSINGS}, got {crossings!r}.")
         self.classes = tuple(classes)
         self._crossings = crossings
-        self.x_range, self.y_range = x_range, y_range
+        self.x_range = x_range
+        self.y_range = y_range
         self._lines = GeometryLayer(layers.lines)
         areas = set(AREA_CLASSES) & set(classes)
         self._areas = {name: GeometryLayer(layers.polygons[name]) for name in areas}
-        surface = [layers.polygons[name] for name in SURFACE_LAYERS if name in layers.polygons]
-        outlines = shapely.get_parts(shapely.union_all([shapely.union_all(p) for p in surface]))
-        self._outlines = OutlineIndex(rings_of(outlines))
+        surfaces = []
+        for name in SURFACE_LAYERS:
+            if name in layers.polygons:
+                surfaces.append(shapely.union_all(layers.polygons[name]))
+        surface_parts = shapely.get_parts(shapely.union_all(surfaces))
+        self._outlines = OutlineIndex(rings_of(surface_parts))
         self._lane_paths = LanePaths(layers.centerlines, layers.links)
         lanes = [shapely.LineString(line[:, :2]) for line in layers.centerlines]
         self._lane_tree = shapely.STRtree(lanes)
 
     def instances(self, global_from_frame: np.ndarray) -> list[MapInstance]:
-        """Return the map elements around a pose (4, 4) of the annotation frame, in that frame.
+        """Extract the map elements around a pose.
 
-        They come class by class in label order; points are (n, 2) in metres.
+        Args:
+            global_from_frame: Transform from the annotation frame to the map in metres. (4, 4)
+
+        Returns:
+            Map elements in label order. Their points are in metres, annotation frame. Each (n, 2).
         """
-        patch = LocalPatch(global_from_frame, self.x_range, self.y_range)
-        return [
-            MapInstance(label, points)
-            for label, name in enumerate(self.classes)
-            for points in self._polylines(name, patch)
-        ]
+        patch = LocalPatch(global_from_frame, x_range=self.x_range, y_range=self.y_range)
+        elements = []
+        for label, name in enumerate(self.classes):
+            for points in self._polylines(name, patch):
+                elements.append(MapInstance(label, points))
+        return elements
 
     def _polylines(self, name: str, patch: LocalPatch) -> list[Points]:
+        """Vertices of one class inside the patch, in metres, annotation frame. Each (n, 2)."""
         if name == "boundary":
             return self._outlines.cut(patch, OUTLINE_MARGIN_M)
         if name == CROSSING and self._crossings != UNITED:
             return self._open_crossings(patch)
         if name in self._areas:
             pieces = shapely.intersection(self._areas[name].near(patch), patch.polygon)
-            merged = shapely.get_parts(shapely.union_all(patch.to_local(pieces)))
-            return vertices_of(rings_of(merged[shapely.get_type_id(merged) == POLYGON]), 2)
+            parts = shapely.get_parts(shapely.union_all(patch.to_local(pieces)))
+            polygons = parts[shapely.get_type_id(parts) == POLYGON]
+            return vertices_of(rings_of(polygons), dim=2)
         if name == "divider":
             lines = self._lines.near(patch)
         else:
             near = np.sort(self._lane_tree.query(patch.polygon, predicate="intersects"))
             lines = shapely.force_2d(self._lane_paths.simplified(near.tolist()))
-        return vertices_of(patch.to_local(patch.lines_inside(lines)), 2)
+        return vertices_of(patch.to_local(patch.lines_inside(lines)), dim=2)
 
     def _open_crossings(self, patch: LocalPatch) -> list[Points]:
-        """Return the lines of the crossings around a patch, in its frame. each (n, 2)"""
+        """Vertices of crossings by the rule ``edges`` or ``parallel``. Each (n, 2)."""
         near = self._areas[CROSSING].near(patch)
         if self._crossings == EDGES:
             lines = patch.lines_inside(long_edges(near))
-            return vertices_of(patch.to_local(lines), 2)
-        pieces, owner = shapely.get_parts(
-            shapely.intersection(near, patch.polygon), return_index=True
-        )
-        keep = shapely.get_type_id(pieces) == POLYGON
-        local = patch.to_local(pieces[keep])
-        return vertices_of(open_outlines(local, owner[keep], patch), 2)
+            return vertices_of(patch.to_local(lines), dim=2)
+        clipped = shapely.intersection(near, patch.polygon)
+        pieces, owner = shapely.get_parts(clipped, return_index=True)
+        is_polygon = shapely.get_type_id(pieces) == POLYGON
+        polygons = patch.to_local(pieces[is_polygon])
+        outlines = open_outlines(polygons, owner[is_polygon], patch=patch)
+        return vertices_of(outlines, dim=2)

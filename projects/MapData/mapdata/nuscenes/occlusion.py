@@ -1,8 +1,9 @@
-"""How much of each sample's map the annotated boxes hide, as groups for ``evaluate.py --by``."""
+"""Groups of samples by the share of the map that boxes hide, for ``evaluate.py --by``."""
 
 import argparse
 import json
 import math
+from collections import Counter
 from collections.abc import Collection, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -21,115 +22,160 @@ from gsmap.utils.files import write_text
 from gsmap.utils.words import counted
 from mapdata.nuscenes.tables import pose_of, read_table
 
-LIMITS = (10, 20)  # per cent of a map
-_NEAR_M = 0.3  # smallest depth in an image
-_STEP_M = 1.0  # between the points of a map
+LIMITS = (10, 20)  # lower limits of the second and third group, per cent of the map
+_NEAR_M = 0.3  # smallest depth of a visible point
+_STEP_M = 1.0  # distance between the sampled points of a map
 
 Array = NDArray[np.float64]
 
 
 class Boxes(NamedTuple):
-    """Boxes of a sample: from the global frame into each, (B, 4, 4); half of each side. (B, 3)"""
+    """B annotated boxes of a sample.
+
+    Args:
+        box_from_global: Transforms from the global frame to the boxes in metres. (B, 4, 4)
+        halves_m: Half the length, width and height of the boxes in metres. (B, 3)
+    """
 
     box_from_global: Array
     halves_m: Array
 
 
 def read_boxes(folder: Path, tokens: Collection[str]) -> dict[str, Boxes]:
-    """Read the annotated boxes of samples, of any category.
+    """Read the annotated boxes of samples, of all categories.
 
     Args:
         folder: Folder of the tables, such as ``v1.0-trainval``.
-        tokens: The samples.
+        tokens: Tokens of the samples.
+
+    Returns:
+        Boxes by token of the sample.
 
     Raises:
-        FileNotFoundError: If there is no ``sample_annotation.json``.
-        ValueError: If it is damaged, or has no box of any of the samples.
+        FileNotFoundError: If the folder has no ``sample_annotation.json``.
+        ValueError: If the table is damaged, or has no box of any of the samples.
     """
-    found: dict[str, list[tuple[Array, Array]]] = {token: [] for token in tokens}
+    poses: dict[str, list[Array]] = {token: [] for token in tokens}
+    halves_m: dict[str, list[Array]] = {token: [] for token in poses}
     for record in read_table(folder, "sample_annotation"):
-        if (boxes := found.get(record["sample_token"])) is not None:
+        token = record["sample_token"]
+        if token in poses:
             width, length, height = record["size"]
-            boxes.append((pose_of(record), np.array([length, width, height]) / 2))
-    if not any(found.values()):
+            poses[token].append(pose_of(record))
+            halves_m[token].append(np.array([length, width, height]) / 2)
+    if not any(poses.values()):
         raise InputError(f"{folder} has no box of these samples: give the tables of their data.")
-    return {
-        token: Boxes(
-            invert_rigid(np.array([pose for pose, _ in boxes]).reshape(-1, 4, 4)),
-            np.array([halves for _, halves in boxes]).reshape(-1, 3),
-        )
-        for token, boxes in found.items()
-    }
+    boxes = {}
+    for token in poses:
+        global_from_box = np.array(poses[token]).reshape(-1, 4, 4)
+        halves = np.array(halves_m[token]).reshape(-1, 3)
+        boxes[token] = Boxes(invert_rigid(global_from_box), halves)
+    return boxes
 
 
 def cuts_sight(origin: Array, points: Array, boxes: Boxes) -> NDArray[np.bool_]:
-    """Say which boxes the straight line to each point passes through.
+    """Compute which boxes intersect the line of sight to each point.
+
+    Each line of sight is clipped to the three slabs of a box (slab method).
 
     Args:
-        origin: Where one looks from, in metres in the global frame. (3,)
-        points: What one looks at. (n, 3)
+        origin: Position of the camera in metres, global frame. (3,)
+        points: Observed points in metres, global frame. (n, 3)
         boxes: B boxes.
 
     Returns:
-        (n, B)
+        True where the segment from the origin to a point intersects a box. (n, B)
     """
-    turns, shifts = boxes.box_from_global[:, :3, :3], boxes.box_from_global[:, :3, 3]
-    start = np.einsum("bij,j->bi", turns, origin) + shifts  # (B, 3)
-    way = np.einsum("bij,nj->nbi", turns, points - origin)  # (n, B, 3)
-    with np.errstate(divide="ignore", invalid="ignore"):  # parallel to a side
-        sides = np.stack([(half - start) / way for half in (-boxes.halves_m, boxes.halves_m)])
-    enter, leave = sides.min(0).max(-1), sides.max(0).min(-1)
+    rotations = boxes.box_from_global[:, :3, :3]
+    translations = boxes.box_from_global[:, :3, 3]
+    start = np.einsum("bij,j->bi", rotations, origin) + translations  # (B, 3)
+    direction = np.einsum("bij,nj->nbi", rotations, points - origin)  # (n, B, 3)
+    with np.errstate(divide="ignore", invalid="ignore"):  # lines parallel to a slab
+        to_lower = (-boxes.halves_m - start) / direction  # (n, B, 3)
+        to_upper = (boxes.halves_m - start) / direction  # (n, B, 3)
+    crossings = np.stack([to_lower, to_upper])  # fractions of the segment. (2, n, B, 3)
+    enter = crossings.min(axis=0).max(axis=-1)  # (n, B)
+    leave = crossings.max(axis=0).min(axis=-1)  # (n, B)
     return (enter <= leave) & (leave > 0) & (enter < 1)
 
 
 def _map_points(sample: MapSample) -> Array:
-    """Return the points of a sample's map, every metre, on the ground if it is flat. (n, 3)
+    """Points along the map elements of a sample, about a metre apart, in its frame. (n, 3)
 
-    ValueError if it has no ground truth.
+    Elements without heights are placed on the ground.
+
+    Raises:
+        ValueError: If the sample has no ground truth.
     """
     if sample.instances is None:
         raise InputError(f"sample {sample.token!r} has no ground truth, of which parts could hide.")
-    height_m = 0.0 if sample.ego_from_frame is None else sample.ego_from_frame[2, 3]
-    lines = [
-        resample(i.points, max(math.ceil(arc_lengths(i.points)[-1] / _STEP_M), 1) + 1)
-        for i in sample.instances
-    ]
-    flat = [np.column_stack([line, np.full(len(line), -height_m)])[:, :3] for line in lines]
-    return np.concatenate([np.empty((0, 3)), *flat])
+    frame_height_m = 0.0 if sample.ego_from_frame is None else sample.ego_from_frame[2, 3]
+    elements = [np.empty((0, 3))]
+    for instance in sample.instances:
+        length_m = arc_lengths(instance.points)[-1]
+        num_steps = max(math.ceil(length_m / _STEP_M), 1)
+        points = resample(instance.points, num_steps + 1)
+        ground = np.full(len(points), -frame_height_m)
+        elements.append(np.column_stack([points, ground])[:, :3])
+    return np.concatenate(elements)
 
 
 def _in_image(points: Array, camera: CameraRecord) -> NDArray[np.bool_]:
-    """Say which points (n, 3) of the annotation frame lie in a camera's image. (n,)"""
-    u, v, w = (points @ camera.img_from_frame[:3, :3].T + camera.img_from_frame[:3, 3]).T
-    inside = (u >= 0) & (u < w * camera.width) & (v >= 0) & (v < w * camera.height)
-    return inside & (w > _NEAR_M)
+    """Mask of the points that project into a camera's image. (n,)
+
+    Args:
+        points: Points in metres, annotation frame. (n, 3)
+        camera: Camera record.
+    """
+    projection = camera.img_from_frame
+    u, v, depth = (points @ projection[:3, :3].T + projection[:3, 3]).T  # pixels times depth
+    inside = (u >= 0) & (u < depth * camera.width) & (v >= 0) & (v < depth * camera.height)
+    return inside & (depth > _NEAR_M)
 
 
 def hidden_share(sample: MapSample, boxes: Boxes) -> float:
-    """Return the share of a map that is in an image, but behind boxes for each such camera.
+    """Compute the share of a sample's map that boxes hide.
+
+    The share is taken of the map points inside at least one image. A point is hidden if boxes
+    intersect the line of sight from each camera with the point in its image.
 
     Args:
-        sample: With its cameras and map; heights are those of its points, or level ground.
-        boxes: The boxes around it.
+        sample: Sample with cameras and ground truth. Elements without heights are placed on the
+            ground.
+        boxes: Boxes around the sample.
 
     Returns:
-        In [0, 1]; 0 if no image holds any of the map.
+        Share in [0, 1]; 0 if no map point is inside an image.
+
+    Raises:
+        ValueError: If the sample has no ground truth.
     """
     points = _map_points(sample)
-    in_global = points @ sample.global_from_frame[:3, :3].T + sample.global_from_frame[:3, 3]
-    held, seen = np.zeros(len(points), bool), np.zeros(len(points), bool)
+    global_from_frame = sample.global_from_frame
+    global_points = points @ global_from_frame[:3, :3].T + global_from_frame[:3, 3]
+    is_in_image = np.zeros(len(points), dtype=bool)
+    is_visible = np.zeros(len(points), dtype=bool)
     for camera in sample.cameras:
         inside = np.flatnonzero(_in_image(points, camera))
-        origin = (sample.global_from_frame @ invert_rigid(camera.cam_from_frame))[:3, 3]
-        held[inside] = True
-        seen[inside] |= ~cuts_sight(origin, in_global[inside], boxes).any(axis=1)
-    return float((held & ~seen).sum() / max(held.sum(), 1))
+        origin = (global_from_frame @ invert_rigid(camera.cam_from_frame))[:3, 3]
+        is_in_image[inside] = True
+        is_hidden = cuts_sight(origin, global_points[inside], boxes=boxes).any(axis=1)
+        is_visible[inside] |= ~is_hidden
+    return float((is_in_image & ~is_visible).sum() / max(is_in_image.sum(), 1))
 
 
 def word_for(share: float, limits: Sequence[int] = LIMITS) -> str:
-    """Return the group of a share: ``00-10 % hidden`` for the first limit of 10 and so on."""
-    edges = (0, *limits, 100)
-    low, high = next(pair for pair in pairwise(edges) if 100 * share < pair[1] or pair[1] == 100)
+    """Name the group of a hidden share, such as ``00-10 % hidden``.
+
+    Args:
+        share: Hidden share in [0, 1].
+        limits: Ascending limits between the groups, per cent, between 0 and 100.
+    """
+    low = 0
+    for high in (*limits, 100):
+        if 100 * share < high or high == 100:
+            break
+        low = high
     return f"{low:02d}-{high:02d} % hidden"
 
 
@@ -148,18 +194,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> str:
-    """Write the group of each sample, and say how large the groups are.
+    """Write the group of each sample to a JSON file.
+
+    Returns:
+        Sizes of the groups as text.
 
     Raises:
-        ValueError: If the limits do not rise, or the file has no ground truth.
+        ValueError: If the limits do not ascend, or the file has no ground truth.
     """
     limits = arguments.limits
     if any(low >= high for low, high in pairwise((0, *limits, 100))):
         raise InputError(f"--limits must rise between 0 and 100, got {limits}.")
     file = AnnotationFile(arguments.annotations)
     boxes = read_boxes(arguments.tables, file.column("token"))
-    groups = {s.token: word_for(hidden_share(s, boxes[s.token]), limits) for s in file}
+    groups = {}
+    for sample in file:
+        share = hidden_share(sample, boxes[sample.token])
+        groups[sample.token] = word_for(share, limits)
     write_text(arguments.target, json.dumps(groups, indent=0) + "\n")
-    sizes = sorted((word, list(groups.values()).count(word)) for word in {*groups.values()})
-    said = ", ".join(f"{word}: {counted(number, 'sample')}" for word, number in sizes)
-    return f"{said}. Written to {arguments.target}"
+    sizes = sorted(Counter(groups.values()).items())
+    text = ", ".join(f"{group}: {counted(size, 'sample')}" for group, size in sizes)
+    return f"{text}. Written to {arguments.target}"

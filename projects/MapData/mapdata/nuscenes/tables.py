@@ -1,4 +1,4 @@
-"""The tables of nuScenes-format data, without what maps do not need, and the samples in them."""
+"""Tables of nuScenes-format data, reduced to the records of cameras and LiDAR, and samples."""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
@@ -22,7 +22,7 @@ CAMERAS = (
     "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT",
 )  # fmt: skip
 LIDAR = "LIDAR_TOP"
-# what is read of each table: fields with their type, or how many numbers they hold
+# fields of each table that are read, with their type or, for a list of numbers, its length
 _POSE: dict[str, type | int] = {"translation": 3, "rotation": 4}
 _FIELDS: dict[str, dict[str, type | int]] = {
     "sensor": {"channel": str},
@@ -38,6 +38,7 @@ _FIELDS: dict[str, dict[str, type | int]] = {
     },
     "sample_annotation": {"sample_token": str, "size": 3, **_POSE},
 }  # fmt: skip
+# fields that hold the token of a record, with the table of this record
 _LINKS = {
     "calibrated_sensor": {"sensor_token": "sensor"},
     "scene": {"log_token": "log", "first_sample_token": "sample"},
@@ -48,50 +49,69 @@ _LINKS = {
 }  # fmt: skip
 
 
-def _is_right(value: Any, kind: type | int) -> bool:
-    """Whether a value is of a type, or a list of so many finite numbers."""
-    if kind is list:  # a matrix of intrinsics, or nothing for another sensor
-        return type(value) is list and (
-            not value or (len(value) == 3 and all(_is_right(row, 3) for row in value))
-        )
-    if kind is int:  # microseconds that nanoseconds of 64 bits hold
+def _has_kind(value: Any, kind: type | int) -> bool:
+    """Whether a value has the type of a field, or is a list of ``kind`` finite numbers.
+
+    A ``list`` is a matrix of camera intrinsics (3, 3), or empty for other sensors. An integer must
+    fit into 64 bits after a conversion from microseconds to nanoseconds. Four numbers are a unit
+    quaternion.
+    """
+    if kind is list:
+        if type(value) is not list:
+            return False
+        if not value:
+            return True
+        return len(value) == 3 and all(_has_kind(row, 3) for row in value)
+    if kind is int:
         return type(value) is int and abs(value) <= 1 << 53
     if isinstance(kind, type):
         return type(value) is kind
     if type(value) is not list or len(value) != kind:
         return False
-    if not all(type(v) in (int, float) and math.isfinite(v) for v in value):
-        return False
-    return kind != 4 or abs(math.hypot(*value) - 1) < 1e-3  # a quaternion
+    for number in value:
+        if type(number) not in (int, float) or not math.isfinite(number):
+            return False
+    return kind != 4 or abs(math.hypot(*value) - 1) < 1e-3
 
 
 def pose_of(record: Mapping[str, Any], prefix: str = "") -> np.ndarray:
-    """Return the transform of a record's ``translation`` and ``rotation``. (4, 4).
+    """Combine the translation and the rotation of a record to a transform.
 
-    The rotation is a quaternion (w, x, y, z), or in info files a matrix.
+    Args:
+        record: Record with ``translation`` in metres (3,) and ``rotation``, a quaternion
+            (w, x, y, z) or, in info files, a matrix (3, 3).
+        prefix: Prefix of the two names, such as ``lidar2ego_``.
+
+    Returns:
+        Transform in metres. (4, 4)
+
+    Raises:
+        ValueError: If the translation does not have three numbers.
     """
-    turned = np.asarray(record[f"{prefix}rotation"], np.float64)
-    rotation = turned if turned.shape == (3, 3) else Quaternion(turned).rotation_matrix
-    shift = np.asarray(record[f"{prefix}translation"], np.float64)
-    if shift.size != 3:
-        raise InputError(f"{prefix}translation must be 3 numbers, got {shift.tolist()!r:.60}")
-    return rigid(rotation, shift.reshape(3))
+    rotation = np.asarray(record[f"{prefix}rotation"], np.float64)
+    if rotation.shape != (3, 3):
+        rotation = Quaternion(rotation).rotation_matrix
+    translation = np.asarray(record[f"{prefix}translation"], np.float64)
+    if translation.size != 3:
+        raise InputError(f"{prefix}translation must be 3 numbers, got {translation.tolist()!r:.60}")
+    return rigid(rotation, translation.reshape(3))
 
 
-def _damaged(folder: Path, table: str, wrong: str) -> ValueError:
-    return InputError(f"{folder}/{table}.json{wrong}; download the tables again.")
+def _table_error(folder: Path, table: str, problem: str) -> ValueError:
+    """Error for a damaged table; ``problem`` continues the name of its file."""
+    return InputError(f"{folder}/{table}.json{problem}; download the tables again.")
 
 
 def read_table(folder: Path, table: str) -> Iterator[dict[str, Any]]:
-    """Yield a table's records, what is read of each checked.
+    """Yield the records of a table after a check of their fields.
 
     Args:
         folder: Folder of the tables.
-        table: Its name, one of those with fields that maps need.
+        table: Name of the table, such as ``ego_pose``.
 
     Raises:
-        FileNotFoundError: If it is missing.
-        ValueError: If it is damaged; maybe only after some records.
+        FileNotFoundError: If the table is missing.
+        ValueError: If the table is damaged. Records before the damage may be yielded first.
     """
     path = folder / f"{table}.json"
     if not path.is_file():
@@ -100,80 +120,101 @@ def read_table(folder: Path, table: str) -> Iterator[dict[str, Any]]:
     for record, _ in items_of(path, None, "download it again"):
         values = record if isinstance(record, dict) else {}
         for name, kind in fields.items():
-            if not _is_right(value := values.get(name), kind):
+            value = values.get(name)
+            if not _has_kind(value, kind):
                 numbers = f"{kind} finite numbers"
-                wanted = f"a {kind.__name__}" if isinstance(kind, type) else numbers
-                wrong = f", record {values.get('token')!r}: {name} must be {wanted}"
-                raise _damaged(folder, table, f"{wrong}, got {value!r}")
+                expected = f"a {kind.__name__}" if isinstance(kind, type) else numbers
+                problem = (
+                    f", record {values.get('token')!r}: {name} must be {expected}, got {value!r}"
+                )
+                raise _table_error(folder, table, problem=problem)
         yield record
 
 
 class NuScenesTables:
-    """The tables with the key frames of cameras and LiDAR, and LiDAR sweeps if asked for.
+    """Tables with the key frames of cameras and LiDAR and, on request, LiDAR sweeps.
 
-    Annotation tables and every other sensor's records are left out while reading: of trainval's 2.6
-    million ``sample_data`` records a tenth remains (a fifth with sweeps), and with them their
-    poses. Each sample's ``data`` holds the records of its key frames by channel.
+    Annotation tables and the records of other sensors are not kept. Of the 2.6 million
+    ``sample_data`` records of ``v1.0-trainval`` a tenth remains (a fifth with sweeps), with the
+    poses that they refer to. The field ``data`` of a sample holds the records of its key frames by
+    channel.
+
+    Args:
+        version: Name of the folder of the tables, such as ``v1.0-trainval``.
+        dataroot: Data root.
+        max_sweeps: Number of earlier LiDAR sweeps per sample.
+        frame: Annotation frame, ``lidar`` or ``ego``.
 
     Raises:
         FileNotFoundError: If a table is missing.
-        ValueError: If a table is damaged or a record points to one that there is not.
+        ValueError: If a table is damaged, or a record refers to a missing record.
     """
 
     def __init__(self, version: str, dataroot: Path, max_sweeps: int, frame: str = "lidar") -> None:
         self.frame = frame
-        self._folder, self._max_sweeps = dataroot / version, max_sweeps
+        self._folder = dataroot / version
+        self._max_sweeps = max_sweeps
         self._messages = lru_cache(maxsize=1)(partial(read_messages, dataroot))
         self._records: dict[str, dict[str, dict[str, Any]]] = {}
         for table in ("sensor", "calibrated_sensor", "log", "sample", "scene"):
-            self._keep(table, read_table(self._folder, table))
-        self.cameras, self.lidar = self._sensors()
-        data = list(self._wanted_sample_data())
-        wanted = {record["ego_pose_token"] for record in data}
-        self._keep(
-            "ego_pose", (r for r in read_table(self._folder, "ego_pose") if r["token"] in wanted)
-        )
-        self._keep("sample_data", data)
+            self._store(table, read_table(self._folder, table))
+        self.cameras, self.lidar = self._sensor_channels()
+        sample_data = list(self._read_sample_data())
+        pose_tokens = {record["ego_pose_token"] for record in sample_data}
+        poses = read_table(self._folder, "ego_pose")
+        self._store("ego_pose", (pose for pose in poses if pose["token"] in pose_tokens))
+        self._store("sample_data", sample_data)
         for sample in self._records["sample"].values():
             sample["data"] = {}
-        for record in data:
+        for record in sample_data:
             if record["is_key_frame"]:
-                keys = self._records["sample"][record["sample_token"]]["data"]
-                keys[self._channel_of(record)] = record
+                sample = self._records["sample"][record["sample_token"]]
+                sample["data"][self._channel_of(record)] = record
         self.scene = list(self._records["scene"].values())
 
-    def _keep(self, table: str, records: Iterable[dict[str, Any]]) -> None:
-        """Keep a table's records by token; those that they link to are there already."""
-        kept = self._records[table] = {}
+    def _store(self, table: str, records: Iterable[dict[str, Any]]) -> None:
+        """Store the records of a table by token; linked tables must be stored before."""
+        records_by_token: dict[str, dict[str, Any]] = {}
+        self._records[table] = records_by_token
         for record in records:
+            token = record["token"]
             for link in _LINKS.get(table, ()):
-                self._check_link(table, record, link)
-            if kept.setdefault(record["token"], record) is not record:
-                raise _damaged(self._folder, table, f" has record {record['token']!r} twice")
+                self._check_link(table, record, name=link)
+            if token in records_by_token:
+                raise _table_error(self._folder, table, problem=f" has record {token!r} twice")
+            records_by_token[token] = record
 
     def _check_link(self, table: str, record: dict[str, Any], name: str) -> None:
+        """Raise a ``ValueError`` if the field ``name`` of a record refers to a missing record."""
         if record[name] not in self._records[_LINKS[table][name]]:
-            wrong = f", record {record['token']!r}: {name} {record[name]!r} leads nowhere"
-            raise _damaged(self._folder, table, wrong)
+            problem = f", record {record['token']!r}: {name} {record[name]!r} leads nowhere"
+            raise _table_error(self._folder, table, problem=problem)
 
     def _channel_of(self, record: dict[str, Any]) -> str:
-        """Return the sensor channel of a ``sample_data`` record."""
-        sensor = self._records["calibrated_sensor"][record["calibrated_sensor_token"]]
-        return self._records["sensor"][sensor["sensor_token"]]["channel"]
+        """Channel of the sensor of a ``sample_data`` record."""
+        calibration = self._records["calibrated_sensor"][record["calibrated_sensor_token"]]
+        return self._records["sensor"][calibration["sensor_token"]]["channel"]
 
-    def _sensors(self) -> tuple[tuple[str, ...], str]:
-        """Return the channels of the cameras, nuScenes' first, and that of the LiDAR.
+    def _sensor_channels(self) -> tuple[tuple[str, ...], str]:
+        """Find the channels of the cameras and the LiDAR.
+
+        Returns:
+            Channels of the cameras, the six of nuScenes first, and the channel of the LiDAR.
 
         Raises:
-            ValueError: If the LiDAR is not LIDAR_TOP and its frame is asked for, or not the one.
+            ValueError: If there is no LIDAR_TOP, unless the frame is ``ego`` and there is one other
+                LiDAR.
         """
-        channels = {sensor["channel"] for sensor in self._records["sensor"].values()}
-        seeing = {
-            self._records["sensor"][sensor["sensor_token"]]["channel"]
-            for sensor in self._records["calibrated_sensor"].values()
-            if sensor["camera_intrinsic"]
-        }
-        cameras = (*(c for c in CAMERAS if c in seeing), *sorted(seeing - set(CAMERAS)))
+        sensors = self._records["sensor"]
+        camera_channels = set()
+        for calibration in self._records["calibrated_sensor"].values():
+            if calibration["camera_intrinsic"]:
+                sensor = sensors[calibration["sensor_token"]]
+                camera_channels.add(sensor["channel"])
+        nuscenes_cameras = [name for name in CAMERAS if name in camera_channels]
+        other_cameras = sorted(camera_channels - set(CAMERAS))
+        cameras = (*nuscenes_cameras, *other_cameras)
+        channels = {sensor["channel"] for sensor in sensors.values()}
         lidars = sorted(channel for channel in channels if "LIDAR" in channel.upper())
         if LIDAR in channels:
             return cameras, LIDAR
@@ -185,134 +226,176 @@ class NuScenesTables:
             "y ahead); else convert with --frame ego, which takes one LiDAR of any name."
         )
 
-    def _wanted_sample_data(self) -> Iterator[dict[str, Any]]:
-        wanted = {self.lidar, *self.cameras}
+    def _read_sample_data(self) -> Iterator[dict[str, Any]]:
+        """Yield the key frames of cameras and LiDAR and, on request, LiDAR sweeps.
+
+        A record is reduced to the checked fields.
+        """
+        key_frame_channels = {self.lidar, *self.cameras}
+        names = ("token", *_FIELDS["sample_data"])
         for record in read_table(self._folder, "sample_data"):
-            self._check_link("sample_data", record, "calibrated_sensor_token")
+            self._check_link("sample_data", record, name="calibrated_sensor_token")
             channel = self._channel_of(record)
             is_sweep = channel == self.lidar and self._max_sweeps > 0
-            if is_sweep or (record["is_key_frame"] and channel in wanted):
-                yield {name: record[name] for name in ("token", *_FIELDS["sample_data"])}
+            if is_sweep or (record["is_key_frame"] and channel in key_frame_channels):
+                yield {name: record[name] for name in names}
 
     def chain(
-        self, table: str, token: str, step: str, first: dict[str, Any]
+        self, table: str, token: str, step: str, origin: dict[str, Any]
     ) -> Iterator[dict[str, Any]]:
-        """Yield a table's records from ``token`` on, to which ``first`` leads; ``step`` leads on.
+        """Yield the records of a linked list.
+
+        Args:
+            table: Name of the table.
+            token: Token of the first record; empty for an empty list.
+            step: Field with the token of the following record, ``next`` or ``prev``; an empty
+                token ends the list.
+            origin: Record with a link to the first record, for messages.
 
         Raises:
-            ValueError: If a link leads nowhere or back; an empty one ends the chain.
+            ValueError: If a record is missing, or the links form a circle.
         """
-        known, seen, record = self._records[table], set(), first
+        records = self._records[table]
+        visited_tokens = set()
+        record = origin
         while token:
-            if token not in known:
-                origin = record["token"]
-                raise _damaged(
-                    self._folder, table, f" has no record {token!r}, to which {origin!r} leads"
-                )
-            if token in seen:
-                wrong = f", record {record['token']!r}: {step} leads back to {token!r}"
-                raise _damaged(self._folder, table, wrong)
-            seen.add(token)
-            record = known[token]
+            if token not in records:
+                problem = f" has no record {token!r}, to which {record['token']!r} leads"
+                raise _table_error(self._folder, table, problem=problem)
+            if token in visited_tokens:
+                problem = f", record {record['token']!r}: {step} leads back to {token!r}"
+                raise _table_error(self._folder, table, problem=problem)
+            visited_tokens.add(token)
+            record = records[token]
             yield record
             token = record[step]
 
     def samples_of(self, scene: dict[str, Any]) -> Iterator[dict[str, Any]]:
-        """Yield a scene's samples in order of time."""
-        return self.chain("sample", scene["first_sample_token"], "next", scene)
+        """Yield the sample records of a scene in order of time."""
+        return self.chain("sample", scene["first_sample_token"], step="next", origin=scene)
 
     def location_of(self, scene: dict[str, Any]) -> str:
-        """Return the name of the map that a scene was driven on."""
+        """Name of the map of a scene."""
         return self._records["log"][scene["log_token"]]["location"]
 
-    def _global_from(self, data: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
-        """Return global-from-sensor (4, 4) and the calibration of a sensor record."""
+    def _global_from_sensor(self, data: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
+        """Transform from the sensor of a ``sample_data`` record to the map (4, 4); calibration."""
         calibration = self._records["calibrated_sensor"][data["calibrated_sensor_token"]]
         global_from_ego = pose_of(self._records["ego_pose"][data["ego_pose_token"]])
         return global_from_ego @ pose_of(calibration), calibration
 
     def read(self, sample: dict[str, Any], scene: dict[str, Any]) -> MapSample:
-        """Return a sample in the annotation frame, without instances and absent cameras."""
+        """Make a sample in the annotation frame, without ground truth.
+
+        Args:
+            sample: Sample record with a key frame of the LiDAR. Cameras may be absent.
+            scene: Record of its scene.
+        """
         lidar = sample["data"][self.lidar]
-        global_from_lidar, calibration = self._global_from(lidar)
-        ego_from_lidar, timestamp_ns = pose_of(calibration), sample["timestamp"] * 1000
+        global_from_lidar, calibration = self._global_from_sensor(lidar)
+        ego_from_lidar = pose_of(calibration)
         global_from_ego = global_from_lidar @ invert_rigid(ego_from_lidar)
-        global_from_frame, ego_from_frame, frame_from_lidar = (
-            (global_from_lidar, ego_from_lidar, np.eye(4))
-            if self.frame == "lidar"
-            else (global_from_ego, np.eye(4), ego_from_lidar)
-        )
+        if self.frame == "lidar":
+            global_from_frame = global_from_lidar
+            ego_from_frame = ego_from_lidar
+            frame_from_lidar = np.eye(4)
+        else:
+            global_from_frame = global_from_ego
+            ego_from_frame = np.eye(4)
+            frame_from_lidar = ego_from_lidar
         sweeps = self._sweeps(lidar, global_from_frame)
-        names = [name for name in self.cameras if name in sample["data"]]
+        cameras = []
+        for name in self.cameras:
+            if name in sample["data"]:
+                camera = self._camera(name, sample["data"][name], global_from_frame)
+                cameras.append(camera)
+        timestamp_ns = sample["timestamp"] * 1000
+        messages = self._messages(scene["name"])
         return MapSample(
             token=sample["token"],
             scene=scene["name"],
             map_name=self.location_of(scene),
             timestamp_ns=timestamp_ns,
-            cameras=[self._camera(n, sample["data"][n], global_from_frame) for n in names],
+            cameras=cameras,
             global_from_frame=global_from_frame,
-            lidar=LidarRecord(lidar["filename"], frame_from_lidar, sweeps),
+            lidar=LidarRecord(lidar["filename"], frame_from_lidar, sweeps=sweeps),
             ego_from_frame=ego_from_frame,
-            can_bus=signals_at(timestamp_ns, global_from_ego, self._messages(scene["name"])),
+            can_bus=signals_at(timestamp_ns, global_from_ego, messages=messages),
         )
 
     def _camera(
         self, name: str, data: dict[str, Any], global_from_frame: np.ndarray
     ) -> CameraRecord:
-        global_from_cam, calibration = self._global_from(data)
+        """Make the camera of a ``sample_data`` record."""
+        global_from_cam, calibration = self._global_from_sensor(data)
         return CameraRecord(
-            name,
-            data["filename"],
-            data["width"],
-            data["height"],
-            np.array(calibration["camera_intrinsic"]),
-            invert_rigid(global_from_cam) @ global_from_frame,
+            name=name,
+            path=data["filename"],
+            width=data["width"],
+            height=data["height"],
+            intrinsics=np.array(calibration["camera_intrinsic"]),
+            cam_from_frame=invert_rigid(global_from_cam) @ global_from_frame,
         )
 
     def _sweeps(self, lidar: dict[str, Any], global_from_frame: np.ndarray) -> list[SweepRecord]:
+        """Make the sweeps before a key frame of the LiDAR, the latest first."""
         frame_from_global = invert_rigid(global_from_frame)
-        earlier = self.chain("sample_data", lidar["prev"], "prev", lidar)
-        return [
-            SweepRecord(
-                data["filename"],
-                data["timestamp"] * 1000,
-                frame_from_global @ self._global_from(data)[0],
+        earlier = self.chain("sample_data", lidar["prev"], step="prev", origin=lidar)
+        sweeps = []
+        for data in islice(earlier, self._max_sweeps):
+            global_from_lidar, _ = self._global_from_sensor(data)
+            sweep = SweepRecord(
+                path=data["filename"],
+                timestamp_ns=data["timestamp"] * 1000,
+                frame_from_lidar=frame_from_global @ global_from_lidar,
             )
-            for data in islice(earlier, self._max_sweeps)
-        ]
+            sweeps.append(sweep)
+        return sweeps
 
 
 def versions_in(root: Path) -> list[str]:
-    """Return the version folders of a nuScenes-format root; none if it is no such root."""
-    folders = (path.parent for path in root.glob("*/scene.json"))
-    return sorted(folder.name for folder in folders if not is_hidden(folder))
+    """Sorted names of the version folders in a data root; empty without nuScenes tables."""
+    names = []
+    for path in root.glob("*/scene.json"):
+        if not is_hidden(path.parent):
+            names.append(path.parent.name)
+    return sorted(names)
 
 
 def read_nuscenes(
     root: Path, version: str | None = None
 ) -> tuple[list[MapSample], tuple[str, ...]]:
-    """Read all samples that have a LIDAR_TOP key frame, whose frame they are in.
+    """Read all samples with a LIDAR_TOP key frame, in the frame of this LiDAR.
 
     Args:
         root: Data root.
-        version: Version folder, such as ``v1.0-mini``; the only one by default.
+        version: Version folder, such as ``v1.0-mini``; may be omitted if there is only one.
 
     Returns:
-        The samples, and how many are left out.
+        The samples, and a note with the number of samples without a key frame, if there are any.
 
     Raises:
-        ValueError: If there is no such version or several, no sample, or a table is damaged.
+        ValueError: If the version is missing or ambiguous, there is no sample, or a table is
+            damaged.
     """
-    found = versions_in(root)
-    if version is None and len(found) > 1:
-        raise InputError(f"{root} holds several versions, {found}: name one with --version.")
-    if version is not None and version not in found:
-        raise InputError(f"{root} holds no version {version!r}, but {found}.")
-    tables = NuScenesTables(version or found[0], root, max_sweeps=10)
-    pairs = [(record, scene) for scene in tables.scene for record in tables.samples_of(scene)]
-    used = [(record, scene) for record, scene in pairs if tables.lidar in record["data"]]
-    note = f"{len(used)} of {counted(len(pairs), 'sample')} used: the others have no key frame of "
-    if not used:
-        raise InputError(f"{root}: {note}{tables.lidar}; download the tables again.")
-    samples = [tables.read(record, scene) for record, scene in used]
-    return samples, (note + tables.lidar,) if len(used) < len(pairs) else ()
+    versions = versions_in(root)
+    if version is None and len(versions) > 1:
+        raise InputError(f"{root} holds several versions, {versions}: name one with --version.")
+    if version is not None and version not in versions:
+        raise InputError(f"{root} holds no version {version!r}, but {versions}.")
+    tables = NuScenesTables(version or versions[0], root, max_sweeps=10)
+    samples = []
+    total = 0
+    for scene in tables.scene:
+        for record in tables.samples_of(scene):
+            total += 1
+            if tables.lidar in record["data"]:
+                samples.append(tables.read(record, scene))
+    note = (
+        f"{len(samples)} of {counted(total, 'sample')} used: the others have no key frame of "
+        f"{tables.lidar}"
+    )
+    if not samples:
+        raise InputError(f"{root}: {note}; download the tables again.")
+    notes = (note,) if len(samples) < total else ()
+    return samples, notes
