@@ -1,8 +1,8 @@
-"""Info pickles of MapTR and MapTRv2 as annotation files.
+"""Conversion of the info pickles of MapTR and MapTRv2 to annotation files.
 
-MapTR's ``nuscenes_infos_temporal_*.pkl`` hold sensors and poses; their ground truth is made from
-the map expansion. MapTRv2's ``nuscenes_map_infos_temporal_*.pkl`` and ``av2_map_infos_*.pkl`` hold
-the ground truth too. The pickles are read without running code from them.
+MapTR's ``nuscenes_infos_temporal_*.pkl`` contain sensors and poses; their ground truth is made from
+the map expansion. MapTRv2's ``nuscenes_map_infos_temporal_*.pkl`` and ``av2_map_infos_*.pkl`` also
+contain the ground truth. No code from the pickles is run.
 """
 
 import argparse
@@ -39,138 +39,179 @@ from mapdata.nuscenes.tables import pose_of
 from mapdata.summary import ConversionSummary
 from mapdata.unix_times import in_nanoseconds
 
-NUSCENES_SIZE = (1600, 900)
+NUSCENES_SIZE = (1600, 900)  # width and height of the images in pixels
+_RING_SIZE = (2048, 1550)  # of Argoverse 2
+_RING_FRONT_SIZE = (1550, 2048)  # of Argoverse 2's upright front camera
 _NEEDED = {
     "lidar": "token, timestamp, lidar_path, lidar2ego_* and ego2global_* (translation, rotation), "
     "and cams with data_path, cam_intrinsic and sensor2lidar_*",
     "ego": "token, log_id, timestamp, lidar_path, e2g_* (translation, rotation), and cams with "
     "img_fpath, intrinsics and extrinsics",
 }
-_MAPTRV2 = {"timestamp", "log_id", "lidar_path"}  # what MapTRv2's samples of Argoverse 2 have
-_BEYOND_M = 1.0  # roll and pitch may move what was cut in the plane by some centimetres
+_MAPTRV2 = {"timestamp", "log_id", "lidar_path"}  # fields of MapTRv2's samples of Argoverse 2
+_BEYOND_M = 1.0  # tolerance of the range; roll and pitch move clipped points by centimetres
 
 
 def _relative(path: str, root: Path) -> str:
-    """Return a path of an info file relative to the data root, wherever it was made."""
-    if (found := find_file(path, root)) is not None:
-        return found.as_posix()
-    parts = Path(path.replace("\\", "/")).parts
+    """Path of an info file relative to the data root; the file may be from another computer."""
+    existing = find_file(path, root)
+    if existing is not None:
+        return existing.as_posix()
+    posix_path = Path(path.replace("\\", "/"))
+    parts = posix_path.parts
     for anchor in ("samples", "sweeps", "train", "val", "test"):
         if anchor in parts:
-            first = len(parts) - 1 - parts[::-1].index(anchor)
-            return Path(*parts[first:]).as_posix()
+            last = len(parts) - 1 - parts[::-1].index(anchor)  # position of the last anchor
+            return Path(*parts[last:]).as_posix()
     if not Path(path).is_absolute():
-        return Path(*parts).as_posix()
+        return posix_path.as_posix()
     raise InputError(f"path {path!r} does not lie under {root}: give the right --data-root.")
 
 
 def _instances(info: Mapping[str, Any], meta: AnnotationMeta) -> list[MapInstance] | None:
-    """Return the elements of the file's classes, if known; lines of one point are left out."""
+    """Ground truth of an entry without lines of one point; None if the entry has none."""
     annotation = info.get("annotation")
     if annotation is None:
         return None
-    return [
-        MapInstance(label, np.asarray(points, np.float64)[:, : meta.dim])
-        for label, name in enumerate(meta.classes)
-        for points in annotation[name]
-        if len(points) >= 2
-    ]
+    elements = []
+    for label, name in enumerate(meta.classes):
+        for points in annotation[name]:
+            if len(points) >= 2:
+                vertices = np.asarray(points, np.float64)[:, : meta.dim]
+                elements.append(MapInstance(label, vertices))
+    return elements
 
 
-class _Sizes:
-    """Sizes of a nuScenes info file's images, of which the first of a camera in a scene is read.
+class _ImageSizes:
+    """Image sizes of a nuScenes info file, read once per scene and camera.
 
     Args:
-        summary: Counts the images that are not there, whose size is taken to be nuScenes'.
+        summary: Counts the missing images, for which the size of nuScenes' images is assumed.
     """
 
     def __init__(self, summary: ConversionSummary) -> None:
         self._summary = summary
-        self._known: dict[tuple[str, str], tuple[int, int]] = {}
+        self._sizes: dict[tuple[str, str], tuple[int, int]] = {}
 
     def __call__(self, scene: str, camera: str, file: Path) -> tuple[int, int]:
-        """Return width and height in pixels of a camera's image."""
-        if (scene, camera) in self._known:
-            return self._known[scene, camera]
+        """Look up or read the size of a camera's images.
+
+        Args:
+            scene: Token of the scene.
+            camera: Name of the camera.
+            file: Image of the camera in this scene.
+
+        Returns:
+            Width and height in pixels.
+        """
+        if (scene, camera) in self._sizes:
+            return self._sizes[scene, camera]
         if not file.is_file():
             width, height = NUSCENES_SIZE
             reason = f"image not there (taken to have {width} x {height} pixels)"
             self._summary.add_problem(f"{camera}: {reason}", str(file))
             return NUSCENES_SIZE
         size = image_size(file, f"camera {camera}")
-        self._known[scene, camera] = size
+        self._sizes[scene, camera] = size
         return size
 
 
 def _nuscenes_sample(
-    info: Mapping[str, Any], meta: AnnotationMeta, root: Path, size_of: _Sizes
+    info: Mapping[str, Any], meta: AnnotationMeta, root: Path, image_sizes: _ImageSizes
 ) -> MapSample:
-    """Read one entry of a nuScenes info file, in the LIDAR_TOP frame."""
+    """Make a sample in the LIDAR_TOP frame from an entry of a nuScenes info file."""
     ego_from_frame = pose_of(info, "lidar2ego_")
     global_from_ego = pose_of(info, "ego2global_")
+    scene = str(info.get("scene_token", ""))
     cameras = []
     for name, camera in info["cams"].items():
         path = _relative(camera["data_path"], root)
         intrinsics = np.asarray(camera["cam_intrinsic"], np.float64)[:3, :3]
         cam_from_frame = np.linalg.inv(pose_of(camera, "sensor2lidar_"))
-        size = size_of(str(info.get("scene_token", "")), name, root / path)
-        cameras.append(CameraRecord(name, path, *size, intrinsics, cam_from_frame))
+        width, height = image_sizes(scene, name, file=root / path)
+        record = CameraRecord(
+            name=name,
+            path=path,
+            width=width,
+            height=height,
+            intrinsics=intrinsics,
+            cam_from_frame=cam_from_frame,
+        )
+        cameras.append(record)
     sweeps = []
     for sweep in info.get("sweeps", []):
-        path, time_ns = (
-            _relative(sweep["data_path"], root),
-            in_nanoseconds(sweep["timestamp"], 1000),
+        sweep_record = SweepRecord(
+            path=_relative(sweep["data_path"], root),
+            timestamp_ns=in_nanoseconds(sweep["timestamp"], usual_unit_ns=1000),
+            frame_from_lidar=pose_of(sweep, "sensor2lidar_"),
         )
-        sweeps.append(SweepRecord(path, time_ns, pose_of(sweep, "sensor2lidar_")))
+        sweeps.append(sweep_record)
     can_bus = info.get("can_bus")
-    if can_bus is not None:  # the pose belongs into it, as MapTR puts it there on loading
-        measured = np.asarray(can_bus, np.float64)[7:16]
+    if can_bus is not None:  # completed by the pose, as MapTR does on loading
+        measurements = np.asarray(can_bus, np.float64)[7:16]
         can_bus = pose_signals(global_from_ego)
         can_bus[3:7] = np.asarray(info["ego2global_rotation"])
-        can_bus[7 : 7 + len(measured)] = measured
+        can_bus[7 : 7 + len(measurements)] = measurements
     return MapSample(
         token=info["token"],
         scene=info.get("scene_token", ""),
         map_name=info.get("map_location", ""),
-        timestamp_ns=in_nanoseconds(info["timestamp"], 1000),
+        timestamp_ns=in_nanoseconds(info["timestamp"], usual_unit_ns=1000),
         cameras=cameras,
         global_from_frame=global_from_ego @ ego_from_frame,
         ego_from_frame=ego_from_frame,
-        lidar=LidarRecord(_relative(info["lidar_path"], root), np.eye(4), sweeps),
+        lidar=LidarRecord(_relative(info["lidar_path"], root), np.eye(4), sweeps=sweeps),
         can_bus=can_bus,
         instances=_instances(info, meta),
     )
 
 
-def _argoverse_sample(
-    info: Mapping[str, Any], meta: AnnotationMeta, root: Path, _: _Sizes
-) -> MapSample:
-    """Read one entry of an Argoverse 2 info file, in the vehicle's frame."""
-    pose = pose_of(info, "e2g_")
+def _argoverse_sample(info: Mapping[str, Any], meta: AnnotationMeta, root: Path) -> MapSample:
+    """Make a sample in the ego frame from an entry of an Argoverse 2 info file."""
+    global_from_ego = pose_of(info, "e2g_")
     cameras = []
     for name, camera in info["cams"].items():
-        then = pose_of(camera, "e2g_") if "e2g_translation" in camera else pose
+        global_from_ego_at_image = global_from_ego
+        if "e2g_translation" in camera:
+            global_from_ego_at_image = pose_of(camera, "e2g_")
         path = _relative(camera["img_fpath"], root)
-        size = (1550, 2048) if name == "ring_front_center" else (2048, 1550)
+        width, height = _RING_FRONT_SIZE if name == "ring_front_center" else _RING_SIZE
         if (root / path).is_file():
-            size = image_size(root / path, f"camera {name}")
+            width, height = image_size(root / path, f"camera {name}")
         intrinsics = np.asarray(camera["intrinsics"], np.float64)[:3, :3]
-        cam_from_frame = np.asarray(camera["extrinsics"], np.float64) @ np.linalg.inv(then) @ pose
-        cameras.append(CameraRecord(name, path, *size, intrinsics, cam_from_frame))
+        cam_from_ego = np.asarray(camera["extrinsics"], np.float64)
+        ego_at_image_from_global = np.linalg.inv(global_from_ego_at_image)
+        record = CameraRecord(
+            name=name,
+            path=path,
+            width=width,
+            height=height,
+            intrinsics=intrinsics,
+            cam_from_frame=cam_from_ego @ ego_at_image_from_global @ global_from_ego,
+        )
+        cameras.append(record)
     return MapSample(
         token=str(info["token"]),
         scene=info["log_id"],
         map_name=info["log_id"],
-        timestamp_ns=in_nanoseconds(info["timestamp"], 1),
+        timestamp_ns=in_nanoseconds(info["timestamp"], usual_unit_ns=1),
         cameras=cameras,
-        global_from_frame=pose,
+        global_from_frame=global_from_ego,
         lidar=LidarRecord(_relative(info["lidar_path"], root), np.eye(4)),
         instances=_instances(info, meta),
     )
 
 
 def _entries(content: Any, path: Path) -> tuple[list[Mapping[str, Any]], str]:
-    """Return the samples of an info file and the frame of its data set."""
+    """List the entries of an info file.
+
+    Args:
+        content: Content of the pickle.
+        path: Path of the info file, for messages.
+
+    Returns:
+        The entries, and the annotation frame: ``lidar`` (nuScenes) or ``ego`` (Argoverse 2).
+    """
     entries = content.get("samples", ()) if isinstance(content, Mapping) else content
     first = entries[0] if isinstance(entries, list) and entries else None
     if isinstance(first, Mapping) and "e2g_translation" in first and not first.keys() >= _MAPTRV2:
@@ -199,39 +240,58 @@ def _samples(
     root: Path,
     summary: ConversionSummary,
 ) -> Iterator[MapSample]:
-    """Yield the samples of an info file, with ground truth where it is known."""
+    """Yield the samples of an info file.
+
+    Ground truth is read from the file or, for nuScenes, extracted from the map expansion; samples
+    without either have none.
+
+    Args:
+        entries: Entries of the info file with their position in it.
+        meta: Description of the annotation file.
+        infos: Path of the info file, for messages.
+        root: Data root.
+        summary: Counts the samples and problems.
+    """
 
     @cache
-    def map_of(name: str) -> NuScenesLocalMap | None:
+    def open_map(name: str) -> NuScenesLocalMap | None:
         if not name or not expansion(root, name).is_file():
             return None
-        layers = open_layers(root, name, meta.classes)
-        return NuScenesLocalMap(layers, meta.classes, meta.x_range, meta.y_range)
+        layers = open_layers(root, name, classes=meta.classes)
+        return NuScenesLocalMap(layers, meta.classes, x_range=meta.x_range, y_range=meta.y_range)
 
-    read = _argoverse_sample if meta.frame == "ego" else _nuscenes_sample
-    size_of, needs = _Sizes(summary), _NEEDED[meta.frame]
+    image_sizes = _ImageSizes(summary)
+    remedy = f"a sample of such a file has {_NEEDED[meta.frame]}"
     for number, info in entries:
-        with naming(f"{infos}, sample {number}", f"a sample of such a file has {needs}"):
-            sample = read(info, meta, root, size_of)
+        with naming(f"{infos}, sample {number}", remedy):
+            if meta.frame == "ego":
+                sample = _argoverse_sample(info, meta, root=root)
+            else:
+                sample = _nuscenes_sample(info, meta, root=root, image_sizes=image_sizes)
             check_samples([sample], meta)
         if sample.instances is not None:
             _check_range(sample, meta)
-        elif meta.frame == "lidar" and (town := map_of(sample.map_name)) is not None:
-            sample.instances = town.instances(sample.global_from_frame)
         elif meta.frame == "lidar":
-            reason = f"no ground truth: maps/expansion has no map {sample.map_name!r}"
-            summary.add_problem(f"{reason} (sample kept without)", sample.token)
+            local_map = open_map(sample.map_name)
+            if local_map is not None:
+                sample.instances = local_map.instances(sample.global_from_frame)
+            else:
+                reason = f"no ground truth: maps/expansion has no map {sample.map_name!r}"
+                summary.add_problem(f"{reason} (sample kept without)", sample.token)
         summary.add_sample(meta.split, sample)
         yield sample
 
 
 def _check_range(sample: MapSample, meta: AnnotationMeta) -> None:
-    """Raise a ``ValueError`` if ground truth lies outside the range that the file will name."""
+    """Raise a ``ValueError`` if ground truth lies outside the range of the annotation file."""
     low, high = np.array([meta.x_range, meta.y_range]).T
-    points = np.concatenate([np.empty((0, 2)), *(i.points[:, :2] for i in sample.instances or [])])
-    outside = ((points < low - _BEYOND_M) | (points > high + _BEYOND_M)).any(1)
-    if outside.any():
-        x, y = points[outside][0]
+    lines = [np.empty((0, 2))]
+    for instance in sample.instances or []:
+        lines.append(instance.points[:, :2])
+    points = np.concatenate(lines)
+    is_outside = ((points < low - _BEYOND_M) | (points > high + _BEYOND_M)).any(axis=1)
+    if is_outside.any():
+        x, y = points[is_outside][0]
         raise InputError(
             f"sample {sample.token!r} has a vertex at ({x:.1f}, {y:.1f}), outside x "
             f"{meta.x_range} and y {meta.y_range}: give the range that the info file was made "
@@ -240,10 +300,14 @@ def _check_range(sample: MapSample, meta: AnnotationMeta) -> None:
 
 
 def _dim(entries: Sequence[Mapping[str, Any]], classes: Sequence[str]) -> int:
-    """Return how many coordinates the points of the first element have."""
-    known = (info["annotation"] for info in entries if "annotation" in info)
-    lines = (line for annotation in known for name in classes for line in annotation[name])
-    return min(np.shape(next(lines, np.empty((0, 2))))[-1], 3)
+    """Number of coordinates per point of the first map element, at most 3; 2 without elements."""
+    for info in entries:
+        if "annotation" not in info:
+            continue
+        for name in classes:
+            for points in info["annotation"][name]:
+                return min(np.shape(points)[-1], 3)
+    return 2
 
 
 def convert_infos(
@@ -257,49 +321,56 @@ def convert_infos(
     command: str = "",
     shard: Shard = WHOLE,
 ) -> ConversionSummary:
-    """Convert one info file.
+    """Convert one info file to an annotation file.
 
     Args:
-        infos: The pickle.
+        infos: Info file (pickle).
         target: Annotation file to write.
-        data_root: Folder that image and LiDAR paths shall be relative to; maps are read from it.
+        data_root: Folder that image and LiDAR paths become relative to. The map expansion is read
+            from it.
         split: Name of the split.
         classes: Class names in label order.
-        x_range: Smallest and largest x of the ground truth in metres; the frame's usual if None.
-        y_range: Smallest and largest y of the ground truth in metres; the frame's usual if None.
-        command: The command line, for messages of readers.
-        shard: Which part of the samples to convert.
+        x_range: Smallest and largest x of the ground truth in metres, annotation frame; None is the
+            usual range of the frame.
+        y_range: Smallest and largest y of the ground truth in metres, annotation frame; None is the
+            usual range of the frame.
+        command: Command line, for messages of readers of the file.
+        shard: Part of the samples to convert.
+
+    Returns:
+        Counts of the samples and map elements in the file, and of the problems.
 
     Raises:
-        FileNotFoundError: If the pickle does not exist.
-        ValueError: If it holds more than plain data, is of no known form, or holds ground truth
-            outside the range.
+        FileNotFoundError: If the info file is missing.
+        ValueError: If the info file holds more than plain data, has an unknown form, or has ground
+            truth outside the range.
     """
     entries, frame = _entries(load_plain_pickle(infos), infos)
     with naming(infos, "make it anew"):
         dim = _dim(entries, classes) if frame == "ego" else 2
+    usual_x_range, usual_y_range = RANGES[frame]
     meta = AnnotationMeta(
-        "nuscenes" if frame == "lidar" else "av2",
-        frame,
-        split,
-        classes,
-        x_range or RANGES[frame][0],
-        y_range or RANGES[frame][1],
-        dim,
-        digest(infos)[:16],
+        dataset="nuscenes" if frame == "lidar" else "av2",
+        frame=frame,
+        split=split,
+        classes=classes,
+        x_range=x_range or usual_x_range,
+        y_range=y_range or usual_y_range,
+        dim=dim,
+        source_fingerprint=digest(infos)[:16],
         options={"infos": infos.name},
         command=command,
     )
     summary = ConversionSummary(classes)
-    bar = Progress(shard.part(list(enumerate(entries))), unit="samples")
-    with bar as numbered, AnnotationWriter(target, meta, shard) as writer:
-        for sample in _samples(numbered, meta, infos, data_root, summary):
+    progress = Progress(shard.part(list(enumerate(entries))), unit="samples")
+    with progress as numbered, AnnotationWriter(target, meta, shard=shard) as writer:
+        for sample in _samples(numbered, meta, infos=infos, root=data_root, summary=summary):
             writer.write(sample)
     return summary
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of ``tools/create_data.py infos``."""
+    """Add the options of ``tools/create_data.py infos`` to a parser."""
     add = parser.add_argument
     add("infos", type=Path, help="info file of MapTR or MapTRv2 (.pkl)")
     add("target", type=output_file, help="annotation file to write (.arrow)")
@@ -311,8 +382,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> str:
-    """Convert as the command line asks and return the summary."""
+    """Convert with the options of a command line and return the summary as text."""
     split = arguments.split or arguments.infos.stem.rsplit("_", 1)[-1]
-    more = {"split": split, "classes": tuple(arguments.classes)}
-    names = ("infos", "target", "data_root", "x_range", "y_range", "command", "shard")
-    return convert_infos(**{name: getattr(arguments, name) for name in names} | more).text()
+    summary = convert_infos(
+        arguments.infos,
+        arguments.target,
+        data_root=arguments.data_root,
+        split=split,
+        classes=tuple(arguments.classes),
+        x_range=arguments.x_range,
+        y_range=arguments.y_range,
+        command=arguments.command,
+        shard=arguments.shard,
+    )
+    return summary.text()

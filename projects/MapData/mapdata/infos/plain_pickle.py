@@ -1,4 +1,4 @@
-"""Reading of pickles that hold plain data. Nothing that a file names is ever imported or called."""
+"""Reader of pickles of plain data that never imports or calls a name from the file."""
 
 import pickle
 import struct
@@ -18,11 +18,12 @@ _STAND_INS: dict[str, Callable[..., Any]] = {
     "__builtin__.bytes": lambda: b"",
     "builtins.bytes": lambda: b"",
 }
-_KEY_BITS, _KEY_PARTS = 60, 8
+_KEY_BITS = 60  # of an integer in a key
+_KEY_PARTS = 8  # of a tuple as key
 _KEYS = (str, bytes, int, float, np.generic, type(None))
 _CONTAINERS = (list, tuple, dict, set, frozenset)
 _MAX_DEPTH = 50
-_VALUES_PER_BYTE = 20  # what is shared counts each time
+_VALUES_PER_BYTE = 20  # a value counts once for each of its containers
 _DAMAGE = (
     pickle.UnpicklingError, EOFError, struct.error, LookupError, TypeError, ValueError,
     AttributeError, ArithmeticError,
@@ -30,7 +31,7 @@ _DAMAGE = (
 
 
 class _PlainUnpickler(pickle._Unpickler):
-    """Python's own unpickler, without the instructions that do more than hold data."""
+    """Unpickler of the standard library without the opcodes that call functions or make objects."""
 
     stack: list[Any]
     append: Callable[[Any], None]
@@ -38,13 +39,18 @@ class _PlainUnpickler(pickle._Unpickler):
     read: Callable[[int], bytes]
 
     def find_class(self, module: str, name: str) -> Callable[..., Any]:
-        """Return what stands in for a function or class."""
+        """Look up the harmless substitute of a function or class.
+
+        Raises:
+            UnpicklingError: If there is no substitute.
+        """
         path = f"{module}.{name}"
         if path not in _STAND_INS:
             raise pickle.UnpicklingError(f"it asks for {path}, which is not plain data")
         return _STAND_INS[path]
 
     def _top(self, *kinds: type) -> Any:
+        """Top of the stack; ``UnpicklingError`` if its type is not one of ``kinds``."""
         if type(self.stack[-1]) not in kinds:
             raise pickle.UnpicklingError(f"it changes a {type(self.stack[-1]).__name__}")
         return self.stack[-1]
@@ -54,7 +60,8 @@ class _PlainUnpickler(pickle._Unpickler):
         self._top(CheckedArray, CheckedDtype).__setstate__(state)
 
     def _set_item(self) -> None:
-        value, key = self.stack.pop(), self.stack.pop()
+        value = self.stack.pop()
+        key = self.stack.pop()
         _fill(self._top(dict), [key, value])
 
     def _set_items(self) -> None:
@@ -72,7 +79,7 @@ class _PlainUnpickler(pickle._Unpickler):
 
     def _make_bytearray(self) -> None:
         (size,) = struct.unpack("<Q", self.read(8))
-        self.append(bytearray(self.read(size)))  # no more than the file has
+        self.append(bytearray(self.read(size)))  # read() returns at most the rest of the file
 
     def _refuse(self) -> None:
         raise pickle.UnpicklingError("it makes objects as plain data needs not")
@@ -91,31 +98,48 @@ class _PlainUnpickler(pickle._Unpickler):
         pickle.DICT[0]: _make_dict,
         pickle.FROZENSET[0]: lambda self: self.append(frozenset(map(_key, self.pop_mark()))),
         pickle.BYTEARRAY8[0]: _make_bytearray,
-        pickle.FRAME[0]: lambda self: self.read(8),  # its size, which nothing depends on
+        pickle.FRAME[0]: lambda self: self.read(8),  # skips the size of the frame
     }  # fmt: skip
 
 
 def _key(value: Any) -> Hashable:
-    """Return a key of a dict or set, if it is a plain one."""
+    """Check a key of a dict or set, and return it.
+
+    Wide integers and tuples with floats are rejected: an attacker can give them equal hashes, and
+    building a dict of such keys takes quadratic time.
+    """
     parts = value if isinstance(value, tuple) else (value,)
-    if not all(isinstance(part, _KEYS) for part in parts):
-        raise pickle.UnpicklingError(f"a key is a {type(value).__name__}")
-    # such keys may all have one hash, and a dict of them takes the square of their number
-    is_wide = any(isinstance(part, int) and part.bit_length() > _KEY_BITS for part in parts)
-    if is_wide or (len(parts) > 1 and any(isinstance(part, float) for part in parts)):
-        raise pickle.UnpicklingError(f"a key is a number of more than {_KEY_BITS} bits")
+    for part in parts:
+        if not isinstance(part, _KEYS):
+            raise pickle.UnpicklingError(f"a key is a {type(value).__name__}")
+    for part in parts:
+        is_wide = isinstance(part, int) and part.bit_length() > _KEY_BITS
+        is_float_of_tuple = len(parts) > 1 and isinstance(part, float)
+        if is_wide or is_float_of_tuple:
+            raise pickle.UnpicklingError(f"a key is a number of more than {_KEY_BITS} bits")
     if len(parts) > _KEY_PARTS:
         raise pickle.UnpicklingError(f"a key has {len(parts)} parts")
     return value
 
 
 def _fill(target: dict[Any, Any], items: list[Any]) -> None:
-    """Put keys and values, which alternate, into a dict."""
-    target.update(zip(map(_key, items[::2]), items[1::2], strict=True))
+    """Add a list of alternating keys and values to a dict."""
+    keys = map(_key, items[::2])
+    values = items[1::2]
+    target.update(zip(keys, values, strict=True))
 
 
 def _count(value: Any, counts: dict[int, int], depth: int = 0) -> int:
-    """Count the values in nested containers; refuse what holds itself or is nested too deep."""
+    """Count the values in nested containers; a shared container counts once for each reference.
+
+    Args:
+        value: Value or container.
+        counts: Numbers of values by ``id`` of the container, 0 while it is being counted.
+        depth: Number of enclosing containers.
+
+    Raises:
+        UnpicklingError: If a container holds itself or a class, or they are nested too deep.
+    """
     if callable(value):
         raise pickle.UnpicklingError("it holds a function or class, which is not plain data")
     if not isinstance(value, _CONTAINERS):
@@ -123,18 +147,24 @@ def _count(value: Any, counts: dict[int, int], depth: int = 0) -> int:
     if depth > _MAX_DEPTH or counts.get(id(value)) == 0:
         raise pickle.UnpicklingError("a container holds itself, or they are nested too deep")
     if id(value) not in counts:
-        counts[id(value)] = 0  # under way
-        inner: Iterable[Any] = value.values() if isinstance(value, dict) else value
-        counts[id(value)] = 1 + sum(_count(v, counts, depth + 1) for v in inner)
+        counts[id(value)] = 0
+        items: Iterable[Any] = value.values() if isinstance(value, dict) else value
+        total = 1
+        for item in items:
+            total += _count(item, counts, depth=depth + 1)
+        counts[id(value)] = total
     return counts[id(value)]
 
 
 def load_plain_pickle(path: str | Path) -> Any:
-    """Read a pickle of plain containers and numpy values.
+    """Read a pickle of plain containers and numpy arrays.
+
+    Args:
+        path: Pickle file.
 
     Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If it is not a whole pickle, or asks for anything but plain data.
+        FileNotFoundError: If the file is missing.
+        ValueError: If the file is not a complete pickle, or holds more than plain data.
     """
     path = Path(path)
     if not path.is_file():

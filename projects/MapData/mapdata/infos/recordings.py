@@ -1,4 +1,4 @@
-"""Samples from info files of mmdet3d (format v2, as mmdet3d 1.x writes them)."""
+"""Samples from info files of mmdet3d 1.x (format v2)."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -26,16 +26,17 @@ def read_info_file(
     """Read the samples of an info file: cameras, LiDAR and poses, without map elements.
 
     Args:
-        path: A pickle with ``metainfo`` and ``data_list``. It is read without running code from it.
-        data_root: Folder that image and LiDAR paths start from; that of the file by default.
-        allow_missing_cameras: Whether to leave out a camera whose image does not exist.
+        path: Pickle with ``metainfo`` and ``data_list``. No code from the file is run.
+        data_root: Folder that image and LiDAR paths are relative to; the folder of the file by
+            default.
+        allow_missing_cameras: Whether to leave out cameras whose image is missing.
 
     Returns:
-        The samples, in the LIDAR_TOP frame, with paths relative to ``data_root``.
+        Samples in the LIDAR_TOP frame, with paths relative to ``data_root``.
 
     Raises:
-        FileNotFoundError: If the file, or an image that it names, does not exist.
-        ValueError: If it is not an info file of this format.
+        FileNotFoundError: If the file or one of its images is missing.
+        ValueError: If the file is not an info file of this format.
     """
     path = Path(path)
     root = Path(path.parent if data_root is None else data_root)
@@ -47,70 +48,99 @@ def read_info_file(
             "tools/dataset_converters/update_infos_to_v2.py."
         )
     samples = []
+    meta = AnnotationMeta("mmdet3d", "lidar", split="test")
     for i, info in enumerate(content["data_list"]):
         where = f"{path}, sample {i}"
         with naming(where, _REMEDY):
-            samples.append(_sample(info, root, where, allow_missing_cameras))
-            check_samples(samples[-1:], AnnotationMeta("mmdet3d", "lidar", "test"))
+            sample = _sample(info, root, where=where, allow_missing=allow_missing_cameras)
+            check_samples([sample], meta)
+        samples.append(sample)
     return samples
 
 
-def _matrix(values: Any, size: int, what: str) -> np.ndarray:
-    """Return a square matrix; a 4 x 4 one given as its upper 3 x 4 part is completed."""
+def _matrix(values: Any, size: int, name: str) -> np.ndarray:
+    """Square matrix of a field; a transform may lack its last row, intrinsics may be padded.
+
+    Args:
+        values: Nested lists or an array. (size, size), (3, 4), or (4, 4) for intrinsics
+        size: 3 for intrinsics, 4 for transforms.
+        name: Name of the field, for messages.
+    """
     matrix = np.asarray(values, dtype=np.float64)
     if size == 4 and matrix.shape == (3, 4):
         matrix = np.vstack([matrix, [0, 0, 0, 1]])
     if size == 3 and matrix.shape in ((3, 4), (4, 4)):
         matrix = matrix[:3, :3]
     if matrix.shape != (size, size):
-        raise InputError(f"{what} must be {size} x {size}, got {matrix.shape}.")
+        raise InputError(f"{name} must be {size} x {size}, got {matrix.shape}.")
     return matrix
 
 
 def find_file(name: str, root: Path) -> Path | None:
-    """Return the longest end of a path that is a file below ``root``, relative to it, or None."""
+    """Find the longest suffix of a path that is a file below a folder.
+
+    Args:
+        name: Path, possibly absolute and from another computer.
+        root: Folder.
+
+    Returns:
+        The suffix, relative to ``root``; None if no suffix is a file.
+    """
     parts = [part for part in Path(name.replace("\\", "/")).parts if part != "/"]
-    ends = (Path(*parts[start:]) for start in range(len(parts)))
-    return next((end for end in ends if (root / end).is_file()), None)
+    for start in range(len(parts)):
+        suffix = Path(*parts[start:])
+        if (root / suffix).is_file():
+            return suffix
+    return None
 
 
-def _locate(name: str, folder: str, root: Path, what: str) -> Path:
-    """Find a file, as named or in nuScenes' folders; the result is relative to ``root``."""
+def _locate(name: str, folder: str, root: Path, owner: str) -> Path:
+    """Find a file by its path or in a folder of nuScenes.
+
+    Args:
+        name: Path of the file.
+        folder: Folder of nuScenes below ``samples``.
+        root: Data root.
+        owner: Sample and sensor of the file, for messages.
+
+    Returns:
+        Path relative to ``root``.
+    """
     usual = Path("samples", folder, Path(name).name)
-    found = find_file(name, root) or find_file(str(usual), root)
-    if found is None:
+    path = find_file(name, root) or find_file(str(usual), root)
+    if path is None:
         raise FileNotFoundError(
-            f"{what}: no file {root / name} or {root / usual}; give the folder that the paths "
+            f"{owner}: no file {root / name} or {root / usual}; give the folder that the paths "
             "start from with --data-root."
         )
-    return found
+    return path
 
 
 def _camera(name: str, info: Mapping[str, Any], root: Path, where: str) -> CameraRecord:
-    """Read one camera's record."""
-    what = f"{where}, camera {name}"
-    path = _locate(info["img_path"], name, root, what)
-    width, height = image_size(root / path, what)
+    """Read the record of one camera; ``where`` names the sample in messages."""
+    owner = f"{where}, camera {name}"
+    path = _locate(info["img_path"], name, root=root, owner=owner)
+    width, height = image_size(root / path, owner)
     return CameraRecord(
         name=name,
         path=path.as_posix(),
         width=width,
         height=height,
-        intrinsics=_matrix(info["cam2img"], 3, f"{what}: cam2img"),
-        cam_from_frame=_matrix(info["lidar2cam"], 4, f"{what}: lidar2cam"),
+        intrinsics=_matrix(info["cam2img"], size=3, name=f"{owner}: cam2img"),
+        cam_from_frame=_matrix(info["lidar2cam"], size=4, name=f"{owner}: lidar2cam"),
     )
 
 
 def _cameras(
     images: Mapping[str, Any], root: Path, where: str, allow_missing: bool
 ) -> list[CameraRecord]:
-    """Read the cameras that have an image and a calibration."""
+    """Read the cameras with an image and a calibration; ``where`` names the sample in messages."""
     cameras = []
     for name, info in images.items():
         if not info.get("img_path") or info.get("lidar2cam") is None:
             continue
         try:
-            cameras.append(_camera(name, info, root, where))
+            cameras.append(_camera(name, info, root=root, where=where))
         except FileNotFoundError:
             if not allow_missing:
                 raise
@@ -120,15 +150,15 @@ def _cameras(
 
 
 def _sample(info: Mapping[str, Any], root: Path, where: str, allow_missing: bool) -> MapSample:
-    """Turn one entry of ``data_list`` into a sample."""
+    """Make a sample from an entry of ``data_list``; ``where`` names it in messages."""
     lidar = info["lidar_points"]
-    cameras = _cameras(info["images"], root, where, allow_missing)
-    ego_from_lidar = _matrix(lidar["lidar2ego"], 4, f"{where}: lidar2ego")
-    global_from_ego = _matrix(info["ego2global"], 4, f"{where}: ego2global")
-    timestamp_ns = in_nanoseconds(info["timestamp"], 10**9)
+    cameras = _cameras(info["images"], root, where=where, allow_missing=allow_missing)
+    ego_from_lidar = _matrix(lidar["lidar2ego"], size=4, name=f"{where}: lidar2ego")
+    global_from_ego = _matrix(info["ego2global"], size=4, name=f"{where}: ego2global")
+    timestamp_ns = in_nanoseconds(info["timestamp"], usual_unit_ns=10**9)
     record = None
     if lidar.get("lidar_path"):
-        path = _locate(lidar["lidar_path"], "LIDAR_TOP", root, f"{where}, LiDAR")
+        path = _locate(lidar["lidar_path"], "LIDAR_TOP", root=root, owner=f"{where}, LiDAR")
         record = LidarRecord(path.as_posix(), np.eye(4))
     return MapSample(
         token=str(info.get("token", info.get("sample_idx", where))),
