@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gsmap.datasets.source import Source
-from mapdata.folders.names import in_order, times_of_names
+from mapdata.folders.names import natural_sort_key, times_of_names
 from mapdata.inputs import open_input
 from mapdata.unix_times import span_of, unix_time_ns
 
@@ -72,7 +72,7 @@ def test_a_unix_time_has_the_unit_that_puts_it_into_this_century():
 
 def test_numbers_in_names_count_as_numbers():
     names = ["a/10.jpg", "a/9.jpg", "a/b2.jpg", "a/b10.jpg", "a/007.jpg"]
-    ordered = [path.as_posix() for path in sorted(map(Path, names), key=in_order)]
+    ordered = [path.as_posix() for path in sorted(map(Path, names), key=natural_sort_key)]
     assert ordered == ["a/007.jpg", "a/9.jpg", "a/10.jpg", "a/b2.jpg", "a/b10.jpg"]
 
 

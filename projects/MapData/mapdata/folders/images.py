@@ -22,7 +22,7 @@ from gsmap.structures.rigid import invert_rigid, is_rigid, rigid
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import file_name, is_hidden, read_text
 from gsmap.utils.words import counted
-from mapdata.folders.names import in_order, times_of_names
+from mapdata.folders.names import natural_sort_key, times_of_names
 from mapdata.folders.poses import read_poses
 from mapdata.folders.rig import (
     PoseAt,
@@ -250,7 +250,7 @@ def _images_of(folder: Path, name: str, camera: Mapping[str, Any]) -> tuple[list
     place = _below(folder, pattern, "images")
     found = place.iterdir() if place.is_dir() else folder.glob(_moderate(pattern))
     files = [path for path in found if path.is_file() and not is_hidden(path)]
-    paths = sorted((p for p in files if p.suffix.lower() in _SUFFIXES), key=in_order)
+    paths = sorted((p for p in files if p.suffix.lower() in _SUFFIXES), key=natural_sort_key)
     others = sorted({path.suffix for path in files if path.suffix.lower() not in _SUFFIXES})[:5]
     if not paths:
         holds = f" It holds files with {others}, and {list(_SUFFIXES)} are read." * bool(others)

@@ -16,59 +16,70 @@ from gsmap.utils.files import read_text
 from mapdata.folders.rig import PoseTrack
 
 _VALUES = ("x", "y", "z", "qw", "qx", "qy", "qz")
-_TIME, _FRAME = "timestamp_ns", "frame"
+_TIME = "timestamp_ns"
+_FRAME = "frame"
 _SEPARATORS = ",;\t"
 _NUMBER = re.compile(r"(-?\d+)(\.0*)?")
 _LENGTH_TOLERANCE = 1e-2  # of a quaternion
-_SHOWN = 12  # columns in a message
+_MOST_COLUMNS = 12  # in a message
 
 
 def read_poses(path: Path, time_of: Mapping[str, int], ground: np.ndarray) -> PoseTrack:
-    """Read a file with x, y, z, qw, qx, qy, qz, and timestamp_ns or frame (an image's name).
+    """Read poses from the columns x, y, z, qw, qx, qy, qz, and timestamp_ns or frame.
 
-    Columns are separated by commas, semicolons or tabs; blanks around values do not count. Beside
-    semicolons and tabs, numbers may have decimal commas.
+    The column ``frame`` holds names of images. Columns are separated by commas, semicolons or tabs,
+    and blanks around values are ignored. In files with semicolons or tabs, numbers may have decimal
+    commas.
 
     Args:
-        path: The file. Its first line names the columns.
+        path: Text file, whose first line names the columns.
         time_of: Times of the images in nanoseconds, by their names without suffix.
-        ground: Pose of the road in the vehicle's frame. (4, 4)
+        ground: Pose of the road in the vehicle's frame, in metres. (4, 4)
+
+    Returns:
+        Poses of the road below the vehicle.
 
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: If it is malformed; the message names the line.
+        ValueError: If the file is malformed; the message names the line.
     """
     if not path.is_file():
         raise FileNotFoundError(f"There is no file of poses {path}.")
-    times, values, foreign = [], [], []
+    times_ns = []
+    values = []
+    unknown_frames = []
     with naming(path, "see docs/inference.md"):
         for number, row in _rows(read_text(path)):
             try:
                 time_ns = _time_of(row, time_of)
                 if time_ns is None:
-                    foreign.append(row[_FRAME])
+                    unknown_frames.append(row[_FRAME])
                     continue
                 values.append(_pose_of(row))
             except ValueError as error:
                 raise InputError(f"line {number}: {error}") from error
-            times.append(time_ns)
-        if not times and foreign:
+            times_ns.append(time_ns)
+        if not times_ns and unknown_frames:
             raise InputError(
-                f"none of its {len(foreign)} frames is the name of an image: it has "
-                f"{foreign[0]!r:.60}, images are {next(iter(time_of), '')!r:.60}"
+                f"none of its {len(unknown_frames)} frames is the name of an image: it has "
+                f"{unknown_frames[0]!r:.60}, images are {next(iter(time_of), '')!r:.60}"
             )
-        if not times:
+        if not times_ns:
             raise InputError("it holds no pose")
         rows = np.array(values, np.float64)
-        turns = Rotation.from_quat(rows[:, [4, 5, 6, 3]]).as_matrix()
-        poses = [rigid(turn, row[:3]) @ ground for turn, row in zip(turns, rows, strict=True)]
-        return PoseTrack(times, poses)
+        positions = rows[:, :3]
+        quaternions_xyzw = rows[:, [4, 5, 6, 3]]
+        rotations = Rotation.from_quat(quaternions_xyzw).as_matrix()
+        poses = []
+        for rotation, position in zip(rotations, positions, strict=True):
+            poses.append(rigid(rotation, position) @ ground)
+        return PoseTrack(times_ns, poses)
 
 
 def _rows(text: str) -> Iterator[tuple[int, dict[str, str]]]:
-    """Yield the lines below the first, with their numbers, by the names in the first."""
+    """Yield the number and the values by column of each line below the first."""
     lines = text.splitlines()
-    start = next((n for n, line in enumerate(lines) if line.strip()), None)
+    start = next((number for number, line in enumerate(lines) if line.strip()), None)
     if start is None:
         raise InputError("it is empty")
     separator = max(_SEPARATORS, key=lines[start].count)
@@ -77,38 +88,39 @@ def _rows(text: str) -> Iterator[tuple[int, dict[str, str]]]:
         names = [name.strip() for name in next(table)]
         _require_columns(names)
         for row in table:
-            if not any(value.strip() for value in row):
+            values = [value.strip() for value in row]
+            if not any(values):
                 continue
             number = start + table.line_num
-            if len(row) < len(names):
-                raise InputError(f"line {number}: it has {len(row)} of {len(names)} columns")
-            cells = [value.strip() for value in row]
+            if len(values) < len(names):
+                raise InputError(f"line {number}: it has {len(values)} of {len(names)} columns")
             if separator != ",":
-                cells = [value.replace(",", ".") for value in cells]
-            yield number, dict(zip(names, cells, strict=False))
+                values = [value.replace(",", ".") for value in values]
+            yield number, dict(zip(names, values, strict=False))
     except csv.Error as error:
         raise InputError(f"it is no CSV: {error}") from error
 
 
 def _require_columns(names: Collection[str]) -> None:
-    """Refuse a first line without the columns that are needed."""
+    """Raise a ``ValueError`` if a required column is missing."""
     missing = [name for name in _VALUES if name not in names]
     if _TIME not in names and _FRAME not in names:
         missing.insert(0, f"{_TIME} or {_FRAME}")
     if missing:
         raise InputError(
             f"its first line must name the columns {_TIME} or {_FRAME}, {', '.join(_VALUES)}; it "
-            f"lacks {', '.join(missing)} and has {list(names)[:_SHOWN]!r:.200}"
+            f"lacks {', '.join(missing)} and has {list(names)[:_MOST_COLUMNS]!r:.200}"
         )
 
 
 def _time_of(row: Mapping[str, str], time_of: Mapping[str, int]) -> int | None:
-    """Return the time of a row; None where it names no image."""
+    """Time of a row in nanoseconds; None if its frame is not the name of an image."""
     if _FRAME in row:
         name = row[_FRAME]
         return time_of.get(name, time_of.get(Path(name).stem))
     text = row[_TIME]
-    if match := _NUMBER.fullmatch(text):
+    match = _NUMBER.fullmatch(text)
+    if match:
         return int(match[1])
     if re.fullmatch(r"\d([.,]\d+)?[eE]\+?\d+", text):
         raise InputError(
@@ -118,15 +130,17 @@ def _time_of(row: Mapping[str, str], time_of: Mapping[str, int]) -> int | None:
 
 
 def _pose_of(row: Mapping[str, str]) -> list[float]:
-    """Return a row's position and quaternion."""
+    """Position and quaternion (w, x, y, z) of a row. 7 values"""
     values = []
     for name in _VALUES:
         try:
-            values.append(float(row[name]))
+            value = float(row[name])
         except ValueError:
-            values.append(math.nan)
-        if not math.isfinite(values[-1]):
+            value = math.nan
+        if not math.isfinite(value):
             raise InputError(f"{name} is {row[name]!r:.40}, no finite number")
-    if not abs(math.hypot(*values[3:]) - 1) < _LENGTH_TOLERANCE:
+        values.append(value)
+    length = math.hypot(values[3], values[4], values[5], values[6])
+    if not abs(length - 1) < _LENGTH_TOLERANCE:
         raise InputError(f"a quaternion must have length 1, got {values[3:]}")
     return values
