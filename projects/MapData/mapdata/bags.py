@@ -17,7 +17,7 @@ from mapdata.bag_files import Bag, bag_at, damage_in
 from mapdata.bag_images import write_image
 from mapdata.bag_poses import PoseChain, odometry_poses
 from mapdata.bag_topics import camera_topics, check_topics, image_topics
-from mapdata.folders.images import read_rig
+from mapdata.folders.calibration_file import read_rig
 from mapdata.folders.rig import (
     RigCamera,
     RigFrame,

@@ -9,7 +9,8 @@ from mapdata.argoverse2.log import logs_in
 from mapdata.argoverse2.samples import read_logs
 from mapdata.bag_files import is_bag, parts_in, suffix_advice
 from mapdata.bags import read_bag
-from mapdata.folders.images import NAMES, read_image_folder
+from mapdata.folders.calibration_file import NAMES
+from mapdata.folders.images import read_image_folder
 from mapdata.infos.recordings import read_info_file
 from mapdata.nuscenes.tables import read_nuscenes, versions_in
 from mapdata.options import InputOptions

@@ -15,7 +15,8 @@ from lz4 import frame as lz4
 from mcap.writer import CompressionType, Writer
 
 from mapdata import decompression
-from mapdata.folders.images import _content, _moderate
+from mapdata.folders.calibration_file import _read_values
+from mapdata.folders.images import _simplify_pattern
 from mapdata.infos.plain_pickle import load_plain_pickle
 from mapdata.inputs import open_input
 from mapdata.ros_bag import RosTypes
@@ -161,14 +162,14 @@ def test_metadata_that_stand_for_more_are_refused(text, message, tmp_path):
 def test_a_calibration_of_a_megabyte_is_refused(tmp_path):
     (tmp_path / "c.yaml").write_text("cameras: [" + "1," * 200_000 + "1]\n")
     with pytest.raises(ValueError, match="more than 300000 bytes"):
-        _content(tmp_path / "c.yaml")
+        _read_values(tmp_path / "c.yaml")
 
 
 def test_a_pattern_of_any_folders_is_looked_for_once():
-    assert _moderate("**/" * 12 + "a*.png") == "**/a*.png"
-    assert _moderate("a/**/b/**/*.png") == "a/**/b/**/*.png"
+    assert _simplify_pattern("**/" * 12 + "a*.png") == "**/a*.png"
+    assert _simplify_pattern("a/**/b/**/*.png") == "a/**/b/**/*.png"
     with pytest.raises(ValueError, match=r"more than 2 `\*\*`"):
-        _moderate("**/a/**/b/**/*.png")
+        _simplify_pattern("**/a/**/b/**/*.png")
 
 
 @pytest.mark.parametrize(

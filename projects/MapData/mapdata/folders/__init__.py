@@ -1,1 +1,1 @@
-"""Folders of images with a calibration file, as samples."""
+"""Samples of folders of images with a calibration file."""

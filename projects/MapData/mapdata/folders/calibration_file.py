@@ -1,0 +1,284 @@
+"""Calibration file of the cameras on a vehicle, in YAML or JSON (docs/inference.md)."""
+
+import json
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from scipy.spatial.transform import Rotation
+
+from gsmap.datasets.errors import naming
+from gsmap.datasets.image_files import image_size
+from gsmap.structures.rigid import invert_rigid, is_rigid, rigid
+from gsmap.utils.errors import InputError
+from gsmap.utils.files import read_text
+from mapdata.folders.poses import read_poses
+from mapdata.folders.rig import PoseTrack, RigCamera, rotation_of
+
+NAMES = ("calibration.yaml", "calibration.yml", "calibration.json")
+_KEYS = {"cameras", "ground_z_m", "poses", "rate_hz", "max_time_difference_ms"}
+_CAMERA_KEYS = {
+    "images", "intrinsics", "distortion", "distortion_model", "vehicle_from_camera", "position_m",
+    "quaternion_wxyz", "yaw_pitch_roll_deg", "size_px",
+}  # fmt: skip
+# A camera's axes (right, down, ahead) in a vehicle's (ahead, left, up).
+_AHEAD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+_MOST_BYTES = 300_000  # of a file; YAML takes some milliseconds for a thousand bytes
+_MOST_VALUES = 100_000  # in a file
+
+
+def read_rig(file: Path, ground: np.ndarray) -> tuple[list[tuple[RigCamera, str]], np.ndarray]:
+    """Read the cameras of a calibration file for images that lie elsewhere, such as in a bag.
+
+    Args:
+        file: Calibration file, in which each camera has ``size_px``.
+        ground: Pose of the road in the vehicle's frame, in metres, for a file without
+            ``ground_z_m``. (4, 4)
+
+    Returns:
+        The cameras, each with its ``images``, and the pose of the road. (4, 4)
+
+    Raises:
+        ValueError: If the file is malformed; the message names the camera.
+    """
+    rig = []
+    with naming(file, "see docs/inference.md"):
+        content = read_calibration(file)
+        if "ground_z_m" in content:
+            ground = ground_pose(content)
+        for name, camera in cameras_of(content):
+            with naming(f"{file}, camera {name!r}", "see docs/inference.md"):
+                check_camera_keys(camera)
+                if "size_px" not in camera:
+                    raise InputError("beside a bag it needs size_px: [width, height]")
+                rig_camera = create_camera(name, camera, ground=ground, images=())
+                rig.append((rig_camera, str(camera.get("images", ""))))
+        return rig, ground
+
+
+def read_vehicle(
+    file: Path, images: Mapping[str, Sequence[Path]], time_of: Mapping[str, int]
+) -> tuple[list[RigCamera], PoseTrack | None]:
+    """Read the cameras and the poses of a calibration file for given images.
+
+    Args:
+        file: Calibration file. The path of its ``poses`` is relative to its folder.
+        images: Images by the camera's name; other cameras of the file are left out.
+        time_of: Times of the images in nanoseconds, by their names without suffix.
+
+    Returns:
+        The cameras, and the poses of the road below the vehicle, None if the file has no poses.
+
+    Raises:
+        FileNotFoundError: If there is no calibration file, or no file of poses.
+        ValueError: If the file is malformed; the message names the camera.
+    """
+    rig = []
+    with naming(file, "see docs/inference.md"):
+        content = read_calibration(file)
+        ground = ground_pose(content)
+        for name, camera in cameras_of(content):
+            if name not in images:
+                continue
+            with naming(f"{file}, camera {name!r}", "see docs/inference.md"):
+                check_camera_keys(camera)
+                rig.append(create_camera(name, camera, ground=ground, images=images[name]))
+        poses = read_named_poses(content, file.parent, time_of=time_of, ground=ground)
+        return rig, poses
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML loader that refuses merge keys (``<<``), which can expand without a limit."""
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        """Leave merge keys in the mapping, where they are unknown keys."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Construct a mapping; repeated keys raise a ``ValueError``."""
+        _refuse_repeats([key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)])
+        return super().construct_mapping(node, deep)
+
+
+def _refuse_repeats(names: Sequence[Any]) -> None:
+    """Raise a ``ValueError`` if a name repeats, as the values of the first would be lost."""
+    repeats = sorted(str(name) for name, count in Counter(names).items() if count > 1)
+    if repeats:
+        raise InputError(f"{', '.join(repeats)} is there twice: remove or rename one")
+
+
+def _construct_object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Construct an object of JSON; repeated keys raise a ``ValueError``."""
+    _refuse_repeats([name for name, _ in pairs])
+    return dict(pairs)
+
+
+def _read_values(file: Path) -> Any:
+    """Parse the values of a calibration file, within bounds."""
+    if file.stat().st_size > _MOST_BYTES:
+        raise InputError(f"it has more than {_MOST_BYTES} bytes, which no calibration takes")
+    text = read_text(file)
+    try:
+        if file.suffix == ".json":
+            content = json.loads(text, object_pairs_hook=_construct_object)
+        else:
+            content = yaml.load(text, _Loader)
+    except yaml.YAMLError as error:
+        raise InputError(f"it is no YAML: {error}") from error
+    values = [content]
+    for value in values:  # the list grows; aliases of YAML can repeat a value many times
+        if isinstance(value, dict):
+            values += value.values()
+        elif isinstance(value, list):
+            values += value
+        if len(values) > _MOST_VALUES:
+            raise InputError(f"it holds more than {_MOST_VALUES} values")
+    return content
+
+
+def read_calibration(file: Path) -> dict[str, Any]:
+    """Read the content of a calibration file; the keys of its cameras are not yet checked.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If the file is malformed or too large, or has unknown keys.
+    """
+    content = _read_values(file)
+    _check_keys(content, _KEYS, "a calibration file")
+    if not isinstance(content.get("cameras"), dict) or not content["cameras"]:
+        raise InputError("`cameras` must map names to cameras, at least one")
+    return dict(content)
+
+
+def cameras_of(content: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yield name and entry of each camera of a calibration file."""
+    for name, camera in content["cameras"].items():
+        yield str(name), camera
+
+
+def check_camera_keys(camera: Any) -> None:
+    """Raise a ``ValueError`` if the entry of a camera is no mapping, or has unknown keys."""
+    _check_keys(camera, _CAMERA_KEYS, "a camera")
+
+
+def _check_keys(value: Any, known_keys: set[str], noun: str) -> None:
+    if not isinstance(value, Mapping):
+        raise InputError(f"{noun} must be a mapping, got {value!r:.60}")
+    unknown = sorted(map(str, set(value) - known_keys))
+    if unknown:
+        raise InputError(f"unknown keys {unknown}; {noun} may have {sorted(known_keys)}")
+
+
+def ground_pose(content: Mapping[str, Any]) -> np.ndarray:
+    """Pose of the road in the vehicle's frame, from ``ground_z_m`` of a calibration. (4, 4)"""
+    return rigid(np.eye(3), (0, 0, float(content.get("ground_z_m", 0.0))))
+
+
+def read_named_poses(
+    content: Mapping[str, Any], folder: Path, time_of: Mapping[str, int], ground: np.ndarray
+) -> PoseTrack | None:
+    """Read the poses that a calibration file names.
+
+    Args:
+        content: Content of the calibration file.
+        folder: Folder of the calibration file.
+        time_of: Times of the images in nanoseconds, by their names without suffix.
+        ground: Pose of the road in the vehicle's frame, in metres. (4, 4)
+
+    Returns:
+        Poses of the road below the vehicle; None if the file names no poses.
+    """
+    if not content.get("poses"):
+        return None
+    path = path_below(folder, str(content["poses"]), noun="poses")
+    return read_poses(path, time_of, ground)
+
+
+def path_below(folder: Path, name: str, noun: str) -> Path:
+    """Path that a calibration file names, below its folder.
+
+    Args:
+        folder: Folder of the calibration file.
+        name: Relative path.
+        noun: Key of the path, for error messages.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: If the path leads out of the folder.
+    """
+    if Path(name).is_absolute() or ".." in Path(name).parts:
+        raise InputError(f"{noun} must lie below the calibration file's folder, got {name!r}")
+    return folder / name
+
+
+def create_camera(
+    name: str, camera: Mapping[str, Any], ground: np.ndarray, images: Sequence[Path]
+) -> RigCamera:
+    """Create a camera from its entry in a calibration file.
+
+    Args:
+        name: Name of the camera.
+        camera: Entry of the camera, with known keys.
+        ground: Pose of the road in the vehicle's frame, in metres. (4, 4)
+        images: Images of the camera, for its size if the entry has no ``size_px``.
+
+    Returns:
+        The camera.
+
+    Raises:
+        ValueError: If a value is malformed.
+    """
+    intrinsics = np.array(camera["intrinsics"], np.float64)
+    if intrinsics.shape == (4,):
+        fx, fy, cx, cy = intrinsics
+        intrinsics = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    if intrinsics.shape != (3, 3):
+        raise InputError(f"intrinsics must be [fx, fy, cx, cy] or 3 x 3, got {intrinsics.shape}")
+    width, height = camera.get("size_px") or _size_of(images, f"camera {name!r}")
+    return RigCamera(
+        name=name,
+        intrinsics=intrinsics,
+        cam_from_ground=invert_rigid(_vehicle_from_camera(camera)) @ ground,
+        size_px=(int(width), int(height)),
+        distortion=np.array(camera.get("distortion", ()), np.float64),
+        model=str(camera.get("distortion_model", "")),
+    )
+
+
+def _size_of(images: Sequence[Path], where: str) -> tuple[int, int]:
+    """Size of the first image that can be read."""
+    for path in images[:-1]:
+        with suppress(ValueError):
+            return image_size(path, where)
+    return image_size(images[-1], where)
+
+
+def _vehicle_from_camera(camera: Mapping[str, Any]) -> np.ndarray:
+    """Pose of a camera (right, down, ahead) on the vehicle (ahead, left, up), in metres. (4, 4)"""
+    keys = {"vehicle_from_camera", "quaternion_wxyz", "yaw_pitch_roll_deg"} & set(camera)
+    if len(keys) != 1:
+        raise InputError(
+            "say its place by vehicle_from_camera (4 x 4), or by position_m with either "
+            f"quaternion_wxyz or yaw_pitch_roll_deg; got {sorted(keys) or 'none of them'}"
+        )
+    if "vehicle_from_camera" in camera:
+        pose = np.array(camera["vehicle_from_camera"], np.float64)
+        if pose.shape == (4, 4) and np.linalg.det(pose[:3, :3]) < 0:
+            raise InputError(
+                "vehicle_from_camera mirrors (its rotation's determinant is below 0): two axes are "
+                "swapped, or one has the wrong sign"
+            )
+        if pose.shape != (4, 4) or not is_rigid(pose):
+            raise InputError("vehicle_from_camera must be a rotation with a translation, 4 x 4")
+        return pose
+    if "quaternion_wxyz" in camera:
+        rotation = rotation_of(camera["quaternion_wxyz"])
+    else:
+        turn = Rotation.from_euler("ZYX", camera["yaw_pitch_roll_deg"], degrees=True)
+        rotation = turn.as_matrix() @ _AHEAD
+    return rigid(rotation, camera["position_m"])
