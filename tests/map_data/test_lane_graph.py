@@ -17,7 +17,8 @@ def paths(polylines: list[np.ndarray], successors: list[list[int]], lanes: list[
     count = len(polylines)
     predecessors = [[j for j in range(count) if i in successors[j]] for i in range(count)]
     links = link_lanes(list(zip(range(count), predecessors, successors, strict=True)))
-    simplified = LanePaths(polylines, links).simplified(range(count) if lanes is None else lanes)
+    lanes = range(count) if lanes is None else lanes
+    simplified = LanePaths(polylines, links).simplify_paths(lanes)
     return [shapely.get_coordinates(path).tolist() for path in simplified]
 
 

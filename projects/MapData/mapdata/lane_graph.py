@@ -1,7 +1,6 @@
-"""The lane graph of a map: which lines along lanes join to one."""
+"""Lane graph of a map, and the paths along lanes that are drawn as one line."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import chain, islice
 from typing import Any
 
 import numpy as np
@@ -13,37 +12,51 @@ ROUND_DECIMALS = 3  # points closer than a millimetre are one node of the graph
 SIMPLIFY_TOLERANCE_M = 0.2
 MAX_PATHS = 20_000
 
-# An edge leads to a node by way of one lane's private points: (interior point ids, end point id).
+# An edge leads to a node by way of points of one lane: (interior point ids, end point id).
 Edge = tuple[tuple[int, ...], int]
 # For each lane of a map, its links: positions of a lane and of the one that follows it.
 LaneLinks = Sequence[Sequence[tuple[int, int]]]
 
 
 def link_lanes(lanes: Sequence[tuple[Any, Iterable[Any], Iterable[Any]]]) -> LaneLinks:
-    """Say by position which lanes follow one another: those of a map, each with its neighbours.
+    """Find the links between the lanes of a map by their positions.
 
-    A lane is its id, its predecessors' ids and its successors'; ids outside the map are left out.
+    Args:
+        lanes: Id, ids of the predecessors, and ids of the successors of each lane. Ids that are not
+            in the map are ignored.
+
+    Returns:
+        For each lane its links: positions of a lane and of a lane that follows it.
     """
     position = {lane_id: i for i, (lane_id, _, _) in enumerate(lanes)}
-    return [
-        [(position[other], i) for other in predecessors if other in position]
-        + [(i, position[other]) for other in successors if other in position]
-        for i, (_, predecessors, successors) in enumerate(lanes)
-    ]
+    links = []
+    for i, (_, predecessors, successors) in enumerate(lanes):
+        lane_links = []
+        for other in predecessors:
+            if other in position:
+                lane_links.append((position[other], i))
+        for other in successors:
+            if other in position:
+                lane_links.append((i, position[other]))
+        links.append(lane_links)
+    return links
 
 
 class LanePaths:
-    """One polyline per lane of a map, and the simple paths through any subset of them.
+    """Polylines of the lanes of a map, and the simple paths through subsets of the lanes.
 
     The graph has a node for every polyline point (rounded to 1 mm, so that lanes may share nodes),
     an edge between consecutive points, and an edge from the end of each lane to the start of each
-    of its successors. A path runs from a node that nothing leads to, to a node that leads nowhere,
-    without visiting a node twice. Points that only one lane has are folded into the edges once per
-    map, so that a frame's search takes about one step per lane.
+    of its successors. A path runs from a node without incoming edges to a node without outgoing
+    edges, and visits no node twice. Points that belong to one lane only are folded into the edges
+    once per map, so that the search in a frame takes about one step per lane.
 
     Args:
-        polylines: Points of each lane's line, in metres, map frame, finite. list of (n >= 2, 3)
-        links: Which lanes follow which.
+        polylines: Points of each lane in the map frame, in metres, finite. each (n >= 2, 3)
+        links: Links of each lane, as `link_lanes` finds them.
+
+    Raises:
+        ValueError: If a polyline has another shape, or is not finite.
     """
 
     def __init__(self, polylines: Sequence[np.ndarray], links: LaneLinks) -> None:
@@ -58,76 +71,105 @@ class LanePaths:
         )  # (nodes, 3)
         ends = np.cumsum([len(line) for line in polylines], dtype=np.int64)
         lanes = [lane.tolist() for lane in np.split(nodes, ends)[:-1]]
-        self._edges = [_fold(lane, uses) for lane in lanes]
-        self._links = [
-            [(a, b, (lanes[a][-1], ((), lanes[b][0]))) for a, b in of_lane] for of_lane in links
-        ]
-        self._memo: tuple[tuple[int, ...], np.ndarray] = ((), np.empty(0, dtype=object))
+        self._edges = [_fold_points(lane, uses) for lane in lanes]
+        self._links: list[list[tuple[int, int, tuple[int, Edge]]]] = []
+        for lane_links in links:
+            link_edges = []
+            for before, after in lane_links:
+                end = lanes[before][-1]
+                start = lanes[after][0]
+                link_edges.append((before, after, (end, ((), start))))
+            self._links.append(link_edges)
+        self._last_key: tuple[int, ...] = ()
+        self._last_lines = np.empty(0, dtype=object)
 
-    def simplified(self, lanes: Sequence[int]) -> np.ndarray:
-        """Return every simple path through the given lanes, simplified (Douglas-Peucker, 0.2 m).
+    def simplify_paths(self, lanes: Sequence[int]) -> np.ndarray:
+        """Find all simple paths through some lanes, simplified (Douglas-Peucker, 0.2 m).
 
-        Lanes are positions, in the order of the map. The result are 3-D line strings in the map
-        frame, at most ``MAX_PATHS``. The latest is kept: neighbouring frames often see the same.
+        The last result is cached, as neighbouring frames often contain equal lanes.
+
+        Args:
+            lanes: Positions of the lanes, in the order of the map.
+
+        Returns:
+            3-D line strings in the map frame, at most ``MAX_PATHS``. (paths,)
+
+        Raises:
+            ValueError: If there are more paths.
         """
         key = tuple(lanes)
-        if key != self._memo[0]:
-            graph = self._subgraph(key)
-            entered = {end for edges in graph.values() for _, end in edges}
-            sources = (node for node, edges in graph.items() if edges and node not in entered)
-            found = chain.from_iterable(_paths_from(source, graph) for source in sources)
-            paths = list(islice(found, MAX_PATHS + 1))
-            if len(paths) > MAX_PATHS:
-                raise InputError(
-                    f"the lanes of one frame allow more than {MAX_PATHS} paths: the lane graph is "
-                    "damaged."
-                )
-            nodes = np.array([node for path in paths for node in path], dtype=np.int64)
-            indices = np.repeat(np.arange(len(paths)), [len(path) for path in paths])
-            lines = shapely.linestrings(self._points[nodes], indices=indices)
-            self._memo = (key, shapely.simplify(lines, SIMPLIFY_TOLERANCE_M))
-        return self._memo[1]
+        if key == self._last_key:
+            return self._last_lines
+        graph = self._subgraph(key)
+        targets = set()
+        for edges in graph.values():
+            targets.update(end for _, end in edges)
+        paths: list[list[int]] = []
+        for node, edges in graph.items():
+            if not edges or node in targets:
+                continue
+            for path in _paths_from(node, graph):
+                paths.append(path)
+                if len(paths) > MAX_PATHS:
+                    raise InputError(
+                        f"the lanes of one frame allow more than {MAX_PATHS} paths: the lane graph "
+                        "is damaged."
+                    )
+        nodes = np.array([node for path in paths for node in path], dtype=np.int64)
+        indices = np.repeat(np.arange(len(paths)), [len(path) for path in paths])
+        lines = shapely.linestrings(self._points[nodes], indices=indices)
+        self._last_key = key
+        self._last_lines = shapely.simplify(lines, SIMPLIFY_TOLERANCE_M)
+        return self._last_lines
 
     def _subgraph(self, lanes: Sequence[int]) -> dict[int, list[Edge]]:
-        """Return the edges that leave each node when only ``lanes`` take part, in their order."""
+        """Edges that leave each node in the graph of some lanes, in their order."""
         members = set(lanes)
         graph: dict[int, dict[Edge, None]] = {}  # inner dicts: ordered sets
         for lane in lanes:
-            links = (edge for a, b, edge in self._links[lane] if a in members and b in members)
-            for start, edge in chain(self._edges[lane], links):
+            edges = list(self._edges[lane])
+            for before, after, edge in self._links[lane]:
+                if before in members and after in members:
+                    edges.append(edge)
+            for start, edge in edges:
                 graph.setdefault(start, {})[edge] = None
                 graph.setdefault(edge[1], {})
         return {node: list(edges) for node, edges in graph.items()}
 
 
-def _fold(nodes: Sequence[int], uses: np.ndarray) -> list[tuple[int, Edge]]:
-    """Return a lane's edges between its ends and shared nodes, private points folded in."""
+def _fold_points(nodes: Sequence[int], uses: np.ndarray) -> list[tuple[int, Edge]]:
+    """Edges of a lane between its ends and shared nodes, with its other points folded in."""
     edges: list[tuple[int, Edge]] = []
-    start, interior = nodes[0], []
-    for i, node in enumerate(nodes[1:], 1):
-        if uses[node] == 1 and i < len(nodes) - 1:
+    start = nodes[0]
+    interior: list[int] = []
+    for node in nodes[1:-1]:
+        if uses[node] == 1:
             interior.append(node)
         else:
             edges.append((start, (tuple(interior), node)))
-            start, interior = node, []
+            start = node
+            interior = []
+    edges.append((start, (tuple(interior), nodes[-1])))
     return edges
 
 
 def _paths_from(source: int, graph: dict[int, list[Edge]]) -> Iterator[list[int]]:
-    """Yield the nodes of every simple path from ``source`` to a node that leads nowhere."""
-    path, visited = [source], {source}
+    """Yield the nodes of every simple path from a node to a node without outgoing edges."""
+    path = [source]
+    visited = {source}
     # (length of the path up to the node, node, edges still to try)
     stack = [(1, source, iter(graph[source]))]
     while stack:
         length, node, edges = stack[-1]
         del path[length:]
-        edge = next((e for e in edges if e[1] not in visited), None)
+        edge = next((candidate for candidate in edges if candidate[1] not in visited), None)
         if edge is None:
             stack.pop()
             visited.discard(node)
             continue
         interior, end = edge
-        path += *interior, end
+        path += interior
+        path.append(end)
         if graph[end]:
             visited.add(end)
             stack.append((len(path), end, iter(graph[end])))

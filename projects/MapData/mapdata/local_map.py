@@ -1,4 +1,4 @@
-"""The patch of a map that a sample sees, and geometry cut with it; shared by converters."""
+"""Patch of a map around a sample, and geometry that is cut with it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,18 +10,24 @@ import shapely
 from gsmap.structures.polylines import Points, clip_to_box
 from gsmap.utils.errors import InputError
 
-LINE, POLYGON, COLLECTION = 1, 3, 7  # shapely type ids
+# shapely type ids
+LINE = 1
+POLYGON = 3
+COLLECTION = 7
 _CHUNK_SEGMENTS = 32
 
 
 @dataclass(frozen=True, eq=False)
 class LocalPatch:
-    """A rectangle in the map's plane, turned by the pose's yaw; roll and pitch do not matter.
+    """A rectangle in the map's plane, rotated by the yaw of a pose; roll and pitch are ignored.
 
     Args:
-        global_from_frame: Pose of the annotation frame in the map, finite. (4, 4)
+        global_from_frame: Pose of the annotation frame in the map, in metres, finite. (4, 4)
         x_range: Smallest and largest x in the frame, in metres.
         y_range: Smallest and largest y in the frame, in metres.
+
+    Raises:
+        ValueError: If the pose has another shape, or is not finite.
     """
 
     global_from_frame: np.ndarray
@@ -35,55 +41,67 @@ class LocalPatch:
 
     @cached_property
     def rotation(self) -> np.ndarray:
-        """Unit vectors of the turned x and y axis in the map, as columns. (2, 2)."""
-        cos, sin = self.global_from_frame[:2, 0] / np.hypot(*self.global_from_frame[:2, 0])
+        """Unit vectors of the x and y axis of the patch in the map, as columns. (2, 2)"""
+        x_axis = self.global_from_frame[:2, 0]
+        cos, sin = x_axis / np.hypot(x_axis[0], x_axis[1])
         return np.array([[cos, -sin], [sin, cos]])
 
     @cached_property
     def polygon(self) -> shapely.Polygon:
         """The rectangle in the map's frame."""
-        (x0, x1), (y0, y1) = self.x_range, self.y_range
+        x0, x1 = self.x_range
+        y0, y1 = self.y_range
         corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
         polygon = shapely.Polygon(corners @ self.rotation.T + self.global_from_frame[:2, 3])
         shapely.prepare(polygon)
         return polygon
 
     def box(self, margin_m: float) -> shapely.Polygon:
-        """Return the rectangle in its own frame, enlarged by ``margin_m`` on every side."""
-        (x0, x1), (y0, y1) = self.x_range, self.y_range
+        """The rectangle in the frame of the patch, enlarged by ``margin_m`` on every side."""
+        x0, x1 = self.x_range
+        y0, y1 = self.y_range
         return shapely.box(x0 - margin_m, y0 - margin_m, x1 + margin_m, y1 + margin_m)
 
-    # Products are written out below: a matrix product may round one point differently from row to
-    # row, and equal points must stay equal for lines to join.
+    # Products are written out below: a matrix product may round equal points differently in
+    # different rows, and equal points must stay equal for lines to join.
     def points_to_local(self, points: Points) -> np.ndarray:
-        """Move points from the map to the patch's frame in the plane. (n, 2)."""
+        """Transform points from the map to the patch's frame, in the plane. (n, 2+) -> (n, 2)"""
         x, y = (points[:, :2] - self.global_from_frame[:2, 3]).T
         r = self.rotation
         return np.stack([r[0, 0] * x + r[1, 0] * y, r[0, 1] * x + r[1, 1] * y], -1)
 
     def to_local(self, geometries: np.ndarray) -> np.ndarray:
-        """Move geometries from the map to the patch's frame in the plane. (n,)."""
+        """Transform geometries from the map to the patch's frame, in the plane. (n,)"""
         return shapely.transform(geometries, self.points_to_local)
 
     def to_frame(self, geometries: np.ndarray) -> np.ndarray:
-        """Move geometries with height to the annotation frame, roll and pitch included. (n,)."""
-        rotation, translation = self.global_from_frame[:3, :3].T, self.global_from_frame[:3, 3]
+        """Transform geometries with heights to the annotation frame, with roll and pitch. (n,)
 
-        def move(points: np.ndarray) -> np.ndarray:
+        Points without a height get the height of the frame's origin.
+        """
+        rotation = self.global_from_frame[:3, :3].T
+        translation = self.global_from_frame[:3, 3]
+
+        def transform_points(points: np.ndarray) -> np.ndarray:
             x, y, z = (points - translation).T
-            z = np.where(np.isnan(z), 0.0, z)  # a map without heights lies at the vehicle's own
-            return np.stack([row[0] * x + row[1] * y + row[2] * z for row in rotation], -1)
+            z = np.where(np.isnan(z), 0.0, z)
+            columns = [row[0] * x + row[1] * y + row[2] * z for row in rotation]
+            return np.stack(columns, -1)
 
-        return shapely.transform(geometries, move, include_z=True)
+        return shapely.transform(geometries, transform_points, include_z=True)
 
     def lines_inside(self, lines: np.ndarray) -> np.ndarray:
-        """Return the parts of the map's lines inside the patch, in the map's frame. (pieces,)."""
+        """Parts of the map's lines inside the patch, in the map's frame. (n,) -> (pieces,)"""
         pieces = shapely.get_parts(shapely.intersection(lines, self.polygon))
         return pieces[is_line(pieces)]
 
 
 class GeometryLayer:
-    """Lines or polygons of a map, with a spatial index; invalid ones are in no answer. (n,)"""
+    """Lines or polygons of a map with a spatial index, which leaves out invalid geometries.
+
+    Args:
+        geometries: Geometries in the map's frame, in metres. (n,)
+    """
 
     def __init__(self, geometries: Sequence[shapely.Geometry] | np.ndarray) -> None:
         self.geometries = np.array(list(geometries), dtype=object)
@@ -92,47 +110,55 @@ class GeometryLayer:
 
     @property
     def invalid_count(self) -> int:
-        """How many geometries are invalid (self-crossing, for example)."""
+        """Number of invalid geometries, such as polygons that cross themselves."""
         return len(self.geometries) - len(self._valid)
 
     def touching(self, patch: LocalPatch) -> np.ndarray:
-        """Return the positions, ascending, of the valid geometries that meet the patch."""
+        """Indices of the valid geometries that intersect the patch, ascending. (m,)"""
         return np.sort(self._valid[self._tree.query(patch.polygon, predicate="intersects")])
 
     def near(self, patch: LocalPatch) -> np.ndarray:
-        """Return the valid geometries that meet the patch, in their order."""
+        """Valid geometries that intersect the patch, in their order. (m,)"""
         return self.geometries[self.touching(patch)]
 
 
 def is_line(geometries: np.ndarray) -> np.ndarray:
-    """Say which geometries are lines with some length. (n,) bool."""
+    """Whether geometries are lines with a length > 0. (n,) -> (n,) bool"""
     return (shapely.get_type_id(geometries) == LINE) & (shapely.length(geometries) > 0)
 
 
 def vertices_of(lines: Sequence[shapely.Geometry] | np.ndarray, dim: int) -> list[np.ndarray]:
-    """Return the vertices of each line. each (n, dim)."""
+    """Vertices of each line, in ``dim`` coordinates. each (n, dim)"""
     points, owner = shapely.get_coordinates(lines, include_z=dim == 3, return_index=True)
-    return np.split(points, np.flatnonzero(np.diff(owner)) + 1) if len(points) else []
+    if not len(points):
+        return []
+    starts = np.flatnonzero(np.diff(owner)) + 1
+    return np.split(points, starts)
 
 
 def rings_of(polygons: np.ndarray) -> np.ndarray:
-    """Return all rings, polygon by polygon: the exterior clockwise, then holes anticlockwise.
+    """All rings of polygons: clockwise exteriors, each followed by its anticlockwise holes.
 
     (n,) -> (rings,)
     """
     rings, owner = shapely.get_rings(polygons, return_index=True)
     is_hole = np.zeros(len(rings), dtype=bool)
     is_hole[1:] = owner[1:] == owner[:-1]  # a polygon's first ring is its exterior
-    turn = shapely.is_ccw(rings) != is_hole
-    rings[turn] = shapely.reverse(rings[turn])
+    is_reversed = shapely.is_ccw(rings) != is_hole
+    rings[is_reversed] = shapely.reverse(rings[is_reversed])
     return rings
 
 
 class OutlineIndex:
-    """Simple rings of a map (n,), indexed in short chunks: a patch touches only what is near."""
+    """Rings of a map with a spatial index of short chunks, so that long rings are cut quickly.
+
+    Args:
+        rings: Simple rings in the map's frame, in metres. (n,)
+    """
 
     def __init__(self, rings: np.ndarray) -> None:
-        self._chunks, owners = [], []
+        self._chunks = []
+        owners = []
         for number, ring in enumerate(rings):
             points = shapely.get_coordinates(ring)
             for start in range(0, len(points) - 1, _CHUNK_SEGMENTS):
@@ -142,26 +168,38 @@ class OutlineIndex:
         self._tree = shapely.STRtree([shapely.LineString(points) for points in self._chunks])
 
     def cut(self, patch: LocalPatch, margin_m: float) -> list[np.ndarray]:
-        """Return the parts of the rings inside a patch, shrunk by ``margin_m`` on each side.
+        """Cut the rings with a patch that is shrunk by ``margin_m`` on each side.
 
-        They are in the patch's frame; a ring wholly inside stays closed. each (n, 2)
+        Args:
+            patch: The patch.
+            margin_m: Distance of the cut from the sides of the patch, in metres.
+
+        Returns:
+            Parts inside, in the patch's frame, in metres; a ring that is wholly inside stays
+            closed. each (n, 2)
         """
         near = np.sort(self._tree.query(patch.polygon, predicate="intersects"))
-        x_range, y_range = (
-            (low + margin_m, high - margin_m) for low, high in (patch.x_range, patch.y_range)
-        )
+        x0, x1 = patch.x_range
+        y0, y1 = patch.y_range
+        x_range = (x0 + margin_m, x1 - margin_m)
+        y_range = (y0 + margin_m, y1 - margin_m)
         pieces = []
         for number in np.unique(self._owners[near]):
-            for chunks in self._runs(near[self._owners[near] == number]):
-                first, *others = (self._chunks[i] for i in chunks)
-                points = np.concatenate([first, *(chunk[1:] for chunk in others)])
-                pieces += clip_to_box(patch.points_to_local(points), x_range, y_range)
+            for run in self._runs(near[self._owners[near] == number]):
+                parts = [self._chunks[run[0]]]
+                for chunk in run[1:]:
+                    parts.append(self._chunks[chunk][1:])  # chunks share a point
+                points = patch.points_to_local(np.concatenate(parts))
+                pieces += clip_to_box(points, x_range, y_range)
         return pieces
 
     def _runs(self, chunks: np.ndarray) -> list[np.ndarray]:
-        """Return which of one ring's chunks, ascending, follow one another."""
-        runs = np.split(chunks, np.flatnonzero(np.diff(chunks) > 1) + 1)
-        first, last = np.flatnonzero(self._owners == self._owners[chunks[0]])[[0, -1]]
-        if len(runs) > 1 and chunks[0] == first and chunks[-1] == last:  # across the ring's start
+        """Group ascending chunks of one ring into runs of consecutive chunks."""
+        gaps = np.flatnonzero(np.diff(chunks) > 1) + 1
+        runs = np.split(chunks, gaps)
+        chunks_of_ring = np.flatnonzero(self._owners == self._owners[chunks[0]])
+        touches_start = chunks[0] == chunks_of_ring[0]
+        touches_end = chunks[-1] == chunks_of_ring[-1]
+        if len(runs) > 1 and touches_start and touches_end:  # a run crosses the ring's start
             runs[0] = np.concatenate([runs.pop(), runs[0]])
         return runs

@@ -209,13 +209,13 @@ class Argoverse2Map:
         is_shared = np.isin(with_left_line, right_neighbours[with_right_line])
         with_left_line = with_left_line[~is_shared]
         left_paths, right_paths = self._side_paths
-        left_lines = left_paths.simplified(with_left_line.tolist())
-        right_lines = right_paths.simplified(with_right_line.tolist())
+        left_lines = left_paths.simplify_paths(with_left_line.tolist())
+        right_lines = right_paths.simplify_paths(with_right_line.tolist())
         return drop_duplicates(clip_lines(np.concatenate([left_lines, right_lines]), patch))
 
     def _centerlines(self, patch: LocalPatch, lanes: np.ndarray) -> np.ndarray:
         """Paths along the middle of the lanes (MapTRv2)."""
-        paths = self._centre_paths.simplified(lanes.tolist())
+        paths = self._centre_paths.simplify_paths(lanes.tolist())
         return drop_duplicates(clip_lines(paths, patch))
 
     def _painted_lines(self, patch: LocalPatch) -> np.ndarray:

@@ -271,7 +271,7 @@ class NuScenesLocalMap:
             lines = self._lines.near(patch)
         else:
             near = np.sort(self._lane_tree.query(patch.polygon, predicate="intersects"))
-            lines = shapely.force_2d(self._lane_paths.simplified(near.tolist()))
+            lines = shapely.force_2d(self._lane_paths.simplify_paths(near.tolist()))
         return vertices_of(patch.to_local(patch.lines_inside(lines)), dim=2)
 
     def _open_crossings(self, patch: LocalPatch) -> list[Points]:
