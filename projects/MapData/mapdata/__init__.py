@@ -1,4 +1,4 @@
-"""From raw recordings to annotation files or samples: a reader for each data set and format."""
+"""Readers of data sets and recordings, which create annotation files or samples."""
 
 from gsmap.utils.lazy import lazy_names
 

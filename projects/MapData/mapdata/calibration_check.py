@@ -1,4 +1,4 @@
-"""Calibrations that cannot be right: what is implausible about them, and a picture to judge by."""
+"""Plausibility of calibrations: warnings, and a figure of the ground plane in the images."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,18 +25,26 @@ _LINES = ("ahead", "left", "every_5_m", "behind", "right", "cameras")
 
 
 def image_warnings(sample: MapSample, data_root: Path) -> list[str]:
-    """Say which images of a sample have another size than their calibration."""
-    found = []
+    """Warnings about images of a sample whose size differs from their calibration.
+
+    Args:
+        sample: The sample.
+        data_root: Folder that its paths are relative to; images that do not exist are ignored.
+
+    Returns:
+        A line for each such image.
+    """
+    warnings = []
     for camera in sample.cameras:
         path = data_root / camera.path
         if path.is_file():
-            size = image_size(path, f"camera {camera.name!r}")
-            if size != (camera.width, camera.height):
-                found.append(
-                    f"camera {camera.name!r} has images of {size[0]} x {size[1]} pixels, but is "
+            width, height = image_size(path, f"camera {camera.name!r}")
+            if (width, height) != (camera.width, camera.height):
+                warnings.append(
+                    f"camera {camera.name!r} has images of {width} x {height} pixels, but is "
                     f"calibrated for {camera.width} x {camera.height}"
                 )
-    return found
+    return warnings
 
 
 def calibration_figure(
@@ -46,55 +54,68 @@ def calibration_figure(
 
     Args:
         sample: The sample.
-        frame: Its annotation frame.
-        data_root: Folder that its paths start from; an image that is not there is grey.
-        ground_z_m: Height of the road in the frame, as in ``AnnotationMeta``.
+        frame: Annotation frame of the sample, ``lidar`` or ``ego``.
+        data_root: Folder that its paths are relative to; an image that does not exist is grey.
+        ground_z_m: Height of the road in the frame in metres, as in ``AnnotationMeta``.
 
     Returns:
-        The picture: lines ahead, to the left, to the right and behind have colours of their own.
+        The figure, with different colours for lines ahead, to the left, to the right and behind.
     """
     frame_from_ground = invert_rigid(ground_from_frame(sample, frame, ground_z_m))
     lines = _ground_lines(frame_from_ground)
-    wedges = [("cameras", _wedge(c, frame_from_ground)) for c in sample.cameras]
-    style = MapStyle(classes=_LINES)
+    wedges = [("cameras", _wedge(camera, frame_from_ground)) for camera in sample.cameras]
+    x_range, y_range = RANGES[frame]
     return compose_figure(
-        camera_views(sample.cameras, data_root, sample.token, grey=True),
-        [BEVPanel("From above", _elements([*lines, *wedges]))],
-        BEVGrid(*RANGES[frame]),
-        frame_view(frame, ground_z_m).with_mounting(sample.ego_from_frame),
-        style,
-        _elements(lines),
-        f"ground plane of {sample.token}",
+        cameras=camera_views(sample.cameras, data_root, sample.token, grey=True),
+        panels=[BEVPanel("From above", _elements([*lines, *wedges]))],
+        grid=BEVGrid(x_range, y_range),
+        view=frame_view(frame, ground_z_m).with_mounting(sample.ego_from_frame),
+        style=MapStyle(classes=_LINES),
+        camera_elements=_elements(lines),
+        title=f"ground plane of {sample.token}",
         width_px=_WIDTH_PX,
     )
 
 
 def _elements(lines: Sequence[tuple[str, np.ndarray]]) -> MapElements:
-    return MapElements.from_polylines(
-        [points for _, points in lines], [_LINES.index(name) for name, _ in lines]
-    )
+    """Lines as map elements, whose labels are positions in ``_LINES``."""
+    polylines = [points for _, points in lines]
+    labels = [_LINES.index(name) for name, _ in lines]
+    return MapElements.from_polylines(polylines, labels)
 
 
 def _ground_lines(frame_from_ground: np.ndarray) -> list[tuple[str, np.ndarray]]:
-    """Return lines on the road, in the annotation frame. each (name, (n, 3))"""
+    """Lines on the road, in the annotation frame, in metres. each (name, (2, 3))"""
     reach = _REACH_M
-    steps = [s for s in np.arange(-reach, reach + 1, 5.0) if s]
-    ends = [("every_5_m", (s, -15.0), (s, 15.0)) for s in steps]
-    ends += [("every_5_m", (-reach, s), (reach, s)) for s in steps if abs(s) <= 15]
-    ends += [("ahead", (0.0, 0.0), (reach, 0.0)), ("behind", (0.0, 0.0), (-reach, 0.0))]
-    ends += [("left", (0.0, 0.0), (0.0, 15.0)), ("right", (0.0, 0.0), (0.0, -15.0))]
-    return [
-        (name, (np.array([[*a, 0, 1], [*b, 0, 1]]) @ frame_from_ground.T)[:, :3])
-        for name, a, b in ends
-    ]
+    side = 15.0
+    ends = []
+    offsets = [offset for offset in np.arange(-reach, reach + 1, 5.0) if offset]
+    for x in offsets:
+        ends.append(("every_5_m", (x, -side), (x, side)))
+    for y in offsets:
+        if abs(y) <= side:
+            ends.append(("every_5_m", (-reach, y), (reach, y)))
+    ends.append(("ahead", (0.0, 0.0), (reach, 0.0)))
+    ends.append(("behind", (0.0, 0.0), (-reach, 0.0)))
+    ends.append(("left", (0.0, 0.0), (0.0, side)))
+    ends.append(("right", (0.0, 0.0), (0.0, -side)))
+    lines = []
+    for name, (start_x, start_y), (end_x, end_y) in ends:
+        points = np.array([[start_x, start_y, 0, 1], [end_x, end_y, 0, 1]])
+        lines.append((name, (points @ frame_from_ground.T)[:, :3]))
+    return lines
 
 
 def _wedge(camera: CameraRecord, frame_from_ground: np.ndarray) -> np.ndarray:
-    """Return the outline of what a camera sees within 6 m, on the road. (4, 3)"""
-    k = camera.intrinsics
-    rays = [[(u - k[0, 2]) / k[0, 0], 0, 1] for u in (0, camera.width)]
-    pose = invert_rigid(camera.cam_from_frame @ frame_from_ground)
-    tips = [pose[:3, 3] + 6 * (ray := pose[:3, :3] @ r) / np.linalg.norm(ray) for r in rays]
-    outline = np.array([pose[:3, 3], *tips, pose[:3, 3]])
+    """Outline of a camera's field of view up to 6 m, on the road, in the frame. (4, 3)"""
+    intrinsics = camera.intrinsics
+    ground_from_cam = invert_rigid(camera.cam_from_frame @ frame_from_ground)
+    rotation = ground_from_cam[:3, :3]
+    centre = ground_from_cam[:3, 3]
+    tips = []
+    for u in (0, camera.width):
+        ray = rotation @ [(u - intrinsics[0, 2]) / intrinsics[0, 0], 0, 1]
+        tips.append(centre + 6 * ray / np.linalg.norm(ray))
+    outline = np.array([centre, *tips, centre])
     outline[:, 2] = 0
     return np.column_stack([outline, np.ones(4)]) @ frame_from_ground.T[:, :3]

@@ -1,9 +1,8 @@
-"""Check annotation files completely: their own content, and the files that they name."""
+"""Complete check of annotation files, and of the images and LiDAR sweeps that they name."""
 
 import argparse
 from collections.abc import Sequence
 from functools import partial
-from itertools import chain
 from pathlib import Path
 
 import pyarrow as pa
@@ -20,11 +19,16 @@ from gsmap.utils.progress import Progress
 from gsmap.utils.words import counted
 from mapdata.command_line import add_workers_option
 
-_SHOWN = 10
+_MOST_PROBLEMS = 10  # in a message
 
 
 def _open(path: Path) -> AnnotationFile:
-    """Open an annotation file, which checks it, and compare what its footer leads to."""
+    """Open and check an annotation file, and compare its parts with its footer.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If the file is damaged.
+    """
     file = AnnotationFile(path)
     try:
         reader = pa.ipc.open_file(pa.memory_map(str(path)))
@@ -42,66 +46,80 @@ def _open(path: Path) -> AnnotationFile:
 
 
 def _broken_files(sample: MapSample, root: Path) -> list[str]:
-    """Read every file that a sample names, and return what is wrong with them."""
+    """Read every file that a sample names, and return a description of each broken file."""
     from gsmap.datasets.transforms.points import read_points
 
-    where, problems = f"sample {sample.token!r}", []
-    reads = [
-        partial(read_image, str(root / c.path), f"{where}, camera {c.name}", (c.width, c.height))
-        for c in sample.cameras
-    ]
-    lidar = sample.lidar
-    paths = [lidar.path, *(sweep.path for sweep in lidar.sweeps)] if lidar else []
-    reads += [partial(read_points, str(root / path), 5) for path in paths]
-    for read in reads:
+    problems = []
+    for camera in sample.cameras:
+        where = f"sample {sample.token!r}, camera {camera.name}"
         try:
-            read()
+            read_image(str(root / camera.path), where, size=(camera.width, camera.height))
+        except BrokenSampleError as error:
+            problems.append(str(error))
+    lidar_paths = []
+    if sample.lidar:
+        lidar_paths.append(sample.lidar.path)
+        lidar_paths += [sweep.path for sweep in sample.lidar.sweeps]
+    for path in lidar_paths:
+        try:
+            read_points(str(root / path), load_dim=5)
         except BrokenSampleError as error:
             problems.append(str(error))
     return problems
 
 
-def _doubts(file: AnnotationFile) -> list[str]:
-    """Count the elements, and say what is implausible about them and the cameras."""
-    counts, meta = file.instance_counts(), file.meta
-    known = counts[counts >= 0]
+def _describe_content(file: AnnotationFile) -> list[str]:
+    """Number of the elements, and warnings about implausible elements and cameras."""
+    counts = file.instance_counts()
+    counts = counts[counts >= 0]  # without samples whose ground truth is not known
     lines = []
-    if len(known):
+    if len(counts):
+        elements = counted(int(counts.sum()), "map element")
         lines.append(
-            f"{counted(int(known.sum()), 'map element')}, up to {known.max()} in a sample (a model "
-            "needs at least as many queries)"
+            f"{elements}, up to {counts.max()} in a sample (a model needs at least as many queries)"
         )
-        if empty := int((known == 0).sum()):
+        empty = int((counts == 0).sum())
+        if empty:
             lines.append(
-                f"warning: {empty} of {counted(len(known), 'sample')} have no element in the range:"
-                " are points in metres of the frame, not of the world?"
+                f"warning: {empty} of {counted(len(counts), 'sample')} have no element in the "
+                "range: are points in metres of the frame, not of the world?"
             )
-    doubts = calibration_warnings(file, meta.frame, meta.ground_z_m)
-    return lines + [f"warning: calibration: {line}" for line in doubts]
+    for warning in calibration_warnings(file, file.meta.frame, file.meta.ground_z_m):
+        lines.append(f"warning: calibration: {warning}")
+    return lines
 
 
 def check_files(paths: Sequence[Path], root: Path | None, workers: int) -> str:
     """Check annotation files and, with a data root, the images and sweeps that they name.
 
-    Returns what was found to be right.
+    Args:
+        paths: Annotation files.
+        root: Folder that paths of images and sweeps are relative to; None does not read them.
+        workers: Number of processes that read images and sweeps.
+
+    Returns:
+        Report of the checks, with warnings.
 
     Raises:
         FileNotFoundError: If an annotation file does not exist.
-        ValueError: If something is wrong; the message names the first few files.
+        ValueError: If a file is damaged or missing; the message names the first few files.
     """
     lines = []
     for path in paths:
         file = _open(path)
         mark = "checksum right" if file.sealed else "no checksum, as it is of an earlier version"
-        lines += [f"{path}: {line}" for line in _doubts(file)]
+        lines += [f"{path}: {line}" for line in _describe_content(file)]
         lines.append(f"{path}: {counted(len(file), 'sample')}, values right, {mark}")
         if root is not None:
             samples = Progress(file, desc=path.name, unit="samples")
-            found = ordered_map(partial(_broken_files, root=root), samples, workers)
-            if problems := list(chain.from_iterable(found)):
-                more = f", and {len(problems) - _SHOWN} more" if len(problems) > _SHOWN else ""
-                shown = "; ".join(problems[:_SHOWN])
-                raise InputError(f"{path} is right, but: {shown}{more}")
+            problems = []
+            for sample_problems in ordered_map(partial(_broken_files, root=root), samples, workers):
+                problems += sample_problems
+            if problems:
+                text = "; ".join(problems[:_MOST_PROBLEMS])
+                if len(problems) > _MOST_PROBLEMS:
+                    text += f", and {len(problems) - _MOST_PROBLEMS} more"
+                raise InputError(f"{path} is right, but: {text}")
             lines[-1] += ", images and LiDAR files whole"
     return "\n".join(lines)
 
@@ -115,5 +133,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> str:
-    """Check as the command line asks and say what is right."""
+    """Run the command ``check`` and return its report."""
     return check_files(arguments.annotations, arguments.data_root, arguments.workers)

@@ -1,4 +1,4 @@
-"""What the commands that make data share: options, and where files go."""
+"""Options and output paths of the commands that create data."""
 
 import argparse
 import hashlib
@@ -18,10 +18,22 @@ Options = TypeVar("Options")
 
 @dataclass(frozen=True)
 class FileOptions:
-    """What every converter of a data set to annotation files is told.
+    """Options of every converter from a data set to annotation files.
 
-    Paths are relative to ``root``, classes are in label order, and ``command`` is the command line,
-    for messages of readers. The others are the options of ``add_file_options``.
+    Args:
+        root: Folder of the data set, which paths in annotation files are relative to.
+        classes: Classes of map elements, in label order.
+        x_range: Smallest and largest x of the ground truth in the frame, in metres.
+        y_range: Smallest and largest y of the ground truth in the frame, in metres.
+        max_sweeps: Number of earlier LiDAR sweeps per sample.
+        out_dir: Folder of the annotation files; None takes ``root``.
+        tag: Suffix of the file names, such as ``_extended``.
+        workers: Number of processes.
+        shard: Part of the samples to convert.
+        command: Command line, which messages about the files quote.
+        split_name: Name of a published split; empty takes the official one.
+        split_file: File with splits in place of a published one.
+        allow_missing: Whether scenes of a published split may be missing.
     """
 
     root: Path
@@ -40,22 +52,32 @@ class FileOptions:
     allow_missing: bool = False
 
     def meta(self, dataset: str, frame: str, split: str, **more: Any) -> AnnotationMeta:
-        """Describe a split's annotation file; ``more`` are further fields."""
+        """Create the description of a split's annotation file.
+
+        Args:
+            dataset: Name of the data set.
+            frame: Annotation frame, ``lidar`` or ``ego``.
+            split: Name of the split.
+            **more: Further fields of ``AnnotationMeta``.
+
+        Returns:
+            The description.
+        """
         return AnnotationMeta(
-            dataset,
-            frame,
-            split,
-            self.classes,
-            self.x_range,
-            self.y_range,
+            dataset=dataset,
+            frame=frame,
+            split=split,
+            classes=self.classes,
+            x_range=self.x_range,
+            y_range=self.y_range,
             command=self.command,
             **more,
         )
 
     def path_of(self, dataset: str, split: str) -> Path:
-        """Return where a split goes: ``gsmap_<dataset>_<split><tag>.arrow``.
+        """Path of a split's annotation file: ``gsmap_<dataset>_<split><tag>.arrow``.
 
-        Without a tag, files of a published split end in its name.
+        Without a tag, the file name of a published split ends in its name.
         """
         tag = self.tag or (f"_{self.split_name}" if self.split_name else "")
         name = file_name(f"gsmap_{dataset}_{split}{tag}")
@@ -63,20 +85,30 @@ class FileOptions:
 
 
 def fingerprint(sizes: Mapping[str, int], contents: Iterable[Path] = ()) -> str:
-    """Return a digest of what a file is made from: names with their sizes, and whole files."""
-    digest = hashlib.sha256("".join(f"{name} {size}\n" for name, size in sizes.items()).encode())
+    """Digest of the sources of a file.
+
+    Args:
+        sizes: Number of records by name.
+        contents: Files whose content is part of the digest.
+
+    Returns:
+        16 hexadecimal digits.
+    """
+    digest = hashlib.sha256()
+    for name, size in sizes.items():
+        digest.update(f"{name} {size}\n".encode())
     for path in contents:
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
 
 def add_file_options(parser: argparse.ArgumentParser, frame: str, max_sweeps: int) -> None:
-    """Add what every converter of a data set asks.
+    """Add the options of every converter of a data set.
 
     Args:
-        parser: Gets the options.
-        frame: Annotation frame, whose usual range is the default.
-        max_sweeps: Default of the number of earlier LiDAR sweeps per sample.
+        parser: Parser of the command, changed in place.
+        frame: Annotation frame, ``lidar`` or ``ego``, whose usual range is the default.
+        max_sweeps: Default number of earlier LiDAR sweeps per sample.
     """
     add = parser.add_argument
     add_range_options(parser, RANGES[frame])
@@ -89,7 +121,7 @@ def add_file_options(parser: argparse.ArgumentParser, frame: str, max_sweeps: in
 
 
 def add_split_options(parser: argparse.ArgumentParser, names: tuple[str, ...]) -> None:
-    """Add which list of scenes to take; ``names`` are those of the published ones."""
+    """Add the options that select a split; ``names`` are the published splits."""
     add = parser.add_argument
     text = f"a published split by place: {', '.join(names)}"
     add("--split-name", default="", choices=names, metavar="NAME", help=text)
@@ -101,7 +133,7 @@ def add_split_options(parser: argparse.ArgumentParser, names: tuple[str, ...]) -
 def add_range_options(
     parser: argparse.ArgumentParser, ranges: tuple[tuple[float, float], ...] | None
 ) -> None:
-    """Add the range of the ground truth; None leaves the default to the command."""
+    """Add the options for the range of the ground truth; the command sets a default of None."""
     for axis, name in enumerate("xy"):
         default = ranges and ranges[axis]
         usual = f"{default[0]:g} {default[1]:g}" if default else "the data set's usual"
@@ -112,13 +144,13 @@ def add_range_options(
 
 
 def add_workers_option(parser: argparse.ArgumentParser) -> None:
-    """Add the number of processes."""
+    """Add the option for the number of processes."""
     cores = default_workers()
     parser.add_argument("--workers", type=int, default=cores, help="processes (default: all cores)")
 
 
 def add_log_options(parser: argparse.ArgumentParser, usual_rate: str) -> None:
-    """Add which Argoverse 2 logs to take, and how often per second; nothing given is no entry."""
+    """Add the options that select Argoverse 2 logs and their rate, which has no default entry."""
     add = parser.add_argument
     add("--root", type=Path, required=True, help="folder that holds train, val and test")
     add("--split", default="val", choices=("train", "val", "test"))
@@ -129,7 +161,11 @@ def add_log_options(parser: argparse.ArgumentParser, usual_rate: str) -> None:
 
 
 def parse_rate(text: str) -> float | None:
-    """Read samples per second, such as ``2.5hz`` or ``2``; ``all`` gives None."""
+    """Parse samples per second, such as ``2.5hz`` or ``2``; ``all`` gives None.
+
+    Raises:
+        ValueError: If the text is no rate > 0.
+    """
     if text.lower() == "all":
         return None
     rate = float(text.lower().removesuffix("hz"))
@@ -139,10 +175,20 @@ def parse_rate(text: str) -> float | None:
 
 
 def options_from(kind: type[Options], arguments: argparse.Namespace, **more: Any) -> Options:
-    """Build a dataclass of options from the arguments that have the names of its fields.
+    """Build a dataclass of options from the arguments with the names of its fields.
 
-    Lists become tuples; ``more`` are fields that come before the arguments.
+    Args:
+        kind: The dataclass.
+        arguments: Arguments of a command. Lists become tuples.
+        **more: Values that override the arguments.
+
+    Returns:
+        The options; fields without an argument have their default.
     """
-    given = vars(arguments) | more
-    names = {field.name for field in fields(kind)} & given.keys()  # type: ignore[arg-type]
-    return kind(**{n: tuple(v) if isinstance(v := given[n], list) else v for n in names})
+    values = vars(arguments) | more
+    options = {}
+    for field in fields(kind):  # type: ignore[arg-type]
+        if field.name in values:
+            value = values[field.name]
+            options[field.name] = tuple(value) if isinstance(value, list) else value
+    return kind(**options)

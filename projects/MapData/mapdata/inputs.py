@@ -1,4 +1,4 @@
-"""From whatever holds a recording to samples: the one entrance to the readers of this room."""
+"""Samples of any input: selects the reader for a file or a folder."""
 
 from pathlib import Path
 
@@ -30,16 +30,17 @@ def open_input(path: str | Path, options: InputOptions | None = None) -> Source:
         path: An annotation file, an info file of mmdet3d, a nuScenes-format root, an Argoverse 2
             log or a folder with some, a folder of images with a calibration file (or that file), a
             bag, or a folder with just one annotation or info file.
-        options: How to read it.
+        options: Options of the readers; None takes the defaults.
 
     Returns:
-        Its samples.
+        The samples.
 
     Raises:
-        FileNotFoundError: If there is nothing there, or what it names.
-        ValueError: If it is none of these, or damaged; the message says why.
+        FileNotFoundError: If the input does not exist, or a file that it names.
+        ValueError: If it is no such input, or damaged; the message names the reason.
     """
-    path, options = Path(path), options or InputOptions()
+    path = Path(path)
+    options = options or InputOptions()
     if not path.exists():
         raise FileNotFoundError(f"There is no input {path}.")
     may_be_bag = is_bag(path) or (path.is_dir() and bool(parts_in(path)))
@@ -62,13 +63,14 @@ def open_input(path: str | Path, options: InputOptions | None = None) -> Source:
         return Source(samples, "lidar", root)
     if path.suffix in (".yaml", ".yml", ".json"):
         return read_image_folder(path, options.frames_dir, options.trained)
-    if advice := suffix_advice(path):
+    advice = suffix_advice(path)
+    if advice:
         raise InputError(f"{path} cannot be used: {advice}.")
     raise InputError(f"{path} is no input: it must be {KINDS}.")
 
 
 def _open_folder(folder: Path, options: InputOptions) -> Source:
-    """Read a folder by what lies in it."""
+    """Read the samples of a folder, with the reader for its content."""
     if versions_in(folder):
         samples, notes = read_nuscenes(folder, options.version)
         return Source(samples, "lidar", folder, notes=notes)
@@ -76,12 +78,15 @@ def _open_folder(folder: Path, options: InputOptions) -> Source:
     if logs:
         root = folder.parent if logs == [folder] else folder
         samples, left_out = read_logs(logs, root, options.rate_hz)
-        used = f"{len(samples)} samples used, left out"
-        notes = tuple(f"{used}: {count} for {reason}" for reason, count in left_out.items())
-        return Source(samples, "ego", root, notes=notes)
+        log_notes = []
+        for reason, count in left_out.items():
+            log_notes.append(f"{len(samples)} samples used, left out: {count} for {reason}")
+        return Source(samples, "ego", root, notes=tuple(log_notes))
     files = [folder / name for name in NAMES if (folder / name).is_file()]
-    found = (path for pattern in _FILES for path in folder.glob(pattern) if not is_hidden(path))
-    files = files or sorted(found)
+    if not files:
+        for pattern in _FILES:
+            files += [path for path in folder.glob(pattern) if not is_hidden(path)]
+        files.sort()
     if len(files) == 1:
         return open_input(files[0], options)
     if files:

@@ -1,4 +1,4 @@
-"""How recordings of any kind are read."""
+"""Options of the readers of recordings."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -7,23 +7,24 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class InputOptions:
-    """How inputs are read; each kind reads what concerns it.
+    """Options of the readers of inputs; each reader ignores options of other kinds of inputs.
 
     Args:
-        data_root: Folder that paths of an annotation or info file start from.
+        data_root: Folder that paths of an annotation or info file are relative to.
         allow_missing_cameras: Whether an info file may name images that do not exist.
-        version: Version folder of a nuScenes-format root; the only one by default.
+        version: Version folder of a nuScenes-format root; None takes the only one.
         rate_hz: Samples per second of Argoverse 2 logs and bags; None takes all.
-        frames_dir: Folder for images that have to be made, a bag's and those of distorted cameras,
-            in a folder for each input.
-        vehicle_frame: The vehicle's frame (x ahead, y left, z up) in a bag's transforms;
-            ``base_footprint`` or ``base_link`` by default.
-        vehicle_ground_z_m: Height of the road in that frame; None is 0.
-        topics: Topics of images and camera info of a bag, by camera (``parse_topics``).
-        trained: By camera, what a model was trained on (``load_model(...).rig``): images of
-            distorted cameras of these names are rectified to those focal lengths.
-        calibration: Calibration file of a bag's cameras, in place of their infos and transforms;
-            their names are those of the topics, or its ``images`` are topics.
+        frames_dir: Folder for images that have to be written: images of bags, and rectified images
+            of distorted cameras. Each input gets a folder in it.
+        vehicle_frame: Name of the vehicle's frame (x ahead, y left, z up) in a bag's transforms;
+            None takes ``base_footprint`` or ``base_link``.
+        vehicle_ground_z_m: Height of the road in that frame in metres; None is 0.
+        topics: Topics of the images and of the camera info of a bag, by camera (``parse_topics``).
+        trained: Width, height, fx, fy, cx and cy of the cameras that a model was trained on, by
+            name (``load_model(...).rig``). Images of distorted cameras with these names are
+            rectified to them.
+        calibration: Calibration file of a bag's cameras, in place of their camera info and
+            transforms. Its cameras are named as the topics, or their ``images`` are topics.
     """
 
     data_root: Path | None = None

@@ -1,10 +1,11 @@
-"""Places that training and validation share: of each sample the distance to the nearest training.
+"""Overlap of training and validation: distances of samples to the nearest training sample.
 
-``tools/create_data.py overlap`` reports and draws them.
+``tools/create_data.py overlap`` reports and draws it.
 """
 
 import argparse
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,21 +23,21 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 OVERLAP_DISTANCE_M = 5.0
-_DISTANCES_M = (5.0, 15.0, 30.0, 60.0)  # of the report; 30 and 60: patches of 60 x 30 m can meet
-# (x, y) in metres of the samples of each split, by map name
+_DISTANCES_M = (5.0, 15.0, 30.0, 60.0)  # of the report; patches of 60 x 30 m can meet at 30 and 60
+# (x, y) of samples in metres, by split and map name
 Positions = Mapping[str, Mapping[str, list[np.ndarray]]]
 _ByMap = Mapping[str, Sequence[np.ndarray] | np.ndarray]
 
 
 @dataclass(frozen=True)
 class Places:
-    """Where the samples of annotation files are; token, scene and map name of each.
+    """Positions of the samples of annotation files.
 
     Args:
-        tokens: Tokens. (n,)
-        scenes: Scenes. (n,)
-        maps: Names of maps. (n,)
-        positions: (x, y) in metres on the map. (n, 2)
+        tokens: Token of each sample. (n,)
+        scenes: Scene of each sample. (n,)
+        maps: Name of the map of each sample. (n,)
+        positions: (x, y) of each sample on its map, in metres. (n, 2)
     """
 
     tokens: np.ndarray
@@ -45,123 +46,166 @@ class Places:
     positions: np.ndarray
 
     def by_map(self) -> dict[str, np.ndarray]:
-        """Return the rows of each map, by its name."""
+        """Rows of the samples on each map, ascending, by its name."""
         return {str(name): np.flatnonzero(self.maps == name) for name in np.unique(self.maps)}
+
+    def select(self, rows: np.ndarray) -> "Places":
+        """Select samples by their rows, or by a mask. (m,) or (n,) bool"""
+        return Places(
+            tokens=self.tokens[rows],
+            scenes=self.scenes[rows],
+            maps=self.maps[rows],
+            positions=self.positions[rows],
+        )
 
 
 def read_places(paths: Sequence[Path]) -> Places:
-    """Read the places of annotation files.
+    """Read the positions of the samples of annotation files.
 
     Raises:
         FileNotFoundError: If a file does not exist.
-        ValueError: If it is damaged, or does not know poses or maps.
+        ValueError: If a file is damaged, or has no poses or no map names.
     """
-    columns: list[list[str]] = [[], [], []]
+    tokens: list[str] = []
+    scenes: list[str] = []
+    maps: list[str] = []
     positions = [np.empty((0, 2))]
     for path in paths:
         file = AnnotationFile(path)
-        found = [file.column(name) for name in ("token", "scene", "map_name")]
-        if not file.meta.options.get("poses", True) or found[1] == found[2]:
+        file_scenes = file.column("scene")
+        file_maps = file.column("map_name")
+        if not file.meta.options.get("poses", True) or file_scenes == file_maps:
             raise InputError(
                 f"{path} does not say where its samples are on common maps: make it from the data "
                 "set itself, not from info files or pictures."
             )
-        for column, values in zip(columns, found, strict=True):
-            column += values
+        tokens += file.column("token")
+        scenes += file_scenes
+        maps += file_maps
         poses = np.array(file.column("global_from_frame"), np.float64).reshape(-1, 4, 4)
         positions.append(poses[:, :2, 3])
-    tokens, scenes, maps = (np.array(column, str) for column in columns)
-    return Places(tokens, scenes, maps, np.concatenate(positions))
+    return Places(
+        tokens=np.array(tokens, str),
+        scenes=np.array(scenes, str),
+        maps=np.array(maps, str),
+        positions=np.concatenate(positions),
+    )
 
 
 def nearest_by_map(train: _ByMap, val: _ByMap) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Find the nearest training position of each validation position on the same map.
 
     Args:
-        train: (x, y) in metres by map name, each (n, 2).
-        val: Likewise.
+        train: (x, y) of the training samples in metres, by map name. each (n, 2)
+        val: (x, y) of the validation samples in metres, by map name. each (m, 2)
 
     Returns:
-        By map name distances in metres, infinite without training there, and rows of ``train``.
-        2 x (m,)
+        By the name of each map with validation, distances in metres (m,), infinite without training
+        on the map, and rows of ``train`` (m,).
     """
-    nothing = np.empty((0, 2))
-    return {
-        name: cKDTree(train[name] if len(train.get(name, ())) else nothing).query(positions)
-        for name, positions in val.items()
-        if len(positions)
-    }
+    nearest = {}
+    for name, positions in val.items():
+        if len(positions):
+            has_training = len(train.get(name, ())) > 0
+            tree = cKDTree(train[name] if has_training else np.empty((0, 2)))
+            nearest[name] = tree.query(positions)
+    return nearest
 
 
 def overlap_share(train: _ByMap, val: _ByMap) -> float:
-    """Return the share of validation positions within 5 m of a training position on the same map.
+    """Share of the validation positions within 5 m of a training position on the same map.
 
-    Positions are (x, y) in metres by map name, each (n, 2). Without any the share is 0.
+    Args:
+        train: (x, y) of the training samples in metres, by map name. each (n, 2)
+        val: (x, y) of the validation samples in metres, by map name. each (m, 2)
+
+    Returns:
+        The share in [0, 1]; 0 without validation.
     """
     distances = [distance for distance, _ in nearest_by_map(train, val).values()]
-    return float((np.concatenate(distances) <= OVERLAP_DISTANCE_M).mean()) if distances else 0.0
+    if not distances:
+        return 0.0
+    return float((np.concatenate(distances) <= OVERLAP_DISTANCE_M).mean())
 
 
 def overlap_notes(positions: Positions) -> list[str]:
-    """Say, if so, how many validation samples lie near a training sample."""
-    train = next((s for s in positions if s.endswith("train")), "")
-    val = next((s for s in positions if s.endswith("val")), "")
-    share = overlap_share(positions[train], positions[val]) if train and val else 0.0
+    """Warning about validation samples near a training sample; none if no sample is near."""
+    train = next((split for split in positions if split.endswith("train")), "")
+    val = next((split for split in positions if split.endswith("val")), "")
+    if not train or not val:
+        return []
+    share = overlap_share(positions[train], positions[val])
+    if not share:
+        return []
     warning = (
         f"warning: {share:.1%} of the {val} samples lie within 5 m of a {train} sample: "
         "scores on them say little about new places. docs/data.md names disjoint splits."
     )
-    return [warning] if share else []
+    return [warning]
 
 
 def sample_overlap(train: Places, val: Places) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distance of each validation sample to the nearest training, and its row. 2 x (m,)
+    """Find the nearest training sample of each validation sample on the same map.
 
-    Distances are metres, infinite on maps without training, where the row is -1.
+    Args:
+        train: Positions of the training samples.
+        val: Positions of the validation samples.
+
+    Returns:
+        Distance of each validation sample in metres (m,), and the row of its nearest training
+        sample (m,); infinite and -1 on maps without training.
     """
-    distance, nearest = np.full(len(val.tokens), np.inf), np.full(len(val.tokens), -1)
-    of_train, of_val = train.by_map(), val.by_map()
-    found = nearest_by_map(
-        *(
-            {name: places.positions[rows] for name, rows in by_map.items()}
-            for places, by_map in ((train, of_train), (val, of_val))
-        )
-    )
-    for name, (apart, rows) in found.items():
-        distance[of_val[name]] = apart
-        if name in of_train:
-            nearest[of_val[name]] = of_train[name][rows]
+    distance = np.full(len(val.tokens), np.inf)
+    nearest = np.full(len(val.tokens), -1)
+    train_rows = train.by_map()
+    val_rows = val.by_map()
+    train_positions = {name: train.positions[rows] for name, rows in train_rows.items()}
+    val_positions = {name: val.positions[rows] for name, rows in val_rows.items()}
+    for name, (distances, rows) in nearest_by_map(train_positions, val_positions).items():
+        distance[val_rows[name]] = distances
+        if name in train_rows:
+            nearest[val_rows[name]] = train_rows[name][rows]
     return distance, nearest
 
 
 def draw_overlap(train: Places, val: Places, distance_m: np.ndarray) -> "Figure":
-    """Draw a panel per map: training grey, validation dark, or red within 5 m of training.
+    """Draw a panel per map: training grey, validation blue, or red within 5 m of training.
 
     Args:
-        train: Places of training.
-        val: Places of validation.
-        distance_m: Distance of each validation sample to training. (m,)
+        train: Positions of the training samples.
+        val: Positions of the validation samples.
+        distance_m: Distance of each validation sample to training, in metres. (m,)
+
+    Returns:
+        The figure.
     """
     from gsmap.visualization.plots import finish_panel, panel_grid
 
     names = sorted({*train.by_map(), *val.by_map()})
     columns = min(len(names), 3)
-    figure, axes = panel_grid(-(-len(names) // columns), columns)
+    rows = math.ceil(len(names) / columns)
+    figure, axes = panel_grid(rows, columns)
     near = distance_m <= OVERLAP_DISTANCE_M
+    layers = (
+        ("training", train, "#C3C9D1"),
+        ("validation", val.select(~near), "#1F6FB2"),
+        ("validation within 5 m", val.select(near), "#C8321E"),
+    )
     for ax, name in zip(axes.flat, names, strict=False):
-        parts = (
-            ("training", train, np.ones(len(train.tokens), bool), "#C3C9D1"),
-            ("validation", val, ~near, "#1F6FB2"),
-            ("validation within 5 m", val, near, "#C8321E"),
-        )
-        for label, places, chosen, colour in parts:
-            at = places.positions[chosen & (places.maps == name)]
-            legend = label if name == names[0] else None
-            ax.scatter(*at.T, s=1.5, color=colour, label=legend, linewidths=0, rasterized=True)
+        for label, places, colour in layers:
+            positions = places.positions[places.maps == name]
+            ax.scatter(
+                positions[:, 0],
+                positions[:, 1],
+                s=1.5,
+                color=colour,
+                label=label if name == names[0] else None,
+                linewidths=0,
+                rasterized=True,
+            )
         ax.set_aspect("equal", "datalim")
-        finish_panel(
-            ax, name.replace("$", "") or "map", "x (m)", "y (m)", legend={"markerscale": 5}
-        )
+        title = name.replace("$", "") or "map"
+        finish_panel(ax, title, "x (m)", "y (m)", legend={"markerscale": 5})
     for ax in axes.flat[len(names) :]:
         ax.set_axis_off()
     return figure
@@ -177,34 +221,37 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> str:
-    """Report what validation shares with training, sample by sample."""
-    train, val = read_places([arguments.train]), read_places([arguments.val])
+    """Run the command ``overlap`` and return its report."""
+    train = read_places([arguments.train])
+    val = read_places([arguments.val])
     if not len(val.tokens):
         raise InputError(f"{arguments.val} has no sample.")
     distance, nearest = sample_overlap(train, val)
-    shared = len({*train.scenes} & {*val.scenes})
-    lines = [f"{len(val.tokens)} samples against {len(train.tokens)}; {shared} scenes are in both"]
-    lines += [
-        f"{(distance <= limit).mean():7.1%} within {limit:g} m of a training sample"
-        for limit in _DISTANCES_M
-    ]
+    common = len({*train.scenes} & {*val.scenes})
+    lines = [f"{len(val.tokens)} samples against {len(train.tokens)}; {common} scenes are in both"]
+    for limit_m in _DISTANCES_M:
+        share = (distance <= limit_m).mean()
+        lines.append(f"{share:7.1%} within {limit_m:g} m of a training sample")
     for name, rows in val.by_map().items():
         share = (distance[rows] <= OVERLAP_DISTANCE_M).mean()
         lines.append(f"{share:7.1%} of {len(rows)} within 5 m on map {name!r}")
     if arguments.out:
-        entries = zip(val.tokens, val.scenes, val.maps, distance, nearest, strict=True)
-        samples = [
-            {
-                "token": str(token), "scene": str(scene), "map": str(name),
-                "distance_m": round(float(apart), 3) if row >= 0 else None,
-                "nearest": str(train.tokens[row]) if row >= 0 else None,
+        samples = []
+        for number, row in enumerate(nearest):
+            has_training = row >= 0
+            sample = {
+                "token": str(val.tokens[number]),
+                "scene": str(val.scenes[number]),
+                "map": str(val.maps[number]),
+                "distance_m": round(float(distance[number]), 3) if has_training else None,
+                "nearest": str(train.tokens[row]) if has_training else None,
             }
-            for token, scene, name, apart, row in entries
-        ]  # fmt: skip
+            samples.append(sample)
         write_text(arguments.out, json.dumps(samples, indent=1) + "\n")
         lines.append(f"samples: {arguments.out}")
     if arguments.plot:
         from gsmap.visualization.figure import save_figure
 
-        lines.append(f"map: {save_figure(draw_overlap(train, val, distance), arguments.plot)}")
+        figure = draw_overlap(train, val, distance_m=distance)
+        lines.append(f"map: {save_figure(figure, arguments.plot)}")
     return "\n".join(lines)

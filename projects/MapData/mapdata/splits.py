@@ -1,4 +1,4 @@
-"""Which scenes belong to which split: published lists by name, lists in files, official ones."""
+"""Splits of a data set: published lists of scenes, and lists in files."""
 
 import re
 from collections.abc import Collection, Mapping
@@ -22,9 +22,9 @@ class SplitList:
     """The scenes of each part of a split, such as ``train`` and ``val``, by name or token.
 
     Args:
-        name: What the list is called.
-        scenes: Scenes by part.
-        complete: Whether the data set must have all of them, for figures that compare with others.
+        name: Name of the list.
+        scenes: Names or tokens of scenes, by part.
+        complete: Whether the data set must have all scenes, so that results are comparable.
     """
 
     name: str
@@ -33,14 +33,23 @@ class SplitList:
 
     @cached_property
     def identity(self) -> str:
-        """Name and digest, as annotation files have it."""
+        """Name and digest of the list, for annotation files."""
         return list_identity(self.name, self.scenes)
 
     def missing_note(self, missing: Collection[str], total: int, where: str, allowed: bool) -> str:
-        """Say that scenes are not there.
+        """Note on missing scenes.
+
+        Args:
+            missing: Names or tokens of the missing scenes.
+            total: Number of scenes of all parts.
+            where: Name of the data set, for the note.
+            allowed: Whether scenes of a complete list may be missing.
+
+        Returns:
+            The note.
 
         Raises:
-            ValueError: If all must be there, and it is not ``allowed`` that some are missing.
+            ValueError: If the list is complete, and missing scenes are not ``allowed``.
         """
         known = f"{total - len(missing)} of the {total} scenes of the splits are in {where}"
         if self.complete and not allowed:
@@ -53,69 +62,103 @@ class SplitList:
 
 
 def _families() -> list[str]:
-    """Names of the files of published lists, the oldest list first."""
-    names = [Path(file.name).stem for file in files("mapdata").joinpath("split_lists").iterdir()]
-    return sorted(names, reverse=True)
+    """Names of the files of published lists, in reverse alphabetical order."""
+    folder = files("mapdata").joinpath("split_lists")
+    return sorted((Path(file.name).stem for file in folder.iterdir()), reverse=True)
 
 
 def split_names(dataset: str) -> tuple[str, ...]:
-    """Return the names of the published splits of a data set, ``nuscenes`` or ``av2``."""
-    return tuple(name for family in _families() for name in _family(family)[dataset]["splits"])
+    """Names of the published splits of a data set, ``nuscenes`` or ``av2``."""
+    names: list[str] = []
+    for family in _families():
+        names += _read_family(family)[dataset]["splits"]
+    return tuple(names)
 
 
-def _family(name: str) -> Any:
-    """Read a file of lists: groups of scenes, and the groups of each part of its splits."""
+def _read_family(name: str) -> Any:
+    """Read a file of published lists.
+
+    It holds, by data set, groups of scenes (``scenes``), and the names of the groups in each part
+    of its splits (``splits``).
+    """
     return read_json(Path(str(files("mapdata").joinpath(f"split_lists/{name}.json"))))
 
 
 def published_split(name: str, dataset: str) -> SplitList:
-    """Return a published split of a data set; ValueError if there is none of this name."""
+    """Read a published split of a data set, ``nuscenes`` or ``av2``.
+
+    Raises:
+        ValueError: If there is no split with this name.
+    """
     for family in _families():
-        lists = _family(family)[dataset]
+        lists = _read_family(family)[dataset]
         if name in lists["splits"]:
-            parts = lists["splits"][name].items()
-            scenes = {p: [s for g in groups for s in lists["scenes"][g]] for p, groups in parts}
+            scenes: dict[str, list[str]] = {}
+            for part, groups in lists["splits"][name].items():
+                scenes[part] = []
+                for group in groups:
+                    scenes[part] += lists["scenes"][group]
             return SplitList(name, scenes, complete=True)
     known = ", ".join(split_names(dataset))
     raise InputError(f"there is no split {name!r} of {dataset}: name one of {known}.")
 
 
 def read_split_file(path: Path) -> SplitList:
-    """Read a split file: JSON, an object with a list of scene names or tokens for each split.
+    """Read a split file, in JSON or as text.
 
-    It is the format of the nuScenes devkit's own ``splits.json``. A text file (``.txt``) has the
-    scenes of one split, one a line, and the split's name in its own, such as ``av2_val.txt``. The
-    list has the file's name.
+    In JSON it is an object with a list of scene names or tokens for each split, as in
+    ``splits.json`` of the nuScenes devkit. A text file (``.txt``) has the scenes of one split, one
+    per line, and the name of the split in its file name, such as ``av2_val.txt``.
+
+    Returns:
+        The list, with the name of the file.
 
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: If it has another form.
+        ValueError: If the file has another form.
     """
     if not path.is_file():
         raise FileNotFoundError(f"no split file at {path}.")
     try:
-        splits = _lines_of(path) if path.suffix.lower() == ".txt" else read_json(path)
+        is_text = path.suffix.lower() == ".txt"
+        splits = _read_lines(path) if is_text else read_json(path)
     except ValueError as error:
         raise InputError(f"{str(error).rstrip('.')}; a split file is JSON like {_FORM}.") from error
-    if not isinstance(splits, dict) or not all(
-        isinstance(scenes, list) and all(isinstance(s, str) for s in scenes)
-        for scenes in splits.values()
-    ):
+    if not isinstance(splits, dict) or not all(map(_is_list_of_names, splits.values())):
         raise InputError(f"split file {path} must look like {_FORM}.")
     return SplitList(file_name(path.stem)[:100], splits)
 
 
-def _lines_of(path: Path) -> dict[str, list[str]]:
+def _is_list_of_names(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(name, str) for name in value)
+
+
+def _read_lines(path: Path) -> dict[str, list[str]]:
     """Read the scenes of one split, whose name is a word of the file's name."""
     words = [word for word in re.split(r"[^a-z]+", path.stem.lower()) if word in _PARTS]
     if len(set(words)) != 1:
         raise InputError(f"the name of {path} must have one of the words {', '.join(_PARTS)}")
-    lines = (line.strip() for line in read_text(path).splitlines())
-    return {words[0]: [line for line in lines if line]}
+    scenes = []
+    for line in read_text(path).splitlines():
+        if line.strip():
+            scenes.append(line.strip())
+    return {words[0]: scenes}
 
 
-def asked_split(options: Any, dataset: str) -> SplitList | None:
-    """Return the list that ``split_name`` or ``split_file`` of the options name, if any."""
+def requested_split(options: Any, dataset: str) -> SplitList | None:
+    """Read the list that ``split_name`` or ``split_file`` of the options name.
+
+    Args:
+        options: Options of a converter (``FileOptions``).
+        dataset: Name of the data set, ``nuscenes`` or ``av2``.
+
+    Returns:
+        The list; None if the options name no list.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If the options name two lists, or the list is not known or malformed.
+    """
     if options.split_name and options.split_file:
         raise InputError("name either --split-name or --split-file.")
     if options.split_name:
@@ -126,26 +169,28 @@ def asked_split(options: Any, dataset: str) -> SplitList | None:
 def resolve_scenes(
     splits: Mapping[str, Collection[str]], names: Mapping[str, str]
 ) -> tuple[dict[str, str], list[str]]:
-    """Turn scene names or tokens, by split, into the split of each scene that exists.
+    """Find the split of each scene of a data set.
 
     Args:
-        splits: Names or tokens by split.
+        splits: Names or tokens of scenes, by split.
         names: Name of each scene of the data set, by token.
 
     Returns:
-        Splits by the scene's name, and the entries that the data set does not have.
+        Split of each scene, by its name, and the entries that the data set does not have.
 
     Raises:
         ValueError: If a scene is in two splits, by its name or its token.
     """
-    known = {name: name for name in names.values()} | dict(names)
+    name_of = {name: name for name in names.values()} | dict(names)
     split_of: dict[str, str] = {}
     missing = []
     for split, entries in splits.items():
         for entry in entries:
-            if entry not in known:
+            if entry not in name_of:
                 missing.append(entry)
-            elif split_of.setdefault(known[entry], split) != split:
-                other = split_of[known[entry]]
-                raise InputError(f"scene {known[entry]} is in both {other} and {split}.")
+                continue
+            name = name_of[entry]
+            other = split_of.setdefault(name, split)
+            if other != split:
+                raise InputError(f"scene {name} is in both {other} and {split}.")
     return split_of, missing

@@ -1,4 +1,4 @@
-"""Splits of scenes by place: validation keeps a distance from training, others are left out."""
+"""Splits of scenes by place, in which validation keeps a distance from training."""
 
 import argparse
 import json
@@ -13,55 +13,63 @@ from gsmap.utils.files import write_text
 from mapdata.overlap import Places, read_places, sample_overlap
 
 
-def _near(scenes: np.ndarray, positions: np.ndarray, distance_m: float) -> np.ndarray:
-    """Return which scenes of a map come how near to each other, themselves too. (S, S)
+def _near_scenes(scenes: np.ndarray, positions: np.ndarray, distance_m: float) -> np.ndarray:
+    """Mask of pairs of scenes that have samples within a distance, also of a scene with itself.
 
-    ``scenes`` are the numbers of the samples' scenes (n,), ``positions`` metres (n, 2).
+    ``scenes`` are indices of the samples' scenes (n,), ``positions`` are (x, y) in metres (n, 2).
+    Returns (S, S) bool.
     """
-    near = np.zeros((scenes.max() + 1,) * 2, bool)
+    count = scenes.max() + 1
+    near = np.zeros((count, count), bool)
     tree = cKDTree(positions)
-    for scene in range(len(near)):
-        beside = tree.query_ball_point(positions[scenes == scene], distance_m)
-        near[scene, scenes[np.unique(np.concatenate(beside).astype(np.int64))]] = True
+    for scene in range(count):
+        neighbours = tree.query_ball_point(positions[scenes == scene], distance_m)
+        samples = np.unique(np.concatenate(neighbours).astype(np.int64))
+        near[scene, scenes[samples]] = True
     return near | near.T
 
 
-def _grow(near: np.ndarray, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Choose scenes of a map from a random one on, always what costs training the least.
+def _select_scenes(
+    near: np.ndarray, count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Select scenes of a map, from a random one on, each so that training loses the fewest scenes.
 
-    Returns which are chosen, and which are neither chosen nor near a chosen one. 2 x (S,)
+    Returns:
+        Mask of the selected scenes (S,), and mask of scenes that are not near a selected one (S,).
     """
     rank = rng.permutation(len(near))
-    chosen, covered = np.zeros(len(near), bool), np.zeros(len(near), bool)
+    selected = np.zeros(len(near), bool)
+    covered = np.zeros(len(near), bool)
     scene = int(rank.argmin())
     while True:
-        chosen[scene] = True
+        selected[scene] = True
         covered |= near[scene]
-        if chosen.sum() >= count:
-            return chosen, ~covered
+        if selected.sum() >= count:
+            return selected, ~covered
         cost = (near & ~covered).sum(1)
-        scene = min(np.flatnonzero(~chosen).tolist(), key=lambda s: (cost[s], rank[s]))
+        others = np.flatnonzero(~selected)
+        scene = int(others[np.lexsort((rank[others], cost[others]))[0]])
 
 
 def split_scenes(
     places: Places, min_distance_m: float, val_share: float, seed: int
 ) -> dict[str, list[str]]:
-    """Split scenes so that no sample of validation is near one of training.
+    """Split scenes so that no validation sample is near a training sample.
 
-    Each map gives about the same share of its scenes to validation. Scenes near those of validation
-    are in neither part. The same input makes the same split.
+    Each map gives about an equal share of its scenes to validation. Scenes near validation scenes
+    are in neither part. The split depends on the arguments only.
 
     Args:
-        places: Where the samples are.
-        min_distance_m: Distance in metres that samples of both parts exceed.
+        places: Positions of the samples.
+        min_distance_m: Least distance between samples of the two parts, in metres, >= 0.
         val_share: Share of the scenes for validation, in (0, 1).
-        seed: Of the random choice of where validation begins.
+        seed: Seed of the random order of scenes, >= 0.
 
     Returns:
-        Names of scenes of ``train`` and ``val``, sorted.
+        Names of the scenes of ``train`` and ``val``, sorted.
 
     Raises:
-        ValueError: If a value is out of its range, or nothing is left for training.
+        ValueError: If a value is out of its range, or a part is empty.
     """
     if not (0 < val_share < 1 and 0 <= min_distance_m < np.inf and seed >= 0):
         raise InputError(
@@ -73,11 +81,13 @@ def split_scenes(
     for rows in places.by_map().values():
         names, scenes = np.unique(places.scenes[rows], return_inverse=True)
         count = round(val_share * len(names))
-        near = _near(scenes, places.positions[rows], min_distance_m)
-        nothing = np.zeros(len(names), bool), np.ones(len(names), bool)
-        chosen, far = _grow(near, count, rng) if count else nothing
+        if not count:
+            parts["train"] += names.tolist()
+            continue
+        near = _near_scenes(scenes, places.positions[rows], distance_m=min_distance_m)
+        selected, far = _select_scenes(near, count, rng)
         parts["train"] += names[far].tolist()
-        parts["val"] += names[chosen].tolist()
+        parts["val"] += names[selected].tolist()
     if not parts["train"] or not parts["val"]:
         raise InputError(
             f"{len(np.unique(places.scenes))} scenes leave {len(parts['train'])} for training and "
@@ -104,22 +114,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> str:
-    """Write a split and say how large its parts are, and how far apart."""
+    """Run the command ``split``: write a split, and return its sizes and distance."""
     places = read_places(arguments.files)
-    options = arguments.min_distance, arguments.val_share, arguments.seed
-    parts = split_scenes(places, *options)
-    of_part = {part: np.isin(places.scenes, names) for part, names in parts.items()}
-    chosen = [
-        Places(*(values[rows] for values in vars(places).values())) for rows in of_part.values()
-    ]
-    distance, _ = sample_overlap(*chosen)
-    write_text(arguments.out, json.dumps(parts, indent=1) + "\n")
-    left_out = len(np.unique(places.scenes)) - sum(map(len, parts.values()))
-    sizes = ", ".join(
-        f"{part} {len(names)} scenes ({of_part[part].sum()} samples)"
-        for part, names in parts.items()
+    parts = split_scenes(
+        places,
+        min_distance_m=arguments.min_distance,
+        val_share=arguments.val_share,
+        seed=arguments.seed,
     )
+    train = places.select(np.isin(places.scenes, parts["train"]))
+    val = places.select(np.isin(places.scenes, parts["val"]))
+    distance, _ = sample_overlap(train, val)
+    write_text(arguments.out, json.dumps(parts, indent=1) + "\n")
+    left_out = len(np.unique(places.scenes)) - len(parts["train"]) - len(parts["val"])
     return (
-        f"{sizes}; {left_out} scenes near both are left out; the nearest samples are "
+        f"train {len(parts['train'])} scenes ({len(train.tokens)} samples), "
+        f"val {len(parts['val'])} scenes ({len(val.tokens)} samples); "
+        f"{left_out} scenes near both are left out; the nearest samples are "
         f"{distance.min():.1f} m apart\n{arguments.out}: give it to create_data.py as --split-file"
     )

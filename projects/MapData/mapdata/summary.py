@@ -1,4 +1,4 @@
-"""What a conversion wrote, and what it left out."""
+"""Summary of a conversion: counts of samples and map elements, and omissions."""
 
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
@@ -10,7 +10,16 @@ _EXAMPLES = 3
 
 @dataclass
 class ConversionSummary:
-    """Counts of one conversion, printed at its end; classes are in label order."""
+    """Summary of one conversion, printed at its end.
+
+    Args:
+        classes: Classes of map elements, in label order.
+        samples: Number of samples by split.
+        instances: Number of map elements by class.
+        problems: Number of omissions by their reason.
+        examples: First places of the omissions, by their reason.
+        notes: Further lines of the summary.
+    """
 
     classes: tuple[str, ...]
     samples: Counter[str] = field(default_factory=Counter)
@@ -20,7 +29,7 @@ class ConversionSummary:
     notes: list[str] = field(default_factory=list)
 
     def add_sample(self, split: str, sample: MapSample) -> None:
-        """Count a sample that was written."""
+        """Count a sample of an annotation file, and its map elements."""
         self.samples[split] += 1
         for instance in sample.instances or []:
             self.instances[self.classes[instance.label]] += 1
@@ -28,13 +37,19 @@ class ConversionSummary:
             self.add_problem("sample without any map element in range (kept)", sample.token)
 
     def add_problem(self, reason: str, where: str, count: int = 1) -> None:
-        """Count something that was left out or is missing; the first few places are remembered."""
+        """Count an omission.
+
+        Args:
+            reason: Description of the kind of omission.
+            where: Place of the omission, such as a token; the first few are listed as examples.
+            count: Number of omissions at this place.
+        """
         self.problems[reason] += count
         if len(self.examples[reason]) < _EXAMPLES:
             self.examples[reason].append(where)
 
     def text(self) -> str:
-        """Return the summary as lines for a terminal."""
+        """Summary as lines for a terminal."""
         samples = ", ".join(f"{split} {count}" for split, count in self.samples.items()) or "none"
         counts = ", ".join(f"{name} {self.instances[name]}" for name in self.classes)
         lines = [f"samples: {samples}", f"map elements: {counts}"]

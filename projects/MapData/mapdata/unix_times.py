@@ -1,4 +1,4 @@
-"""Unix times: their unit by their size, and how a message names them."""
+"""Unix times: detection of their unit, and their text in messages."""
 
 from collections.abc import Iterable
 from datetime import datetime, timezone
@@ -6,22 +6,27 @@ from typing import Any
 
 import numpy as np
 
-_FROM_NS, _TO_NS = 946_684_800 * 10**9, 4_102_444_800 * 10**9  # the years 2000 to 2099
+_FROM_NS = 946_684_800 * 10**9  # the year 2000
+_TO_NS = 4_102_444_800 * 10**9  # the year 2100
 _UNITS_NS = (10**9, 10**6, 10**3, 1)
 
 
 def unix_time_ns(number: float, unit_ns: int | None = None) -> int | None:
-    """Return a Unix time in nanoseconds; None if it is not of the years 2000 to 2099.
+    """Convert a Unix time to nanoseconds.
 
     Args:
-        number: The time since 1970.
-        unit_ns: Its unit in nanoseconds. By default the one of seconds, milliseconds, microseconds
-            and nanoseconds that puts it into these years, of which there is one at most.
+        number: Time since 1970.
+        unit_ns: Unit of the time in nanoseconds. None detects seconds, milliseconds, microseconds
+            or nanoseconds, of which at most one is valid.
+
+    Returns:
+        The time in nanoseconds; None if it is not in the years 2000 to 2099.
     """
-    if not abs(number) < 1 << 63:  # NaN neither
+    if not abs(number) < 1 << 63:  # also refuses NaN
         return None
     whole = round(number)
-    for unit in _UNITS_NS if unit_ns is None else (unit_ns,):
+    units = _UNITS_NS if unit_ns is None else (unit_ns,)
+    for unit in units:
         time_ns = whole * unit if whole == number else round(number * unit)
         if _FROM_NS <= time_ns < _TO_NS:
             return time_ns
@@ -29,25 +34,29 @@ def unix_time_ns(number: float, unit_ns: int | None = None) -> int | None:
 
 
 def in_nanoseconds(time: Any, usual_unit_ns: int) -> int:
-    """Return a time that a file brings, in nanoseconds.
+    """Convert a time from a file to nanoseconds.
 
     Args:
-        time: A Unix time of any unit, or a time of another clock; a number or the text of one.
-        usual_unit_ns: Unit in nanoseconds of a time that is no Unix time.
+        time: A Unix time of any unit, or a time of another clock, as a number or a text.
+        usual_unit_ns: Unit of times of other clocks, in nanoseconds.
+
+    Returns:
+        The time in nanoseconds.
     """
     number = float(time) if isinstance(time, (float, np.floating)) else int(time)
-    known = unix_time_ns(number)
-    return round(number * usual_unit_ns) if known is None else known
+    time_ns = unix_time_ns(number)
+    return round(number * usual_unit_ns) if time_ns is None else time_ns
 
 
 def span_of(times_ns: Iterable[int]) -> str:
-    """Return the first and the last of times as a text: in UTC, or in seconds of another clock."""
+    """First and last of times in nanoseconds as text: in UTC, or in seconds of another clock."""
     times = list(times_ns)
     return f"{_text_of(min(times))} to {_text_of(max(times))}"
 
 
 def _text_of(time_ns: int) -> str:
-    if unix_time_ns(time_ns, 1) is None:
+    if unix_time_ns(time_ns, unit_ns=1) is None:
         return f"{time_ns / 1e9:.3f} s"
-    text = datetime.fromtimestamp(time_ns // 10**9, timezone.utc).strftime("%Y-%m-%d %H:%M:%S")
-    return f"{text}.{time_ns % 10**9 // 10**6:03d} UTC"
+    seconds, fraction_ns = divmod(time_ns, 10**9)
+    text = datetime.fromtimestamp(seconds, timezone.utc).strftime("%Y-%m-%d %H:%M:%S")
+    return f"{text}.{fraction_ns // 10**6:03d} UTC"

@@ -1,11 +1,10 @@
-"""Annotation files as JSON, in MapTR's form: ground truth for ``tools/evaluate.py`` and others."""
+"""Export of annotation files to JSON in MapTR's format, such as for ``tools/evaluate.py``."""
 
 import argparse
 import json
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +18,11 @@ from gsmap.utils.files import atomic_write
 from gsmap.utils.words import counted
 
 _DECIMALS = 6
-_GROUND_TRUTH = "GTs"  # of a JSON file that `tools/evaluate.py` reads
+_GROUND_TRUTH = "GTs"  # key of the samples in MapTR's format
 
 
 def _identity(sample: MapSample, row: int | None) -> dict[str, Any]:
-    """Return a sample's name, time and pose; ``row`` is its place in a pose table."""
+    """Name, time and pose of a sample; ``row`` is its row in a pose table, None without a table."""
     pose = sample.global_from_frame
     if row is not None:
         return {
@@ -44,9 +43,14 @@ def _identity(sample: MapSample, row: int | None) -> dict[str, Any]:
 
 
 def write_vectors(annotations: Sequence[Path], target: Path) -> int:
-    """Write the ground truth of one data set's annotation files as one JSON, when it is whole.
+    """Write the ground truth of a data set's annotation files as one JSON file.
 
-    Returns the number of samples written.
+    Args:
+        annotations: Annotation files.
+        target: File to write; it appears once it is complete.
+
+    Returns:
+        Number of samples.
 
     Raises:
         ValueError: If a sample has no ground truth, or the files differ in data set, frame, classes
@@ -55,37 +59,42 @@ def write_vectors(annotations: Sequence[Path], target: Path) -> int:
     files = [AnnotationFile(path) for path in annotations]
     meta = files[0].meta
     names = ("dataset", "frame", "classes", "x_range", "y_range")
-    same = {name: getattr(meta, name) for name in names}
+    common = {name: getattr(meta, name) for name in names}
     for file in files:
-        file.require(**same)
-    head = {**same, "split": [file.meta.split for file in files], "versions": meta.versions}
+        file.require(**common)
+    splits = [file.meta.split for file in files]
+    head = {**common, "split": splits, "versions": meta.versions}
     with atomic_write(target) as out:
         out.write(f'{{"meta": {json.dumps(head)}, "{_GROUND_TRUTH}": [')
-        for number, record in enumerate(chain.from_iterable(_records(file) for file in files)):
-            out.write(",\n" if number else "\n")
-            json.dump(record, out)
+        separator = "\n"
+        for file in files:
+            for record in _records(file):
+                out.write(separator)
+                json.dump(record, out)
+                separator = ",\n"
         out.write("\n]}\n")
     return sum(len(file) for file in files)
 
 
 def _records(file: AnnotationFile) -> Iterator[dict[str, Any]]:
-    """Yield each sample as JSON: by log and row where the rows of the pose table are known."""
-    stride = re.fullmatch(r"poses:(\d+)", str(file.meta.options.get("at")))
-    position: Counter[str] = Counter()
+    """Yield the samples as JSON objects, with rows of the pose table if these are known."""
+    match = re.fullmatch(r"poses:(\d+)", str(file.meta.options.get("at")))
+    stride = int(match[1]) if match else None  # every N-th row is a sample
+    counts: Counter[str] = Counter()  # of samples by log
     for sample in file:
         if sample.instances is None:
             raise InputError(f"{file.path}: sample {sample.token!r} has no ground truth to export.")
-        # every N-th row was taken and none left out
-        row = int(stride[1]) * position[sample.scene] if stride else None
-        position[sample.scene] += 1
-        vectors = [
-            {
+        row = None if stride is None else stride * counts[sample.scene]
+        counts[sample.scene] += 1
+        vectors = []
+        for instance in sample.instances:
+            points = instance.points.astype(np.float64).round(_DECIMALS)
+            vector = {
                 "label": instance.label,
                 "cls_name": file.meta.classes[instance.label],
-                "pts": instance.points.astype(np.float64).round(_DECIMALS).tolist(),
+                "pts": points.tolist(),
             }
-            for instance in sample.instances
-        ]
+            vectors.append(vector)
         yield {**_identity(sample, row), "vectors": vectors}
 
 
@@ -96,6 +105,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> str:
-    """Export as the command line asks and say how much was written."""
+    """Run the command ``export`` and return its report."""
     count = write_vectors(arguments.annotations, arguments.target)
     return f"{counted(count, 'sample')} written to {arguments.target}"

@@ -33,7 +33,7 @@ from mapdata.command_line import (
     fingerprint,
     options_from,
 )
-from mapdata.splits import OFFICIAL, SplitList, asked_split, resolve_scenes, split_names
+from mapdata.splits import OFFICIAL, SplitList, requested_split, resolve_scenes, split_names
 from mapdata.summary import ConversionSummary
 
 
@@ -57,7 +57,7 @@ def convert_argoverse2(options: Argoverse2Options) -> ConversionSummary:
     """
     summary = ConversionSummary(options.classes)
     target = options.path_of("av2", options.split)
-    split_list = asked_split(options, "av2")
+    split_list = requested_split(options, "av2")
     if split_list is None:
         identity = OFFICIAL
         log_dirs = find_logs(options.root, options.split, logs=options.logs)

@@ -43,8 +43,8 @@ from mapdata.overlap import Positions, overlap_notes
 from mapdata.splits import (
     OFFICIAL,
     SplitList,
-    asked_split,
     read_split_file,
+    requested_split,
     resolve_scenes,
     split_names,
 )
@@ -114,7 +114,7 @@ def _select_splits(options: NuScenesOptions) -> tuple[SplitList, str]:
     """
     from nuscenes.utils.splits import create_splits_scenes
 
-    published_or_file = asked_split(options, "nuscenes")
+    published_or_file = requested_split(options, "nuscenes")
     if published_or_file is not None:
         return published_or_file, published_or_file.identity
     splits_path = options.root / options.versions[0] / "splits.json"
