@@ -10,7 +10,7 @@ import numpy as np
 
 from gsmap.datasets.annotations.record import AnnotationMeta, MapSample
 from gsmap.datasets.errors import naming
-from gsmap.datasets.source import Mount, ground_from_frame, change_frame
+from gsmap.datasets.source import Mount, change_frame, ground_from_frame
 from gsmap.utils.errors import InputError
 from mapdata.folders.calibration_file import read_vehicle
 from mapdata.folders.rig import RigCamera, RigFrame, rig_samples
