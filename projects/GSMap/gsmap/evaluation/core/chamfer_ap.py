@@ -213,12 +213,12 @@ def _nearest(sample: Sample, config: ChamferConfig) -> tuple[IntArray, FloatArra
         config.dim,
     )
     limit = config.thresholds[-1]
-    cached_limit, nearest = sample.shared.get(rules, (-np.inf, None))
+    cached_limit, nearest = sample.cache.get(rules, (-np.inf, None))
     if cached_limit < limit:
         nearest = nearest_by_chamfer(
             sample.predictions, sample.ground_truth, config=config, max_distance=limit
         )
-        sample.shared[rules] = (limit, nearest)
+        sample.cache[rules] = (limit, nearest)
     index, distance = nearest
     return index, distance
 

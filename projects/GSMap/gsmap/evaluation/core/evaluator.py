@@ -1,4 +1,4 @@
-"""All metrics over a stream of samples: match each sample once, keep only its matches."""
+"""Evaluation of several metrics over a stream of samples, of which only the matches are kept."""
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
@@ -22,24 +22,25 @@ from gsmap.structures.polylines import resample_all
 from gsmap.utils.errors import InputError
 
 METRIC_NAMES = ("chamfer", "raster")
-"""The metrics of published tables, which are the default."""
-SampleMatches = dict[str, Matches]  # by the name of the metric
+"""Metrics of published tables, the default."""
+SampleMatches = dict[str, Matches]
+"""Records of one sample, by the name of the metric."""
 
 
 @dataclass(frozen=True, init=False)
 class MapEvaluator:
-    """A list of metrics.
+    """Evaluator of one or more metrics.
 
-    ``update`` with each sample, then ``compute``. Or keep what ``match`` returns for each sample,
-    such as of several processes, and make ``reports`` of all.
+    Call ``update`` with each sample, then ``compute``. To evaluate in several processes, collect
+    the records that ``match`` returns and pass all of them to ``reports``.
 
     Args:
-        *metrics: The metrics, such as ``ChamferConfig(classes)`` and ``RasterConfig(classes)``.
-        ground_truth_points: To how many points ground truth is first resampled, such as the 20 of
-            the training targets; None keeps its full resolution.
+        *metrics: Metrics, such as ``ChamferConfig(classes)`` and ``RasterConfig(classes)``.
+        ground_truth_points: Number of points to which ground truth is resampled first, such as the
+            20 of the training targets, >= 2; None for full resolution.
 
     Raises:
-        ValueError: If there is no metric, two have one name, or their classes differ.
+        ValueError: If there is no metric, two metrics have equal names, or their classes differ.
     """
 
     metrics: tuple[Metric, ...]
@@ -63,38 +64,48 @@ class MapEvaluator:
         settings: MetricSettings,
         ground_truth_points: int | None = None,
     ) -> "MapEvaluator":
-        """Return the evaluator of some metrics.
+        """Create an evaluator from the names of metrics.
 
         Args:
-            names: Names of metrics (`metric_class`); others that belong to one come before it.
-            settings: What each takes its rules from.
-            ground_truth_points: As of the class.
+            names: Names of metrics (`metric_class`). Metrics that are reported together with one
+                of them (`Metric.beside`) are inserted before it.
+            settings: Settings from which each metric takes its rules.
+            ground_truth_points: Number of points to which ground truth is resampled first, >= 2;
+                None for full resolution.
 
         Raises:
-            ValueError: If there is no metric of a name, or settings do not suit it.
+            ValueError: If there is no metric of a name, or the settings do not suit a metric.
         """
-        kinds: dict[str, type[Metric]] = {}
+        metric_types: dict[str, type[Metric]] = {}
         for name in names:
-            kind = metric_class(name)
-            kinds |= {other: metric_class(other) for other in kind.beside if other not in kinds}
-            kinds[name] = kind
-        metrics = [kind.of(settings) for kind in kinds.values()]
+            metric_type = metric_class(name)
+            for companion in metric_type.beside:
+                metric_types.setdefault(companion, metric_class(companion))
+            metric_types[name] = metric_type
+        metrics = [metric_type.of(settings) for metric_type in metric_types.values()]
         return cls(*metrics, ground_truth_points=ground_truth_points)
 
     @cached_property
     def _matches(self) -> list[SampleMatches]:
-        """Matches of the samples so far."""
+        """Records of the samples so far."""
         return []
 
     def update(
         self, predictions: MapElements, ground_truth: MapElements, token: str | None = None
     ) -> None:
-        """Add a sample; one whose token was there before counts once. Its place is the default."""
-        token = f"{len(self._matches):09d}" if token is None else token
-        self._matches.append(self.match(token, predictions, ground_truth))
+        """Add a sample.
+
+        Args:
+            predictions: Predicted elements, in metres in the annotation frame. N in number.
+            ground_truth: Annotated elements at full resolution. K in number.
+            token: Name of the sample; repeated names count once. Default: its number.
+        """
+        if token is None:
+            token = f"{len(self._matches):09d}"
+        self._matches.append(self.match(token, predictions, ground_truth=ground_truth))
 
     def compute(self) -> dict[str, float]:
-        """Return the figures of all samples so far, as docs/evaluation.md lists them.
+        """Compute the figures of all samples so far, which docs/evaluation.md lists.
 
         Raises:
             ValueError: If there is no sample.
@@ -102,7 +113,7 @@ class MapEvaluator:
         return flat_metrics(self.reports(self._matches))
 
     def reset(self) -> None:
-        """Forget all samples."""
+        """Remove all samples."""
         self._matches.clear()
 
     @property
@@ -112,7 +123,7 @@ class MapEvaluator:
 
     @property
     def counts_heights(self) -> bool:
-        """Whether a metric measures distances in space."""
+        """Whether a metric measures distances in space rather than in the plane."""
         return any(metric.counts_heights for metric in self.metrics)
 
     def match(
@@ -122,40 +133,56 @@ class MapEvaluator:
 
         Args:
             token: Name of the sample.
-            predictions: Its predictions, in metres in the annotation frame. (N,)
-            ground_truth: Its ground truth at full resolution, likewise. (K,)
+            predictions: Predicted elements, in metres in the annotation frame. N in number.
+            ground_truth: Annotated elements at full resolution. K in number.
         """
         if self.ground_truth_points is not None:
-            points, offsets = ground_truth.points, ground_truth.offsets
-            resampled = resample_all(points, offsets, self.ground_truth_points)
-            pairs = zip(ground_truth.polylines, resampled, strict=True)
-            polylines = [new if len(old) >= 2 else old for old, new in pairs]
-            ground_truth = MapElements.from_polylines(polylines, ground_truth.labels)
+            ground_truth = _resample_elements(ground_truth, self.ground_truth_points)
         sample = Sample(token, predictions, ground_truth)
         return {metric.name: metric.match(sample) for metric in self.metrics}
 
     def match_empty(self) -> SampleMatches:
-        """Match a sample without elements, for the names and shapes of what is kept."""
+        """Match a sample without elements, for the names and shapes of the records."""
         points = np.empty((0, 3))
         truth = replace(MapElements.from_polylines(), points=points)
-        found = replace(MapElements.from_polylines((), (), ()), points=points)
-        return {metric.name: metric.match(Sample("", found, truth)) for metric in self.metrics}
+        predictions = replace(MapElements.from_polylines(scores=()), points=points)
+        sample = Sample(token="", predictions=predictions, ground_truth=truth)
+        return {metric.name: metric.match(sample) for metric in self.metrics}
 
     def match_all(self, samples: Iterable[Sample]) -> list[SampleMatches]:
-        """Match several samples."""
-        return [self.match(*sample) for sample in samples]
+        """Match several samples under every metric."""
+        return [
+            self.match(sample.token, sample.predictions, ground_truth=sample.ground_truth)
+            for sample in samples
+        ]
 
     def reports(self, samples: Iterable[SampleMatches]) -> list[MetricReport]:
-        """Compute the metrics from the matches of all samples; repeated tokens count once.
+        """Compute the metrics from the records of all samples; repeated tokens count once.
+
+        Args:
+            samples: Records of each sample, as ``match`` returns them.
 
         Raises:
             ValueError: If there is no sample.
         """
         tables: dict[str, MatchTable | ValueTable] = {}
         for sample in samples:
-            tables = tables or {name: new_table(found) for name, found in sample.items()}
+            if not tables:
+                tables = {name: new_table(record) for name, record in sample.items()}
             for name, table in tables.items():
                 table.add(sample[name])  # type: ignore[arg-type]
         if not tables:
             raise InputError("there is no sample to score.")
-        return [report for metric in self.metrics for report in metric.reports(tables[metric.name])]
+        reports: list[MetricReport] = []
+        for metric in self.metrics:
+            reports += metric.reports(tables[metric.name])
+        return reports
+
+
+def _resample_elements(elements: MapElements, num_points: int) -> MapElements:
+    """Resample each element of two points or more; others stay as they are."""
+    resampled = resample_all(elements.points, elements.offsets, num_points=num_points)
+    polylines = []
+    for line, resampled_line in zip(elements.polylines, resampled, strict=True):
+        polylines.append(resampled_line if len(line) >= 2 else line)
+    return MapElements.from_polylines(polylines, labels=elements.labels)

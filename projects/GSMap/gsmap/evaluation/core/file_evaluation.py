@@ -1,4 +1,4 @@
-"""Score a result file against a ground-truth file, in one or more processes."""
+"""Evaluation of a result file against a ground-truth file, in one or more processes."""
 
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -24,21 +24,22 @@ from gsmap.utils.shards import WHOLE, Shard
 from gsmap.utils.split_lists import require_results_of
 from gsmap.utils.words import counted
 
-CHUNK = 64  # samples per task: large enough to hide the hand-over, small enough to share evenly
+CHUNK = 64  # samples per task: few tasks to hand over, and evenly distributed
 Evaluation = tuple[list[MetricReport], list[str]]
-"""A report per metric, and notes: elements left out, z ignored, samples without results."""
+"""Reports of all metrics, and notes on ignored elements, heights and samples."""
 
 
 class AnnotatedTruth:
-    """The ground truth of an annotation file, in the form of ``SampleFile``.
+    """Ground truth of an annotation file, with the interface of ``SampleFile``.
 
     Args:
-        path: The file.
-        classes: Names of the classes; elements of others get the label -1.
-        shard: Which part of the samples to read.
+        path: Path of the file.
+        classes: Names of the classes; elements of other classes get the label -1.
+        shard: Part of the samples to read.
 
     Raises:
-        ValueError: If it lacks one of the classes, or, when read, a sample has no ground truth.
+        ValueError: If the file lacks one of the classes or, while iterating, a sample has no ground
+            truth.
     """
 
     def __init__(self, path: str | Path, classes: Sequence[str], shard: Shard = WHOLE) -> None:
@@ -47,7 +48,8 @@ class AnnotatedTruth:
         missing = [name for name in classes if name not in names]
         if missing:
             raise InputError(f"{path} has the classes {names}, not {missing}.")
-        self._labels = np.array([classes.index(n) if n in classes else -1 for n in names])
+        labels = [classes.index(name) if name in classes else -1 for name in names]
+        self._labels = np.array(labels)
         self._rows = shard.part(range(len(self._file)))
         self.ignored = Counter({THREE_D: len(self._file) * (self._file.meta.dim == 3)})
 
@@ -61,31 +63,36 @@ class AnnotatedTruth:
                     f"{self._file.path}, sample {sample.token!r} has no ground truth: it cannot "
                     "be scored."
                 )
-            self.ignored.update(
-                names[i.label] for i in sample.instances if self._labels[i.label] < 0
-            )
+            for instance in sample.instances:
+                if self._labels[instance.label] < 0:
+                    self.ignored[names[instance.label]] += 1
             yield sample.token, self._elements(sample), row
 
     @property
     def split_list(self) -> str:
-        """The list of scenes behind the file; empty if unknown."""
+        """Name of the list of scenes that the file was made from; empty if unknown."""
         return self._file.meta.split_list
 
     def tokens(self) -> list[str]:
-        """Return the tokens of all samples, whatever the shard."""
+        """Return the tokens of all samples of all shards."""
         return self._file.column("token")
 
     def load(self, _token: str, row: int) -> MapElements:
-        """Read the elements of one sample again."""
+        """Read the elements of one sample at random access."""
         return self._elements(self._file[row])
 
     def _elements(self, sample: MapSample) -> MapElements:
+        """Convert the instances of a sample to elements with labels of ``classes``."""
         elements = elements_of_instances(sample.instances or [])
         return replace(elements, labels=self._labels[elements.labels])
 
 
 def scenes_of(path: str | Path) -> dict[str, str]:
-    """Return the scene of each sample of an annotation file, by token; ValueError for JSON."""
+    """Return the scene of each sample of an annotation file, by token.
+
+    Raises:
+        ValueError: If the file is JSON, which has no scenes.
+    """
     if Path(path).suffix.lower() == ".json":
         raise InputError(f"{path} knows no scenes: give the annotation file (.arrow).")
     file = AnnotationFile(path)
@@ -95,41 +102,62 @@ def scenes_of(path: str | Path) -> dict[str, str]:
 def open_ground_truth(
     path: str | Path, classes: Sequence[str], shard: Shard = WHOLE
 ) -> AnnotatedTruth | SampleFile:
-    """Open an annotation file, of which a shard is read, or MapTR's JSON, which is read whole."""
+    """Open a file of ground truth.
+
+    Args:
+        path: Annotation file, or ground truth in MapTR's JSON form.
+        classes: Names of the classes; elements of other classes get the label -1.
+        shard: Part of the samples to read of an annotation file; JSON is read as a whole.
+    """
     if Path(path).suffix.lower() == ".json":
-        return SampleFile(path, GROUND_TRUTH_KEY, classes)
+        return SampleFile(path, key=GROUND_TRUTH_KEY, classes=classes)
     return AnnotatedTruth(path, classes, shard)
 
 
 def read_ground_truth(
     path: str | Path, classes: Sequence[str]
 ) -> tuple[dict[str, MapElements], Counter[str]]:
-    """Read all ground truth of an annotation file, or of MapTR's JSON, as ``read_samples`` does."""
-    truth = open_ground_truth(path, classes)
-    return {token: elements for token, elements, _ in truth}, truth.ignored
+    """Read all ground truth of a file.
+
+    Args:
+        path: Annotation file, or ground truth in MapTR's JSON form.
+        classes: Names of the classes; elements of other classes get the label -1.
+
+    Returns:
+        Elements of each sample by token, and the number of ignored elements of each other class.
+    """
+    file = open_ground_truth(path, classes)
+    samples = {token: elements for token, elements, _ in file}
+    return samples, file.ignored
 
 
 def mismatch_notes(results: Collection[str], truth: Collection[str], allowed: bool) -> list[str]:
-    """Say which tokens of samples have no results or no ground truth.
+    """Describe the samples that have no results or no ground truth.
 
     Args:
         results: Tokens of samples with results.
         truth: Tokens of samples with ground truth.
-        allowed: Whether they may differ.
+        allowed: Whether both sides may differ.
+
+    Returns:
+        Notes for the user; none if both sides have equal tokens.
 
     Raises:
-        ValueError: If they differ and may not.
+        ValueError: If both sides differ and ``allowed`` is False.
     """
     notes = []
-    for these, others, what, lack, treatment in (
-        (truth, results, "sample", "no results", "counted as without predictions"),
-        (results, truth, "result", "no ground truth", "left out"),
-    ):
-        alone = [token for token in these if token not in others]
-        if alone:
-            verb = "has" if len(alone) == 1 else "have"
-            said = f"{counted(len(alone), what)} {verb} {lack}, such as {alone[0]!r}"
-            notes.append(f"{said}: {treatment}" if allowed else said)
+    no_results = [token for token in truth if token not in results]
+    if no_results:
+        verb = "has" if len(no_results) == 1 else "have"
+        number = counted(len(no_results), "sample")
+        note = f"{number} {verb} no results, such as {no_results[0]!r}"
+        notes.append(f"{note}: counted as without predictions" if allowed else note)
+    no_truth = [token for token in results if token not in truth]
+    if no_truth:
+        verb = "has" if len(no_truth) == 1 else "have"
+        number = counted(len(no_truth), "result")
+        note = f"{number} {verb} no ground truth, such as {no_truth[0]!r}"
+        notes.append(f"{note}: left out" if allowed else note)
     if notes and not allowed:
         raise InputError(
             "; ".join(notes) + ": score the split that was predicted, or allow the mismatch."
@@ -138,20 +166,21 @@ def mismatch_notes(results: Collection[str], truth: Collection[str], allowed: bo
 
 
 class SamplePairs:
-    """Predictions and ground truth of each sample of two files, for one walk through both.
+    """Iterable of the samples of a result file and a ground-truth file; iterate once.
 
-    Few samples are in memory at a time: where the files have other orders, a sample waits by its
-    place in the file, and is read again for its partner.
+    Few samples are in memory at a time. Where the orders of the files differ, the position of a
+    sample in its file is stored, and the sample is read a second time when its partner arrives.
 
     Args:
         results_path: Results in MapTR's JSON form.
-        truth_path: Ground truth, as ``open_ground_truth`` takes it.
-        classes: Names of the classes.
-        allow_mismatch: A sample without results counts as without predictions, and results without
-            ground truth are left out; otherwise both are errors, after the last pair.
-        shard: Which part of the ground truth's samples to take.
-        allow_other_split: Whether results may be of a model that was trained on another split than
-            that of the annotation file; otherwise that is an error, after the last pair.
+        truth_path: Annotation file, or ground truth in MapTR's JSON form.
+        classes: Names of the classes; elements of other classes get the label -1.
+        allow_mismatch: Whether samples of the files may differ. A sample without results then
+            counts as without predictions, and results without ground truth are left out. If False,
+            a difference raises an error after the last pair.
+        shard: Part of the samples of the ground truth to evaluate.
+        allow_other_split: Whether the model of the results may be trained on another split than the
+            annotation file belongs to. If False, this raises an error after the last pair.
         gaussians: Whether to read the Gaussians of results.
     """
 
@@ -166,13 +195,15 @@ class SamplePairs:
         gaussians: bool = False,
     ) -> None:
         self._allow_other_split = allow_other_split
-        self._results = SampleFile(results_path, RESULTS_KEY, classes, gaussians)
-        self._truth = open_ground_truth(truth_path, classes, shard)
+        self._results = SampleFile(
+            results_path, key=RESULTS_KEY, classes=classes, gaussians=gaussians
+        )
+        self._truth = open_ground_truth(truth_path, classes=classes, shard=shard)
         self._allow_mismatch = allow_mismatch
-        self._elsewhere: set[str] = set()  # what belongs to other shards is theirs
+        self._other_shards: set[str] = set()  # tokens of samples that belong to other shards
         if shard.count:
             tokens = self._truth.tokens()
-            self._elsewhere = set(tokens).difference(shard.part(tokens))
+            self._other_shards = set(tokens).difference(shard.part(tokens))
         self._mismatches: list[str] = []
         self._degenerate = 0
 
@@ -183,48 +214,69 @@ class SamplePairs:
             FileNotFoundError: If a file does not exist.
             ValueError: If a file is malformed or the samples differ.
         """
-        sides = self._results, self._truth
-        waiting: tuple[dict[str, Any], dict[str, Any]] = {}, {}  # elements, or places of them
-        mine = ((item for item in side if item[0] not in self._elsewhere) for side in sides)
-        for items in zip_longest(*mine):
-            if None not in items and items[0][0] == items[1][0]:
-                yield self._counted(items[0][0], items[0][1], items[1][1])
+        # samples whose partner is missing so far: their elements, or their places in the file
+        pending_results: dict[str, Any] = {}
+        pending_truth: dict[str, Any] = {}
+        results = self._items_of_shard(self._results)
+        truth = self._items_of_shard(self._truth)
+        for result_item, truth_item in zip_longest(results, truth):
+            if result_item and truth_item and result_item[0] == truth_item[0]:
+                token, predictions, _ = result_item
+                yield self._pair(token, predictions, truth=truth_item[1])
                 continue
-            for own, item in enumerate(items):
-                if item is None:
-                    continue
-                token, elements, place = item
-                other = 1 - own
-                if token in waiting[other]:
-                    pair = [elements, self._load(sides[other], token, waiting[other].pop(token))]
-                    yield self._counted(token, pair[own], pair[other])
+            if result_item:
+                token, predictions, place = result_item
+                if token in pending_truth:
+                    elements = _load(self._truth, token, pending_truth.pop(token))
+                    yield self._pair(token, predictions, truth=elements)
                 else:
-                    waiting[own][token] = elements if len(waiting[own]) < CHUNK else place
+                    is_full = len(pending_results) >= CHUNK
+                    pending_results[token] = place if is_full else predictions
+            if truth_item:
+                token, elements, place = truth_item
+                if token in pending_results:
+                    predictions = _load(self._results, token, pending_results.pop(token))
+                    yield self._pair(token, predictions, truth=elements)
+                else:
+                    is_full = len(pending_truth) >= CHUNK
+                    pending_truth[token] = place if is_full else elements
         if isinstance(self._truth, AnnotatedTruth) and not self._allow_other_split:
             require_results_of(self._truth.split_list, self.about, self._results.path)
-        self._mismatches = mismatch_notes(*waiting, self._allow_mismatch)
-        nothing = MapElements.from_polylines()
-        for token, kept in waiting[1].items():
-            yield self._counted(token, nothing, self._load(self._truth, token, kept))
+        self._mismatches = mismatch_notes(
+            pending_results, pending_truth, allowed=self._allow_mismatch
+        )
+        no_predictions = MapElements.from_polylines()
+        for token, pending in pending_truth.items():
+            elements = _load(self._truth, token, pending)
+            yield self._pair(token, no_predictions, truth=elements)
+
+    def _items_of_shard(self, side: Iterable[Any]) -> Iterator[Any]:
+        """Yield token, elements and place of each sample that does not belong to other shards."""
+        for item in side:
+            if item[0] not in self._other_shards:
+                yield item
 
     @property
     def about(self) -> dict[str, Any]:
-        """What the result file says of itself, after the walk."""
+        """Metadata of the result file, after iterating."""
         return self._results.about
 
-    def _load(self, side: Any, token: str, kept: Any) -> MapElements:
-        """Return the elements of a sample that waited."""
-        return kept if isinstance(kept, MapElements) else side.load(token, kept)
-
-    def _counted(self, token: str, predictions: MapElements, truth: MapElements) -> Sample:
+    def _pair(self, token: str, predictions: MapElements, truth: MapElements) -> Sample:
+        """Create a sample, and count its ground truths of fewer than two points."""
         self._degenerate += int((truth.num_points < 2).sum())
         return Sample(token, predictions, truth)
 
     def notes(self, counts_heights: bool) -> list[str]:
-        """Say, after the walk, what was left out: elements, heights, samples without results."""
+        """Return notes on ignored elements, heights and samples, after iterating.
+
+        Args:
+            counts_heights: Whether a metric uses heights.
+        """
         notes = list(self._mismatches)
-        ignored = [Counter(side.ignored) for side in (self._results, self._truth)]
-        if sum(counts.pop(THREE_D, 0) for counts in ignored) and not counts_heights:
+        ignored_predictions = Counter(self._results.ignored)
+        ignored_truth = Counter(self._truth.ignored)
+        num_with_heights = ignored_predictions.pop(THREE_D, 0) + ignored_truth.pop(THREE_D, 0)
+        if num_with_heights and not counts_heights:
             notes.append(
                 "some elements have 3D points: z is ignored (AP_chamfer can count it: dim 3)"
             )
@@ -233,11 +285,16 @@ class SamplePairs:
                 f"{self._degenerate} ground truths have fewer than two points: they count, nothing "
                 "can match"
             )
-        for what, counts in zip(("predictions", "ground truths"), ignored, strict=True):
-            notes += [
-                f"{n} {what} of class {c!r} are not scored" for c, n in sorted(counts.items())
-            ]
+        for name, number in sorted(ignored_predictions.items()):
+            notes.append(f"{number} predictions of class {name!r} are not scored")
+        for name, number in sorted(ignored_truth.items()):
+            notes.append(f"{number} ground truths of class {name!r} are not scored")
         return notes
+
+
+def _load(side: Any, token: str, pending: Any) -> MapElements:
+    """Return the elements of a pending sample, read from its file if only its place is stored."""
+    return pending if isinstance(pending, MapElements) else side.load(token, pending)
 
 
 def evaluate_files(
@@ -248,41 +305,53 @@ def evaluate_files(
     allow_mismatch: bool = False,
     allow_other_split: bool = False,
 ) -> Evaluation:
-    """Score a result file against ground truth.
+    """Evaluate a result file against ground truth.
 
     Args:
         results_path: Results in MapTR's JSON form.
         truth_path: Annotation file, or ground truth in MapTR's JSON form.
-        evaluator: Metrics and their rules.
+        evaluator: Evaluator of the metrics.
         num_workers: Number of processes.
-        allow_mismatch: Whether the files may have different samples: one without results counts as
-            without predictions, results without ground truth are left out.
-        allow_other_split: Whether the model may be of another split than the annotation file.
+        allow_mismatch: Whether samples of the files may differ. A sample without results counts as
+            without predictions, and results without ground truth are left out.
+        allow_other_split: Whether the model may be trained on another split than the annotation
+            file belongs to.
+
+    Returns:
+        Reports of all metrics, and notes on ignored elements, heights and samples.
 
     Raises:
         FileNotFoundError: If a file does not exist.
         ValueError: If a file is malformed, or samples or splits differ.
     """
     pairs = SamplePairs(
-        results_path, truth_path, evaluator.classes, allow_mismatch, WHOLE, allow_other_split
+        results_path,
+        truth_path,
+        classes=evaluator.classes,
+        allow_mismatch=allow_mismatch,
+        allow_other_split=allow_other_split,
     )
-    reports = evaluator.reports(match_samples(pairs, evaluator, num_workers))
+    matches = match_samples(pairs, evaluator, num_workers=num_workers)
+    reports = evaluator.reports(matches)
     return reports, pairs.notes(evaluator.counts_heights)
 
 
 def match_samples(
     pairs: Iterable[Sample], evaluator: MapEvaluator, num_workers: int = 1
 ) -> Iterator[SampleMatches]:
-    """Match the samples in their order.
+    """Match samples, in their order, in one or more processes.
 
     Args:
-        pairs: Token, predictions and ground truth of each.
-        evaluator: The metrics.
-        num_workers: Processes.
+        pairs: Samples with predictions and ground truth.
+        evaluator: Evaluator of the metrics.
+        num_workers: Number of processes.
+
+    Yields:
+        Records of each sample.
     """
     stream = iter(pairs)
-    tasks = iter(lambda: list(islice(stream, CHUNK)), [])
+    chunks = iter(lambda: list(islice(stream, CHUNK)), [])
     with Progress(unit="samples") as bar:
-        for found in ordered_map(evaluator.match_all, tasks, num_workers):
-            yield from found
-            bar.update(len(found))
+        for matches in ordered_map(evaluator.match_all, chunks, num_workers):
+            yield from matches
+            bar.update(len(matches))

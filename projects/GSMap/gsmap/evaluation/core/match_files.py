@@ -1,4 +1,4 @@
-"""Matches of a part of the samples in a file, and the figures of all parts."""
+"""Files with the matches of a shard of the samples, and the evaluation of all shards."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
@@ -18,7 +18,8 @@ from gsmap.utils.shards import Shard, ShardFile
 
 SHARD_KIND = "matches"
 _FAULTS = KeyError, TypeError, ValueError, IndexError, ArithmeticError, AttributeError
-_TOKENS, _LENGTHS = "/tokens", "/lengths"
+_TOKENS = "/tokens"
+_LENGTHS = "/lengths"
 Arrays = Mapping[str, npt.NDArray[Any]]
 
 
@@ -31,56 +32,57 @@ def write_matches(
     settings: MetricSettings,
     source: str,
 ) -> Path:
-    """Write the matches of a shard, and its manifest.
+    """Write the matches of a shard and its manifest.
 
     Args:
-        target: File for the figures of all shards.
-        shard: Which shard.
-        matches: Its matches, one a sample.
-        notes: What to say besides.
-        evaluator: The metrics, as `MapEvaluator.named` makes them of the settings.
-        settings: Their settings.
+        target: File for the figures of all shards; it determines the path of the shard.
+        shard: Number of the shard and of all shards.
+        matches: Records of each sample of the shard.
+        notes: Notes for the user.
+        evaluator: Evaluator, as `MapEvaluator.named` creates it from ``settings``.
+        settings: Settings of the metrics.
         source: Digest of results and ground truth.
 
     Returns:
-        The shard's file.
+        Path of the file.
     """
-    arrays = {"notes": np.array(notes, str)}
+    arrays = {"notes": np.array(notes, dtype=str)}
     for metric in matches[0] if matches else ():
-        arrays |= _joined(metric, [sample[metric] for sample in matches])
-    with atomic_write(shard.path_of(target), "wb") as file:
+        arrays |= _join_records(metric, [sample[metric] for sample in matches])
+    with atomic_write(shard.path_of(target), mode="wb") as file:
         np.savez_compressed(file, **arrays)
     rules = {
         "metrics": [metric.name for metric in evaluator.metrics],
         "settings": asdict(settings),
         "ground_truth_points": evaluator.ground_truth_points,
     }
-    shard.seal(target, SHARD_KIND, source, {"evaluator": rules}, len(matches))
+    options = {"evaluator": rules}
+    shard.seal(target, SHARD_KIND, source, options, len(matches))
     return shard.path_of(target)
 
 
-def _joined(metric: str, records: Sequence[Matches]) -> dict[str, npt.NDArray[Any]]:
-    """Join the arrays of all samples along their first axes."""
-    found = {f"{metric}{_TOKENS}": np.array([record.token for record in records])}
-    parts = [arrays_of(record) for record in records]
-    for name in parts[0]:
-        values = [np.atleast_1d(part[name]) for part in parts]
-        found[f"{metric}/{name}"] = np.concatenate(values)
-        found[f"{metric}/{name}{_LENGTHS}"] = np.array([len(value) for value in values])
-    return found
+def _join_records(metric: str, records: Sequence[Matches]) -> dict[str, npt.NDArray[Any]]:
+    """Concatenate the arrays of all samples along their first axes."""
+    joined = {f"{metric}{_TOKENS}": np.array([record.token for record in records])}
+    records_arrays = [arrays_of(record) for record in records]
+    for name in records_arrays[0]:
+        values = [np.atleast_1d(arrays[name]) for arrays in records_arrays]
+        joined[f"{metric}/{name}"] = np.concatenate(values)
+        joined[f"{metric}/{name}{_LENGTHS}"] = np.array([len(value) for value in values])
+    return joined
 
 
 def report_shards(shards: Sequence[ShardFile]) -> tuple[list[MetricReport], list[str]]:
-    """Compute the metrics from all shards: the figures are those of a run without shards.
+    """Compute the metrics from all shards, with figures equal to a run without shards.
 
     Args:
-        shards: From ``find_shards``.
+        shards: Shards, as ``find_shards`` returns them.
 
     Returns:
-        A report per metric, and what the shards have to say, once each.
+        Reports of all metrics, and the notes of all shards without repeats.
 
     Raises:
-        ValueError: If a manifest tells no rules, or a shard's matches do not fit them.
+        ValueError: If a manifest contains no rules, or the matches of a shard do not fit the rules.
     """
     try:
         evaluator = _evaluator(shards[0].manifest["options"]["evaluator"])
@@ -95,8 +97,9 @@ def report_shards(shards: Sequence[ShardFile]) -> tuple[list[MetricReport], list
         try:
             with np.load(shard.path) as file:
                 notes += file["notes"].tolist()
-                found = {name: file[name] for name in file.files}
-            matches += _samples(found, evaluator) if len(found) > 1 else ()
+                arrays = {name: file[name] for name in file.files}
+            if len(arrays) > 1:
+                matches += _split_samples(arrays, evaluator)
         except (*_FAULTS, *DAMAGED_ZIP) as error:
             raise InputError(
                 f"{shard.path} holds no matches by the rules of its manifest ({error!r}): make "
@@ -105,18 +108,24 @@ def report_shards(shards: Sequence[ShardFile]) -> tuple[list[MetricReport], list
     return evaluator.reports(matches), list(dict.fromkeys(notes))
 
 
-def _samples(arrays: Arrays, evaluator: MapEvaluator) -> list[SampleMatches]:
-    """Cut the arrays of all metrics into samples."""
+def _split_samples(arrays: Arrays, evaluator: MapEvaluator) -> list[SampleMatches]:
+    """Split the arrays of all metrics into records of samples."""
     metrics = {name.removesuffix(_TOKENS) for name in arrays if name.endswith(_TOKENS)}
     empty = evaluator.match_empty()
     if metrics != empty.keys():
         raise InputError(f"it has matches of {sorted(metrics)}, not of {sorted(empty)}")
-    columns = [_records(arrays, metric, like) for metric, like in empty.items()]
-    return [dict(zip(empty, of_sample, strict=True)) for of_sample in zip(*columns, strict=True)]
+    samples: list[SampleMatches] = []
+    for metric, like in empty.items():
+        records = list(_split_records(arrays, metric=metric, like=like))
+        if not samples:
+            samples = [{} for _ in records]
+        for sample, record in zip(samples, records, strict=True):
+            sample[metric] = record
+    return samples
 
 
-def _records(arrays: Arrays, metric: str, like: Matches) -> Iterator[Matches]:
-    """Cut the arrays of one metric into samples."""
+def _split_records(arrays: Arrays, metric: str, like: Matches) -> Iterator[Matches]:
+    """Split the arrays of one metric into records of samples."""
     tokens = arrays[f"{metric}{_TOKENS}"].tolist()
     columns = {}
     for name in arrays_of(like):
@@ -126,15 +135,18 @@ def _records(arrays: Arrays, metric: str, like: Matches) -> Iterator[Matches]:
             raise InputError(f"{metric}/{name} has {len(values)} rows, its samples have {ends}")
         columns[name] = np.split(values, ends[:-1])
     for number, token in enumerate(tokens):
-        own = {name: values[number] for name, values in columns.items()}
-        yield matches_of(str(token), own, like)
+        sample_arrays = {name: values[number] for name, values in columns.items()}
+        yield matches_of(str(token), arrays=sample_arrays, like=like)
 
 
 def _evaluator(options: Mapping[str, Any]) -> MapEvaluator:
-    """Make the evaluator whose rules a manifest tells."""
-    values = options["settings"]
-    lists = {key: tuple(value) for key, value in values.items() if isinstance(value, list)}
-    canvas = {"grid": BEVGrid(**values["grid"])} if values.get("grid") else {}
-    settings = MetricSettings(**{**values, **lists, **canvas})
+    """Create an evaluator from the rules of a manifest."""
+    values = dict(options["settings"])
+    for key, value in values.items():
+        if isinstance(value, list):  # JSON has no tuples
+            values[key] = tuple(value)
+    if values.get("grid"):
+        values["grid"] = BEVGrid(**values["grid"])
+    settings = MetricSettings(**values)
     points = options["ground_truth_points"]
     return MapEvaluator.named(options["metrics"], settings, ground_truth_points=points)

@@ -43,8 +43,8 @@ class Sample(_Sides):
     """
 
     @cached_property
-    def shared(self) -> dict[Any, Any]:
-        """Cache of intermediate results that several metrics need, by the rules behind them."""
+    def cache(self) -> dict[Any, Any]:
+        """Intermediate results that several metrics need, by the rules behind them."""
         return {}
 
 

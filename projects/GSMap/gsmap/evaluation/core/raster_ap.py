@@ -1,8 +1,11 @@
-"""AP_raster of MapVR: drawn, dilated masks, greedy COCO matching, 101-point AP.
+"""AP_raster of MapVR: drawn and dilated masks, greedy COCO matching, 101-point AP.
 
-Rules (equal to MapVR's evaluator): 8 pixels per metre, points rounded to pixels, lines one pixel
-thick and polygons filled, everything dilated 5 x 5; predictions with a score below 0.05 or fewer
-than two points are dropped, and at most 100 per class and sample count.
+Rules, equal to MapVR's evaluator:
+
+- The canvas has 8 pixels per metre, and points are rounded to pixels.
+- Lines are one pixel thick and polygons are filled; both are dilated by 5 x 5 pixels.
+- Predictions with a score below 0.05 or fewer than two points are dropped.
+- At most 100 predictions of a class count in a sample.
 """
 
 from collections.abc import Iterable
@@ -14,6 +17,7 @@ import numpy as np
 from gsmap.evaluation.core import raster_kernels as kernels
 from gsmap.evaluation.core.average_precision import interpolated_ap
 from gsmap.evaluation.core.matches import (
+    ClassDetections,
     FrameMatches,
     MatchTable,
     assign,
@@ -33,9 +37,10 @@ POLYGON_THRESHOLDS = (0.5, 0.55, 0.6, 0.65, 0.7, 0.75)
 MIN_SCORE = 0.05
 MAX_PREDICTIONS = 100  # of a class and sample
 RECALL_LIMITS = (1, 10, 100)
-NUSCENES_GRID = BEVGrid((-15.0, 15.0), (-30.0, 30.0))
+NUSCENES_GRID = BEVGrid(x_range=(-15.0, 15.0), y_range=(-30.0, 30.0))
 _MOST_PX = 2e7  # of a canvas: 560 m by 560 m at 8 pixels per metre
 _FAR_PX = 2.0**20  # farther points are pulled in, so that they fit the integers of the drawing
+_GROUP_FIGURES = ("AP", "AR", "recall", "mIoU")  # prefixes of the figures with a mean per group
 
 
 @register_metric
@@ -45,10 +50,10 @@ class RasterConfig(Metric):
 
     Args:
         classes: Names of the classes; a label is an index into them.
-        grid: Extent of the canvas; its raster is not used.
-        polygon_classes: The classes that are filled; names that do not occur are allowed.
+        grid: Extent of the canvas in metres; its raster is not used.
+        polygon_classes: Names of the classes that are filled; unknown names are allowed.
         px_per_m: Pixels per metre.
-        dilation_px: Side of the square that masks are dilated by; odd.
+        dilation_px: Side in pixels of the square that masks are dilated by; odd.
 
     Raises:
         ValueError: If a value is out of its range.
@@ -91,17 +96,25 @@ class RasterConfig(Metric):
     @property
     def thresholds(self) -> dict[str, tuple[float, ...]]:
         """Smallest IoUs of a match of each class, by its name. C x (T,)"""
-        found = [POLYGON_THRESHOLDS if polygon else LINE_THRESHOLDS for polygon in self.is_polygon]
-        return dict(zip(self.classes, found, strict=True))
+        thresholds = {}
+        for name, is_polygon in zip(self.classes, self.is_polygon, strict=True):
+            thresholds[name] = POLYGON_THRESHOLDS if is_polygon else LINE_THRESHOLDS
+        return thresholds
 
     @classmethod
     def of(cls, settings: MetricSettings) -> "RasterConfig":
-        """Return the metric by the settings of a command or config."""
-        return cls(settings.classes, settings.canvas, settings.polygon_classes)
+        """Create the metric from the settings of a command or config."""
+        return cls(
+            classes=settings.classes,
+            grid=settings.canvas,
+            polygon_classes=settings.polygon_classes,
+        )
 
     def match(self, sample: Sample) -> FrameMatches:
         """Match the predictions of one sample with its ground truth (`match_raster`)."""
-        return match_raster(sample.predictions, sample.ground_truth, self, sample.token)
+        return match_raster(
+            sample.predictions, sample.ground_truth, config=self, token=sample.token
+        )
 
     def reports(self, table: MatchTable) -> list[MetricReport]:
         """Compute AP_raster from the matches of all samples (`raster_report`)."""
@@ -111,7 +124,12 @@ class RasterConfig(Metric):
 def pixels_from_metres(points: FloatArray, config: RasterConfig) -> IntArray:
     """Round points to pixels, halves to even, with the arithmetic of the reference evaluator.
 
-    (x, y) in metres (M, 2) -> column and row (M, 2)
+    Args:
+        points: Points (x, y) in metres. (M, 2)
+        config: Rules of the metric.
+
+    Returns:
+        Column and row of each point. (M, 2)
     """
     origin = (config.grid.x_range[0], config.grid.y_range[0])
     pixels = (points - origin) / config.grid.extent_m * config.size_px
@@ -120,14 +138,26 @@ def pixels_from_metres(points: FloatArray, config: RasterConfig) -> IntArray:
 
 
 def rasterize(elements: MapElements, config: RasterConfig) -> kernels.WordArray:
-    """Draw and dilate elements of known classes, 64 columns to a word. N -> (N, H, words)
+    """Draw and dilate the elements of a sample, each to a separate mask.
 
-    The parts of an element outside the canvas are cut off before the dilation.
+    Parts of an element outside the canvas are cut off before the dilation.
+
+    Args:
+        elements: Elements with labels in [0, C). N in number.
+        config: Rules of the metric.
+
+    Returns:
+        Masks with 64 columns to a word. (N, H, words)
     """
     pixels = pixels_from_metres(elements.with_coordinates(2).points, config)
-    filled = np.array(config.is_polygon)[elements.labels]
-    height_width = config.size_px[::-1]
-    return kernels.draw(pixels, elements.offsets, filled, height_width, config.dilation_px // 2)
+    columns, rows = config.size_px
+    return kernels.draw(
+        pixels,
+        offsets=elements.offsets,
+        filled=np.array(config.is_polygon)[elements.labels],
+        size=(rows, columns),
+        radius=config.dilation_px // 2,
+    )
 
 
 def match_raster(
@@ -137,67 +167,94 @@ def match_raster(
 
     Args:
         predictions: Elements with scores.
-        ground_truth: Elements at full resolution.
-        config: The metric's settings.
-        token: The sample's name.
+        ground_truth: Annotated elements at full resolution.
+        config: Rules of the metric.
+        token: Name of the sample.
 
     Raises:
-        ValueError: As of `check_pair`.
+        ValueError: As for `check_pair`.
     """
-    check_pair(predictions, ground_truth, config.classes, token)
-    num_classes, gt_labels = len(config.classes), ground_truth.labels
-    rows = ranked_predictions(predictions, num_classes, MIN_SCORE, MAX_PREDICTIONS)
-    gt_index = np.flatnonzero(gt_labels >= 0)
-    pred = rasterize(predictions.select(rows), config)
-    gt = rasterize(ground_truth.select(gt_index), config)
-    labels, gt_labels = predictions.labels[rows], gt_labels[gt_index]
-    ious = kernels.mask_ious(pred, gt, labels, gt_labels)
-    thresholds = np.array(list(config.thresholds.values()))
-    matched = assign(ious, thresholds[labels])
-    matched_iou = np.full((len(rows), len(gt_index) + 1), np.nan)  # column -1: no match
-    matched_iou[:, :-1] = ious
-    quality = matched_iou[np.arange(len(rows)), matched[:, 0]]
-    matched_gt = np.append(gt_index, -1)[matched]
-    num_gts = np.bincount(gt_labels, minlength=num_classes)
-    class_iou = kernels.class_ious(pred, gt, labels, gt_labels, num_classes)
-    scores = predictions.confidence[rows]
-    return FrameMatches(token, rows, labels, scores, matched_gt, quality, num_gts, class_iou)
+    check_pair(predictions, ground_truth, classes=config.classes, token=token)
+    num_classes = len(config.classes)
+    rows = ranked_predictions(
+        predictions, num_classes=num_classes, min_score=MIN_SCORE, max_num=MAX_PREDICTIONS
+    )
+    gt_index = np.flatnonzero(ground_truth.labels >= 0)
+    pred_labels = predictions.labels[rows]
+    gt_labels = ground_truth.labels[gt_index]
+    pred_masks = rasterize(predictions.select(rows), config)
+    gt_masks = rasterize(ground_truth.select(gt_index), config)
+    ious = kernels.mask_ious(
+        pred_masks, gts=gt_masks, pred_labels=pred_labels, gt_labels=gt_labels
+    )  # (N, K)
+    class_thresholds = np.array(list(config.thresholds.values()))
+    matched = assign(ious, thresholds=class_thresholds[pred_labels])  # (N, T)
+    padded_ious = np.full((len(rows), len(gt_index) + 1), fill_value=np.nan)  # column -1: no match
+    padded_ious[:, :-1] = ious
+    return FrameMatches(
+        token=token,
+        pred_index=rows,
+        labels=pred_labels,
+        scores=predictions.confidence[rows],
+        matched_gt=np.append(gt_index, -1)[matched],
+        quality=padded_ious[np.arange(len(rows)), matched[:, 0]],
+        num_gts=np.bincount(gt_labels, minlength=num_classes),
+        class_iou=kernels.class_ious(pred_masks, gt_masks, pred_labels, gt_labels, num_classes),
+    )
 
 
 def _mean(values: Iterable[float]) -> float:
-    """Return the mean of the values that are defined."""
+    """Compute the mean of the values that are defined."""
     defined = [value for value in values if value != UNDEFINED]
     return float(np.mean(defined)) if defined else UNDEFINED
+
+
+def _class_figures(ranked: ClassDetections, ious: FloatArray) -> dict[str, float]:
+    """Compute the figures of one class from its predictions and its IoU in each sample (S,)."""
+    aps = [interpolated_ap(hits, num_gts=ranked.num_gts) for hits in ranked.hits.T]
+    figures = class_figures(ranked, aps=aps, absent=UNDEFINED)
+    for limit in RECALL_LIMITS:
+        hits = ranked.hits[ranked.ranks < limit].sum(axis=0)
+        figures[f"AR@{limit}"] = _mean(hits / ranked.num_gts if ranked.num_gts else ())
+    figures["mIoU"] = _mean(ious[~np.isnan(ious)])
+    return figures
 
 
 def raster_report(matches: MatchTable, config: RasterConfig) -> MetricReport:
     """Compute AP_raster from the matches of all samples.
 
     A class without ground truth is left out of the means.
+
+    Args:
+        matches: Matches of all samples by the rules of ``config``.
+        config: Rules of the metric.
     """
     detections = matches.detections(config.thresholds)
     figures: dict[str, dict[str, float]] = {}
-    for c, (name, found) in enumerate(detections.items()):
-        aps = [interpolated_ap(hits, found.num_gts) for hits in found.hits.T]
-        figures[name] = of_class = class_figures(found, aps, absent=UNDEFINED)
-        for limit in RECALL_LIMITS:
-            hits = found.hits[found.ranks < limit].sum(axis=0)
-            of_class[f"AR@{limit}"] = _mean(hits / found.num_gts if found.num_gts else ())
-        ious = matches.class_iou(c)
-        of_class["mIoU"] = _mean(ious[~np.isnan(ious)])
+    metrics: dict[str, float] = {}
+    for label, (name, ranked) in enumerate(detections.items()):
+        figures[name] = _class_figures(ranked, matches.class_iou(label))
+        for key, value in figures[name].items():
+            metrics[f"{name}/{key}"] = value
+
     groups: dict[str, list[str]] = {}
-    for name, polygon in zip(config.classes, config.is_polygon, strict=True):
-        groups.setdefault("polygon" if polygon else "line", []).append(name)
-    metrics = {f"{name}/{key}": v for name, found in figures.items() for key, v in found.items()}
+    for name, is_polygon in zip(config.classes, config.is_polygon, strict=True):
+        group = "polygon" if is_polygon else "line"
+        groups.setdefault(group, []).append(name)
     for group, names in groups.items():
         for key in figures[names[0]]:
-            if key.startswith(("AP", "AR", "recall", "mIoU")):
+            if key.startswith(_GROUP_FIGURES):
                 metrics[f"{group}/{key}"] = _mean(figures[name][key] for name in names)
-    metrics["mAP"] = _mean(found["AP"] for found in figures.values())
-    metrics["mIoU"] = _mean(found["mIoU"] for found in figures.values())
-    present = sum(found.num_gts > 0 for found in detections.values())
-    metrics["num_absent_classes"] = float(len(config.classes) - present)
+    metrics["mAP"] = _mean(of_class["AP"] for of_class in figures.values())
+    metrics["mIoU"] = _mean(of_class["mIoU"] for of_class in figures.values())
+    num_present = sum(ranked.num_gts > 0 for ranked in detections.values())
+    metrics["num_absent_classes"] = float(len(config.classes) - num_present)
     metrics["num_samples"] = float(len(matches))
-    flat = {f"raster/{key}": value for key, value in metrics.items()}
-    tokens = matches.tokens
-    return MetricReport("raster", groups, flat, detections, tokens, by_distance=False)
+    return MetricReport(
+        name="raster",
+        groups=groups,
+        metrics={f"raster/{key}": value for key, value in metrics.items()},
+        detections=detections,
+        tokens=matches.tokens,
+        by_distance=False,
+    )

@@ -1,61 +1,72 @@
-"""Compiled drawing and comparison of dilated lines and polygons; ``raster_ap`` is the only user.
+"""Compiled drawing and comparison of dilated lines and polygons.
 
-The pixels are those of OpenCV 4.8 to 4.10 (8-connected lines of one pixel, even-odd fill), with
-which the reference figures were made. OpenCV before and after fills other pixels along the outline
-of a polygon, enough to move an AP in the third digit; so the rule stands here, for every version.
+Pixels are equal to OpenCV 4.8 to 4.10 (8-connected lines of one pixel, even-odd fill), with which
+the reference figures were computed. Other versions of OpenCV fill different pixels along the
+outline of a polygon, enough to change AP in the third digit. The drawing is implemented here to be
+independent of the version.
 
-A mask is the canvas with 64 pixels of a row to a word: bit b of word w is column 64 w + b.
+A mask stores 64 pixels of a row in a word: bit b of word w is column 64 w + b.
 """
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-import gsmap.utils.compilation  # noqa: F401 - says that kernels are compiled
+import gsmap.utils.compilation  # noqa: F401 - reports that kernels are compiled
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray
 
 WordArray = npt.NDArray[np.uint64]
 
-_ALL = np.uint64(0xFFFFFFFFFFFFFFFF)
-_ONE = 65536  # crossings are in 1/65536 of a pixel
+_ALL_BITS = np.uint64(0xFFFFFFFFFFFFFFFF)
+_PER_PIXEL = 65536  # units of a crossing in a pixel
 
 
 @njit(cache=True)
 def _stamp(mask: WordArray, width: int, row: int, left: int, right: int, radius: int) -> None:
-    """Set the pixels ``left`` to ``right`` of a row, dilated by a square, inside the mask."""
-    low, high = max(left - radius, 0), min(right + radius, width - 1)
-    first, last = low >> 6, high >> 6
-    head, tail = _ALL << np.uint64(low & 63), _ALL >> np.uint64(63 - (high & 63))
+    """Set the pixels ``left`` to ``right`` of a row, dilated by a square and cut to the mask."""
+    low = max(left - radius, 0)
+    high = min(right + radius, width - 1)
+    first = low >> 6
+    last = high >> 6
+    head = _ALL_BITS << np.uint64(low & 63)
+    tail = _ALL_BITS >> np.uint64(63 - (high & 63))
     for y in range(max(row - radius, 0), min(row + radius + 1, mask.shape[0])):
         if first == last:
             mask[y, first] |= head & tail
         else:
             mask[y, first] |= head
             for word in range(first + 1, last):
-                mask[y, word] = _ALL
+                mask[y, word] = _ALL_BITS
             mask[y, last] |= tail
 
 
 @njit(cache=True)
 def _side(value: int, limit: int) -> int:
-    """Return -1 below 0, 1 above the limit, 0 between."""
+    """Return -1 below 0, 1 above the limit, and 0 between."""
     return -1 if value < 0 else (1 if value > limit else 0)
 
 
 @njit(cache=True)
 def _clip_segment(a: IntArray, b: IntArray, height: int, width: int) -> bool:
-    """Move the ends of a segment to where it meets the border, and say if it has a part inside.
+    """Clip a segment to the mask in place, and return whether a part of it is inside.
 
-    First the rows are brought inside, then the columns; each new coordinate is truncated.
+    Rows are clipped before columns; each new coordinate is truncated to an integer.
+
+    Args:
+        a: Column and row of the first end. (2,)
+        b: Column and row of the second end. (2,)
+        height: Number of rows of the mask.
+        width: Number of columns of the mask.
     """
     for axis in (1, 0):
         limit = (width if axis == 0 else height) - 1
         other = 1 - axis
         other_limit = (width if other == 0 else height) - 1
-        beyond_a, beyond_b = _side(a[axis], limit), _side(b[axis], limit)
+        beyond_a = _side(a[axis], limit=limit)
+        beyond_b = _side(b[axis], limit=limit)
         if beyond_a * beyond_b > 0:
             return False
-        if _side(a[other], other_limit) * _side(b[other], other_limit) > 0:
+        if _side(a[other], limit=other_limit) * _side(b[other], limit=other_limit) > 0:
             return False
         for end, beyond in ((a, beyond_a), (b, beyond_b)):
             if beyond:
@@ -63,32 +74,35 @@ def _clip_segment(a: IntArray, b: IntArray, height: int, width: int) -> bool:
                 along = float(border - end[axis]) * (b[other] - a[other])
                 end[other] += int(along / (b[axis] - a[axis]))
                 end[axis] = border
-    return _side(a[0], width - 1) == 0 and _side(b[0], width - 1) == 0
+    return _side(a[0], limit=width - 1) == 0 and _side(b[0], limit=width - 1) == 0
 
 
 @njit(cache=True)
 def _draw_segment(mask: WordArray, width: int, start: IntArray, end: IntArray, radius: int) -> None:
-    """Draw an 8-connected segment between two points inside the mask, dilated."""
+    """Draw a dilated 8-connected segment between two points (column, row) inside the mask."""
     if end[0] < start[0]:
-        start, end = end, start
-    dx, dy = end[0] - start[0], abs(end[1] - start[1])
-    down = 1 if end[1] >= start[1] else -1
-    x, y = start[0], start[1]
-    steep = dy > dx
-    major, minor = max(dx, dy), min(dx, dy)
+        start, end = end, start  # from left to right
+    dx = end[0] - start[0]
+    dy = abs(end[1] - start[1])
+    row_step = 1 if end[1] >= start[1] else -1
+    x = start[0]
+    y = start[1]
+    is_steep = dy > dx
+    major = max(dx, dy)
+    minor = min(dx, dy)
     error = major - 2 * minor
-    run = x  # first pixel of the row that is being drawn
+    left = x  # first pixel of the current row
     for _ in range(major):
-        aside = error < 0
-        error += (2 * major if aside else 0) - 2 * minor
-        if steep or aside:
-            _stamp(mask, width, y, run, x, radius)
-            y += down
-            x += 1 if (aside or not steep) else 0
-            run = x
+        steps_aside = error < 0
+        error += (2 * major if steps_aside else 0) - 2 * minor
+        if is_steep or steps_aside:
+            _stamp(mask, width, row=y, left=left, right=x, radius=radius)
+            y += row_step
+            x += 1 if (steps_aside or not is_steep) else 0
+            left = x
         else:
             x += 1
-    _stamp(mask, width, y, run, x, radius)
+    _stamp(mask, width, row=y, left=left, right=x, radius=radius)
 
 
 @njit(cache=True)
@@ -97,24 +111,38 @@ def _fill(
 ) -> None:
     """Fill the inside of a polygon by the even-odd rule, dilated.
 
-    Row y holds the pixels between the crossings of the edges that span [y, y + 1), rounded to the
-    nearest pixel; down for edges that leave the mask (``cut``). ``edges`` (P, 2, 2) are two points
-    that fix each edge's slope: its ends, or where it meets the border of the mask.
+    In row y, pixels are filled between the crossings of the edges that span [y, y + 1). Crossings
+    are rounded to the nearest pixel, or down for edges that leave the mask.
+
+    Args:
+        mask: Mask to draw to. (H, words)
+        width: Number of columns W of the mask.
+        corners: Column and row of each corner. (P, 2)
+        edges: Two points that define the slope of each edge: its ends, or its crossings with the
+            border of the mask. (P, 2, 2)
+        cut: Whether each edge leaves the mask. (P,)
+        radius: Number of pixels that each pixel is dilated by.
     """
-    num_edges, height = len(corners), mask.shape[0]
-    x_start, slope = np.zeros(num_edges, np.int64), np.zeros(num_edges, np.int64)
-    low, high = np.zeros(num_edges, np.int64), np.zeros(num_edges, np.int64)
+    num_edges = len(corners)
+    height = mask.shape[0]
+    x_start = np.zeros(num_edges, dtype=np.int64)
+    slope = np.zeros(num_edges, dtype=np.int64)
+    low = np.zeros(num_edges, dtype=np.int64)
+    high = np.zeros(num_edges, dtype=np.int64)
     for i in range(num_edges):
-        a, b = corners[i], corners[(i + 1) % num_edges]
+        a = corners[i]
+        b = corners[(i + 1) % num_edges]
         if a[1] != b[1]:
-            first, last = edges[i, 0], edges[i, 1]
+            first = edges[i, 0]
+            last = edges[i, 1]
             # as C divides: no quotient of such numbers (2^37) rounds up to the next integer
-            slope[i] = int((last[0] - first[0]) * _ONE / (last[1] - first[1]))
-            low[i], high[i] = min(a[1], b[1]), max(a[1], b[1])
+            slope[i] = int((last[0] - first[0]) * _PER_PIXEL / (last[1] - first[1]))
+            low[i] = min(a[1], b[1])
+            high[i] = max(a[1], b[1])
             upper = first if a[1] < b[1] else last
-            x_start[i] = upper[0] * _ONE + (low[i] - upper[1]) * slope[i]
-            x_start[i] += 0 if cut[i] else _ONE // 2
-    crossings = np.zeros(num_edges, np.int64)
+            x_start[i] = upper[0] * _PER_PIXEL + (low[i] - upper[1]) * slope[i]
+            x_start[i] += 0 if cut[i] else _PER_PIXEL // 2
+    crossings = np.zeros(num_edges, dtype=np.int64)
     for row in range(max(0, low.min()), min(height, high.max())):
         count = 0
         for i in range(num_edges):
@@ -123,43 +151,57 @@ def _fill(
                 count += 1
         crossings[:count].sort()
         for i in range(0, count - 1, 2):
-            left, right = max(0, crossings[i] // _ONE), min(width - 1, crossings[i + 1] // _ONE)
+            left = max(0, crossings[i] // _PER_PIXEL)
+            right = min(width - 1, crossings[i + 1] // _PER_PIXEL)
             if left <= right:
-                _stamp(mask, width, row, left, right, radius)
+                _stamp(mask, width, row=row, left=left, right=right, radius=radius)
 
 
 @njit(cache=True)
 def draw(
     pixels: IntArray, offsets: IntArray, filled: BoolArray, size: tuple[int, int], radius: int
 ) -> WordArray:
-    """Draw and dilate elements, each on a canvas of its own. (N, H, words of W columns)
+    """Draw and dilate elements, each to a separate mask.
 
-    Points are column and row (M, 2), of element i ``offsets[i]:offsets[i + 1]``; ``filled`` ones
-    (N,) are polygons; ``size`` is H and W, ``radius`` half the dilating square, less the centre.
+    Args:
+        pixels: Column and row of the points of all elements. (M, 2)
+        offsets: Element i has the points ``offsets[i]:offsets[i + 1]``. (N + 1,)
+        filled: Whether each element is a polygon to fill. (N,)
+        size: Rows H and columns W of a mask.
+        radius: Number of pixels that each pixel is dilated by: (side - 1) / 2 of the square.
+
+    Returns:
+        Masks. (N, H, words), words = ceil(W / 64)
     """
     height, width = size
-    masks = np.zeros((len(filled), height, (width + 63) // 64), np.uint64)
+    num_words = (width + 63) // 64
+    masks = np.zeros((len(filled), height, num_words), dtype=np.uint64)
     for i in range(len(masks)):
         corners = pixels[offsets[i] : offsets[i + 1]]
         num_edges = len(corners) - (0 if filled[i] else 1)
-        edges = np.zeros((max(num_edges, 0), 2, 2), np.int64)
-        cut = np.zeros(len(edges), np.bool_)
+        edges = np.zeros((max(num_edges, 0), 2, 2), dtype=np.int64)
+        cut = np.zeros(len(edges), dtype=np.bool_)
         for j in range(len(edges)):
-            edges[j, 0], edges[j, 1] = corners[j], corners[(j + 1) % len(corners)]
-            for end in edges[j]:
-                cut[j] |= _side(end[0], width - 1) != 0 or _side(end[1], height - 1) != 0
-            if not cut[j] or _clip_segment(edges[j, 0], edges[j, 1], height, width):
-                _draw_segment(masks[i], width, edges[j, 0], edges[j, 1], radius)
-            if edges[j, 0, 1] == edges[j, 1, 1]:  # it says nothing about the slope
-                edges[j, 0], edges[j, 1] = corners[j], corners[(j + 1) % len(corners)]
+            start = corners[j]
+            end = corners[(j + 1) % len(corners)]
+            edges[j, 0] = start
+            edges[j, 1] = end
+            for point in edges[j]:
+                cut[j] |= _side(point[0], limit=width - 1) != 0
+                cut[j] |= _side(point[1], limit=height - 1) != 0
+            if not cut[j] or _clip_segment(edges[j, 0], edges[j, 1], height=height, width=width):
+                _draw_segment(masks[i], width, start=edges[j, 0], end=edges[j, 1], radius=radius)
+            if edges[j, 0, 1] == edges[j, 1, 1]:  # clipping left no slope
+                edges[j, 0] = start
+                edges[j, 1] = end
         if filled[i] and len(corners):
-            _fill(masks[i], width, corners, edges, cut, radius)
+            _fill(masks[i], width, corners=corners, edges=edges, cut=cut, radius=radius)
     return masks
 
 
 @njit(cache=True)
 def _count(word: int) -> int:
-    """Count the bits of a word; compilers know this pattern and use one instruction."""
+    """Count the bits of a word; compilers replace this pattern by one instruction."""
     pairs = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
     fours = (pairs & np.uint64(0x3333333333333333)) + (
         (pairs >> np.uint64(2)) & np.uint64(0x3333333333333333)
@@ -170,8 +212,9 @@ def _count(word: int) -> int:
 
 @njit(cache=True)
 def _count_shared(first: WordArray, second: WordArray) -> int:
-    """Count the pixels that two masks share."""
-    a, b = first.ravel(), second.ravel()  # one long loop, which vectorises
+    """Count the pixels that are set in both masks."""
+    a = first.ravel()  # one long loop vectorises
+    b = second.ravel()
     total = 0
     for word in range(len(a)):
         total += _count(a[word] & b[word])
@@ -182,7 +225,17 @@ def _count_shared(first: WordArray, second: WordArray) -> int:
 def mask_ious(
     preds: WordArray, gts: WordArray, pred_labels: IntArray, gt_labels: IntArray
 ) -> FloatArray:
-    """Return the IoU of each prediction with each ground truth of its class, 0 elsewhere. (N, K)"""
+    """Compute the IoU of each prediction with each ground truth of its class.
+
+    Args:
+        preds: Masks of the predictions. (N, H, words)
+        gts: Masks of the ground truths. (K, H, words)
+        pred_labels: Classes of the predictions. (N,)
+        gt_labels: Classes of the ground truths. (K,)
+
+    Returns:
+        IoU in [0, 1]; 0 for pairs of different classes. (N, K)
+    """
     ious = np.zeros((len(preds), len(gts)))
     gt_areas = [_count_shared(gts[k], gts[k]) for k in range(len(gts))]
     for i in range(len(preds)):
@@ -196,7 +249,7 @@ def mask_ious(
 
 @njit(cache=True)
 def _unite(masks: WordArray, chosen: BoolArray, union: WordArray) -> int:
-    """Write the union of the chosen masks, and return how many are chosen."""
+    """Write the union of the chosen masks to ``union``, and return their number."""
     union[:] = 0
     united = union.ravel()
     number = 0
@@ -217,7 +270,7 @@ def class_ious(
     gt_labels: IntArray,
     num_classes: int,
 ) -> FloatArray:
-    """IoU of the united predictions of each class with its united ground truths.
+    """Compute the IoU of the united predictions of each class with its united ground truths.
 
     Args:
         preds: Masks of the predictions. (N, H, words)
@@ -230,11 +283,11 @@ def class_ious(
         IoU in [0, 1]; NaN for a class with neither predictions nor ground truths. (C,)
     """
     ious = np.full(num_classes, np.nan)
-    pred_union = np.zeros(preds.shape[1:], np.uint64)
-    gt_union = np.zeros(gts.shape[1:], np.uint64)
+    pred_union = np.zeros(preds.shape[1:], dtype=np.uint64)
+    gt_union = np.zeros(gts.shape[1:], dtype=np.uint64)
     for label in range(num_classes):
-        num_preds = _unite(preds, pred_labels == label, pred_union)
-        num_gts = _unite(gts, gt_labels == label, gt_union)
+        num_preds = _unite(preds, chosen=pred_labels == label, union=pred_union)
+        num_gts = _unite(gts, chosen=gt_labels == label, union=gt_union)
         if num_preds + num_gts > 0:
             shared = _count_shared(pred_union, gt_union)
             pred_area = _count_shared(pred_union, pred_union)

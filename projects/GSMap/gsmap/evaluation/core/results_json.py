@@ -1,7 +1,8 @@
 """Result and ground-truth files in the JSON form of MapTR and MapVR.
 
-Results: ``{"meta": ..., "results": [{"sample_token", "vectors": [{"pts", "pts_num", "cls_name",
-"type", "confidence_level"}]}]}``; ground truth: ``{"GTs": [...]}`` without confidence.
+A file of results is ``{"meta": ..., "results": [{"sample_token", "vectors": [{"pts", "pts_num",
+"cls_name", "type", "confidence_level"}]}]}``. A file of ground truth is ``{"GTs": [...]}``, without
+confidence.
 """
 
 import heapq
@@ -22,106 +23,134 @@ from gsmap.utils.files import atomic_write
 from gsmap.utils.json_items import Place, items_of
 from gsmap.utils.shards import ShardFile
 
-RESULTS_KEY, GROUND_TRUTH_KEY = "results", "GTs"
+RESULTS_KEY = "results"
+GROUND_TRUTH_KEY = "GTs"
 BEZIER = "bezier"
-"""Curves in place of ``pts``: ``degree`` and ``pts``; `compact_results` writes them."""
+"""Key of a curve with ``degree`` and ``pts`` in place of points; `compact_results` writes it."""
 THREE_D = "3D"
+"""Key of the number of samples with heights among ignored elements."""
 SHARD_KIND = "results"
 _LAST_LINE = "]}\n"
+_GAUSSIAN_FIELDS = ("scales", "rotations")
 
 
 def vectors_of(elements: MapElements, classes: Sequence[str]) -> list[dict[str, Any]]:
-    """Convert predictions to a sample's ``vectors``, with their Gaussians if they have any."""
-    labels, scores = elements.labels.tolist(), elements.confidence.tolist()
-    vectors: list[dict[str, Any]] = [
-        {
+    """Convert predictions to the ``vectors`` of a sample, with their Gaussians if they have any.
+
+    Args:
+        elements: Predicted elements, in metres in the annotation frame.
+        classes: Names of the classes; a label is an index into them.
+    """
+    labels = elements.labels.tolist()
+    scores = elements.confidence.tolist()
+    vectors: list[dict[str, Any]] = []
+    for points, label, score in zip(elements.polylines, labels, scores, strict=True):
+        vector = {
             "pts": points.tolist(),
             "pts_num": len(points),
             "cls_name": classes[label],
             "type": label,
             "confidence_level": score,
         }
-        for points, label, score in zip(elements.polylines, labels, scores, strict=True)
-    ]
-    for name in ("scales", "rotations"):
+        vectors.append(vector)
+    for name in _GAUSSIAN_FIELDS:
         values = getattr(elements, name)
-        if values is not None:
-            for vector, a, b in zip(vectors, elements.offsets, elements.offsets[1:], strict=False):
-                vector[f"gaussian_{name}"] = values[a:b].tolist()
+        if values is None:
+            continue
+        for vector, (start, end) in zip(vectors, pairwise(elements.offsets), strict=True):
+            vector[f"gaussian_{name}"] = values[start:end].tolist()
     return vectors
 
 
 class SampleFile:
-    """The samples of a result or ground-truth file, one after another; never all in memory.
+    """Iterable of the samples of a result or ground-truth file, which are read one by one.
 
     Args:
-        path: The file.
-        key: ``results`` or ``GTs``.
-        classes: Names of the classes; elements of others get the label -1, which no metric counts.
+        path: Path of the file.
+        key: Key of the samples: ``results`` or ``GTs``.
+        classes: Names of the classes; elements of other classes get the label -1, which no metric
+            counts.
         gaussians: Whether to read the Gaussians of results where all elements have them.
 
     Attributes:
-        ignored: Of the samples so far, how many elements are of which other class, and how many
-            samples have points with heights (``THREE_D``).
-        about: What the file says of itself, after the last sample; a stranger's words.
+        ignored: Number of elements of each other class, and number of samples with heights
+            (``THREE_D``), in the samples so far.
+        about: Metadata of the file, after the last sample. It is not validated.
     """
 
     def __init__(
         self, path: str | Path, key: str, classes: Sequence[str], gaussians: bool = False
     ) -> None:
-        self.path, self._key, self._classes = Path(path), key, classes
+        self.path = Path(path)
+        self._key = key
+        self._classes = classes
         self._gaussians = gaussians
         self.ignored = Counter[str]()
         self.about: dict[str, Any] = {}
 
     def __iter__(self) -> Iterator[tuple[str, MapElements, Place]]:
-        """Yield token, elements and place of each sample; errors are those of `raw`."""
+        """Yield token, elements and place of each sample; raises the errors of `raw`."""
         for _, token, elements, place in self.raw():
             yield token, elements, place
 
     def raw(self) -> Iterator[tuple[dict[str, Any], str, MapElements, Place]]:
-        """Yield what stands in the file, token, elements and place of each sample.
+        """Yield the JSON object, token, elements and place of each sample.
 
         Raises:
             FileNotFoundError: If the file does not exist.
-            ValueError: If it has no list under the key, a sample is malformed or has no token, or a
-                token occurs twice; the message names the file and the sample.
+            ValueError: If the file has no list under the key, a sample is malformed or has no
+                token, or a token occurs twice; the message names the file and the sample.
         """
-        seen, form = set(), f'{{"{self._key}": [{{"sample_token": ..., "vectors": [...]}}, ...]}}'
-        beside: dict[str, Any] = {"meta": None}
-        for item, place in items_of(self.path, self._key, f"it must be {form}", beside):
+        tokens = set()
+        form = f'{{"{self._key}": [{{"sample_token": ..., "vectors": [...]}}, ...]}}'
+        other_entries: dict[str, Any] = {"meta": None}
+        for item, place in items_of(self.path, self._key, f"it must be {form}", other_entries):
             token, elements = self._convert(item, self.ignored)
-            if token in seen:
+            if token in tokens:
                 raise InputError(f"{self.path} holds sample {token!r} more than once.")
-            seen.add(token)
+            tokens.add(token)
             yield item, token, elements, place
-        self.about = beside["meta"] if isinstance(beside["meta"], dict) else {}
+        meta = other_entries["meta"]
+        self.about = meta if isinstance(meta, dict) else {}
 
     def tokens(self) -> list[str]:
         """Return the tokens of all samples."""
-        return [token for token, *_ in SampleFile(self.path, self._key, self._classes)]
+        file = SampleFile(self.path, key=self._key, classes=self._classes)
+        return [token for token, _, _ in file]
 
     def load(self, token: str, place: Place) -> MapElements:
-        """Read the elements of one sample again; ValueError if it is no longer in that place."""
+        """Read the elements of one sample at random access.
+
+        Args:
+            token: Name of the sample.
+            place: Place of the sample, as iterating yields it: start and length in bytes.
+
+        Raises:
+            ValueError: If the sample is not in this place.
+        """
         start, length = place
         with self.path.open("rb") as file, suppress(ValueError):
             file.seek(start)
-            found, elements = self._convert(json.loads(file.read(length)), Counter())
-            if found == token:
+            item = json.loads(file.read(length))
+            token_in_file, elements = self._convert(item, ignored=Counter())
+            if token_in_file == token:
                 return elements
         raise InputError(
             f"{self.path} was changed while it was read: end what writes there, and start again."
         )
 
     def _convert(self, item: Any, ignored: Counter[str]) -> tuple[str, MapElements]:
-        """Return token and elements of a sample, and count what is ignored."""
+        """Convert the JSON object of a sample to token and elements, and count ignored elements."""
         if not isinstance(item, dict) or not {"sample_token", "vectors"} <= item.keys():
             raise InputError(f"{self.path}: {item!r:.80} has no sample_token or no vectors.")
         token = str(item["sample_token"])
         try:
-            scored = self._key == RESULTS_KEY
             elements = read_vectors(
-                item["vectors"], self._classes, ignored, scored=scored, gaussians=self._gaussians
+                item["vectors"],
+                classes=self._classes,
+                ignored=ignored,
+                scored=self._key == RESULTS_KEY,
+                gaussians=self._gaussians,
             )
             return token, elements
         except (ValueError, KeyError, TypeError, OverflowError) as error:
@@ -141,58 +170,62 @@ def read_vectors(
     """Convert the ``vectors`` of one sample of a file.
 
     Args:
-        vectors: Elements as the file has them.
-        classes: Names of the classes; elements of others get the label -1.
-        ignored: Counts elements of other classes by their class, and samples with heights.
-        scored: Whether each element needs a confidence.
+        vectors: JSON objects of the elements.
+        classes: Names of the classes; elements of other classes get the label -1.
+        ignored: Number of elements of each other class, and of samples with heights; modified.
+        scored: Whether each element must have a confidence.
         gaussians: Whether to read the Gaussians where all elements have them.
 
     Raises:
         KeyError: If an entry is missing.
-        TypeError: If an entry has another type.
+        TypeError: If an entry has a wrong type.
         ValueError: If a value is not allowed.
     """
     label_of = {name: label for label, name in enumerate(classes)}
-    if not all(isinstance(v["cls_name"], str) for v in vectors):
+    names = [vector["cls_name"] for vector in vectors]
+    if not all(isinstance(name, str) for name in names):
         raise TypeError("cls_name is no text")
-    ignored.update(v["cls_name"] for v in vectors if v["cls_name"] not in label_of)
+    ignored.update(name for name in names if name not in label_of)
     polylines = [_points_of(vector) for vector in vectors]
-    if any(len(point) == 3 for points in polylines for point in points[:1]):
+    if any(len(points) and len(points[0]) == 3 for points in polylines):
         ignored[THREE_D] += 1
-    extra = {
-        name: [v[f"gaussian_{name}"] for v in vectors]
-        for name in ("scales", "rotations")
-        if gaussians and vectors and all(f"gaussian_{name}" in v for v in vectors)
-    }
+    gaussian_fields = {}
+    for name in _GAUSSIAN_FIELDS if gaussians and vectors else ():
+        key = f"gaussian_{name}"
+        if all(key in vector for vector in vectors):
+            gaussian_fields[name] = [vector[key] for vector in vectors]
+    scores = [vector["confidence_level"] for vector in vectors] if scored else None
     elements = MapElements.from_polylines(
         polylines,
-        [label_of.get(v["cls_name"], -1) for v in vectors],
-        [v["confidence_level"] for v in vectors] if scored else None,
-        **extra,
+        labels=[label_of.get(name, -1) for name in names],
+        scores=scores,
+        **gaussian_fields,
     )
-    _require_near(elements)
+    _check_lengths(elements)
     return elements
 
 
-def _require_near(elements: MapElements) -> None:
-    """Refuse lines that no map around a vehicle has; what resamples them would take all memory.
+def _check_lengths(elements: MapElements) -> None:
+    """Check that lines are as short as in a map around a vehicle; resampling takes memory.
 
     Raises:
-        ValueError: If a point is too far, or a line too long.
+        ValueError: If a point is too far from the vehicle, or a line too long.
     """
     points = elements.points
     if not len(points):
         return
-    widest = 2 * float(np.abs(points).max()) * points.shape[1] ** 0.5  # no step is longer
-    if widest * len(points) <= FARTHEST_M:
+    max_coordinate = np.abs(points).max()
+    max_step = 2 * float(max_coordinate) * points.shape[1] ** 0.5
+    if max_step * len(points) <= FARTHEST_M:
         return
     steps = np.linalg.norm(np.diff(points, axis=0, prepend=points[:1]), axis=1)
     starts = elements.offsets[:-1]
     steps[starts[starts < len(steps)]] = 0.0
     total = steps.sum()
-    if np.abs(points).max() > FARTHEST_M or total > FARTHEST_M:
-        lengths = [steps[a:b].sum() for a, b in pairwise(elements.offsets)]
-        if (worst := max(np.abs(points).max(), *lengths)) > FARTHEST_M:
+    if max_coordinate > FARTHEST_M or total > FARTHEST_M:
+        lengths = [steps[start:end].sum() for start, end in pairwise(elements.offsets)]
+        worst = max([max_coordinate, *lengths])
+        if worst > FARTHEST_M:
             raise InputError(
                 f"a line of {worst:.3g} m, or that far from the vehicle: at most "
                 f"{FARTHEST_M / 1000:g} km are read"
@@ -204,31 +237,32 @@ def _require_near(elements: MapElements) -> None:
 
 
 def _points_of(vector: Mapping[str, Any]) -> Any:
-    """Return the points of a vector, or those of its Bezier curve."""
+    """Return the points of a vector, or points on its Bezier curve."""
     if "pts" in vector or BEZIER not in vector:
         return vector["pts"]
     curve = vector[BEZIER]
     if not isinstance(curve["degree"], int):
         raise TypeError(f"the degree {curve['degree']!r:.20} is no whole number")
-    return curve_points(curve["pts"], curve["degree"]).tolist()
+    return curve_points(curve["pts"], degree=curve["degree"]).tolist()
 
 
 def read_samples(
     path: str | Path, key: str, classes: Sequence[str], gaussians: bool = False
 ) -> tuple[dict[str, MapElements], Counter[str]]:
-    """Read all samples of a file; errors are those of ``SampleFile``.
+    """Read all samples of a file; raises the errors of ``SampleFile``.
 
     Args:
-        path: The file.
-        key: ``results`` or ``GTs``.
-        classes: Names of the classes; elements of others get the label -1.
+        path: Path of the file.
+        key: Key of the samples: ``results`` or ``GTs``.
+        classes: Names of the classes; elements of other classes get the label -1.
         gaussians: Whether to read the Gaussians of results where all elements have them.
 
     Returns:
-        The elements of each sample, by token; and what is ignored.
+        Elements of each sample by token, and the number of ignored elements of each other class.
     """
-    file = SampleFile(path, key, classes, gaussians)
-    return {token: elements for token, elements, _ in file}, file.ignored
+    file = SampleFile(path, key=key, classes=classes, gaussians=gaussians)
+    samples = {token: elements for token, elements, _ in file}
+    return samples, file.ignored
 
 
 def write_results(
@@ -237,16 +271,17 @@ def write_results(
     meta: Mapping[str, Any] | None = None,
     key: str = RESULTS_KEY,
 ) -> None:
-    """Write a file of results or ground truth, which appears only when it is whole.
+    """Write a file of results or ground truth; the file appears when it is complete.
 
     Args:
-        path: File to write.
-        samples: Tokens and vectors (``vectors_of``), taken one by one.
-        meta: What to say about the file, in JSON's types.
-        key: ``results`` or ``GTs``.
+        path: Path of the file.
+        samples: Token and vectors (``vectors_of``) of each sample; may be a generator.
+        meta: Metadata of the file, in types of JSON.
+        key: Key of the samples: ``results`` or ``GTs``.
     """
+    meta_text = json.dumps(dict(meta or {}))
     with atomic_write(path) as file:
-        file.write(f'{{"meta":{json.dumps(dict(meta or {}))},"{key}":[')
+        file.write(f'{{"meta":{meta_text},"{key}":[')
         for number, (token, vectors) in enumerate(samples):
             sample = {"sample_token": token, "vectors": vectors}
             file.write(",\n" if number else "\n")
@@ -255,36 +290,49 @@ def write_results(
 
 
 def merge_results(path: Path, shards: Sequence[ShardFile]) -> int:
-    """Write a result file from its shards (``find_shards``) and return how many samples it has.
+    """Write a result file from its shards, with the samples in the order of their tokens.
 
-    The samples are in the order of their tokens.
+    Args:
+        path: Path of the result file.
+        shards: Shards, as ``find_shards`` returns them.
+
+    Returns:
+        Number of samples.
 
     Raises:
-        ValueError: If the shards say other things about themselves, or a sample occurs twice.
+        ValueError: If the metadata of the shards differs, or a sample occurs twice.
     """
     with ExitStack() as stack, atomic_write(path) as out:
-        files = [stack.enter_context(s.path.open(encoding="utf-8")) for s in shards]
-        head, *others = [file.readline() for file in files]
-        if set(others) - {head}:
+        files = []
+        for shard in shards:
+            file = shard.path.open(encoding="utf-8")
+            files.append(stack.enter_context(file))
+        heads = [file.readline() for file in files]
+        head = heads[0]
+        if len(set(heads)) > 1:
             raise InputError(f"the shards of {path} have different first lines: make them anew.")
         out.write(head.removesuffix("\n"))
-        count, last = 0, None
+        count = 0
+        last = None
         for token, line in heapq.merge(*map(_lines_by_token, files)):
             if last is not None and token <= last:
                 raise InputError(f"shards of {path} hold sample {token!r} twice or out of order.")
             out.write(",\n" if count else "\n")
             out.write(line)
-            count, last = count + 1, token
+            count += 1
+            last = token
         out.write("\n" + _LAST_LINE)
     return count
 
 
 def _lines_by_token(file: Iterable[str]) -> Iterator[tuple[str, str]]:
-    """Yield token and text of the samples in the lines that ``write_results`` writes."""
-    decoder, start = json.JSONDecoder(), len('{"sample_token":')
+    """Yield token and text of each sample, from the lines that ``write_results`` writes."""
+    decoder = json.JSONDecoder()
+    start = len('{"sample_token":')
     for line in file:
-        if line != _LAST_LINE:
-            token, _ = decoder.raw_decode(line, start)
-            if not isinstance(token, str):
-                raise InputError(f"{token!r:.80} is no token of a sample.")
-            yield token, line.rstrip(",\n")
+        if line == _LAST_LINE:
+            continue
+        token, _ = decoder.raw_decode(line, start)
+        if not isinstance(token, str):
+            raise InputError(f"{token!r:.80} is no token of a sample.")
+        yield token, line.rstrip(",\n")
