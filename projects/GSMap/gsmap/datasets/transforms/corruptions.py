@@ -1,7 +1,8 @@
-"""What goes wrong with cameras on the road: lost, moved and late ones, weather, blur, compression.
+"""Corruptions of camera images and calibrations: failures, shifts, delays, weather and compression.
 
-The kinds and their five severities follow MapBench and ImageNet-C. A sample's corruption depends on
-seed and token alone, and a severer one is the same one, stronger.
+The kinds of corruptions and their five severities follow MapBench and ImageNet-C. Random numbers
+depend only on the seed and the token of the sample. A higher severity uses equal random numbers and
+is stronger.
 """
 
 from collections.abc import Callable
@@ -30,46 +31,61 @@ Image = NDArray[np.uint8]
 
 _TURNS_DEG = (0.25, 0.5, 1.0, 2.0, 4.0)
 _SHIFTS_M = (0.02, 0.05, 0.1, 0.2, 0.4)
-_SIGHT_M = (200.0, 100.0, 60.0, 40.0, 25.0)  # in fog
-_DROPS = (0.001, 0.002, 0.0035, 0.0055, 0.008)  # share of pixels in which a streak of rain begins
-_EXPOSURES = (0.6, 0.4, 0.25, 0.15, 0.08)  # at night
-_NOISE = 12.0  # grey levels, of the darkest night
-_BLURS = (0.01, 0.02, 0.03, 0.045, 0.06)  # of the image's width
-_QUALITIES = (25, 18, 15, 10, 7)  # of JPEG, as ImageNet-C
-_FOG = 200.0  # its grey level
-_FARTHEST_M = 60.0  # of what stands on the ground
+_VISIBILITY_M = (200.0, 100.0, 60.0, 40.0, 25.0)  # in fog
+_RAIN_DENSITIES = (0.001, 0.002, 0.0035, 0.0055, 0.008)  # share of pixels with a streak of rain
+_EXPOSURES = (0.6, 0.4, 0.25, 0.15, 0.08)  # at night, relative to day
+_NIGHT_NOISE = 12.0  # standard deviation in grey levels without any light
+_BLUR_LENGTHS = (0.01, 0.02, 0.03, 0.045, 0.06)  # relative to the width of the image
+_JPEG_QUALITIES = (25, 18, 15, 10, 7)  # as in ImageNet-C
+_FOG_GREY = 200.0  # grey level of fog
+_MAX_FOG_DISTANCE_M = 60.0  # of a pixel, also above the horizon
 
 
 def generator(seed: int, token: str) -> np.random.Generator:
-    """Return the random numbers of a sample."""
+    """Return the random number generator of a sample.
+
+    Args:
+        seed: Seed of the transform, at least 0.
+        token: Token of the sample.
+    """
     return np.random.default_rng([seed, crc32(token.encode())])
 
 
-def lose_cameras(results: dict[str, Any], lost: NDArray[np.integer[Any]]) -> None:
-    """Black out views, and let them look where nothing of the map is, as inference does."""
+def lose_cameras(results: dict[str, Any], views: NDArray[np.integer[Any]]) -> None:
+    """Black out views and direct them away from the map, like missing cameras at inference.
+
+    Args:
+        results: Results of the pipeline; the lists ``img``, ``lidar2cam`` and ``lidar2img`` are
+            changed in place.
+        views: Indices of the views.
+    """
     finish_on_host(results)
-    for view in lost.tolist():
+    for view in views.tolist():
         results["img"][view] = np.zeros_like(results["img"][view])
-        _place(results, view, OUT_OF_SIGHT)
+        _set_extrinsics(results, view, lidar2cam=OUT_OF_SIGHT)
 
 
-def _place(results: dict[str, Any], view: int, lidar2cam: NDArray[np.float64]) -> None:
-    """Give a view another calibration. (4, 4)"""
-    matrices = results["img_aug_matrix"][view] @ results["cam2img"][view] @ lidar2cam
-    results["lidar2cam"][view], results["lidar2img"][view] = lidar2cam, matrices
+def _set_extrinsics(results: dict[str, Any], view: int, lidar2cam: NDArray[np.float64]) -> None:
+    """Set the extrinsics of a view and update its projection. (4, 4)"""
+    lidar2img = results["img_aug_matrix"][view] @ results["cam2img"][view] @ lidar2cam
+    results["lidar2cam"][view] = lidar2cam
+    results["lidar2img"][view] = lidar2img
 
 
 @TRANSFORMS.register_module()
 @dataclass(eq=False)
 class CorruptImages(BaseTransform):
-    """Corrupt the images of all cameras, or their calibration; behind ``LoadCameraImages``.
+    """Corrupt the images or the calibration of all cameras.
+
+    The transform must come after ``LoadCameraImages``.
 
     Args:
-        kind: One of ``KINDS``. ``camera_lost``: as many cameras as the severity says, all but one
-            at most. ``rotation`` and ``translation``: each camera is turned by 0.25 to 4 degrees or
-            shifted by 2 to 40 cm in a direction of its own, and the model does not know it.
-        severity: From 1 to 5.
-        seed: Of what is drawn.
+        kind: Kind of corruption, one of ``KINDS``. ``camera_lost`` blacks out as many cameras as
+            the severity, but at least one remains. ``rotation`` and ``translation`` change the
+            calibration but not the image of each camera, by 0.25 to 4 degrees about a random axis
+            or by 2 to 40 cm in a random direction.
+        severity: Severity from 1 to 5.
+        seed: Seed of the random numbers.
 
     Raises:
         ValueError: If the kind or the severity is unknown.
@@ -87,88 +103,143 @@ class CorruptImages(BaseTransform):
             )
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Corrupt ``results['img']`` or its matrices."""
+        """Corrupt ``results['img']``, or ``lidar2cam`` and ``lidar2img``."""
         finish_on_host(results)
-        rng, level = generator(self.seed, results["token"]), self.severity - 1
+        rng = generator(self.seed, results["token"])
+        level = self.severity - 1
         for key in ("img", "lidar2cam", "lidar2img"):
             results[key] = list(results[key])
         views = range(len(results["img"]))
         if self.kind == "camera_lost":
-            lose_cameras(results, rng.permutation(len(views))[: min(self.severity, views[-1])])
+            num_lost = min(self.severity, len(views) - 1)
+            lose_cameras(results, rng.permutation(len(views))[:num_lost])
         elif self.kind in _CALIBRATIONS:
             for view in views:
                 axis = rng.normal(size=3)
-                moved = _CALIBRATIONS[self.kind](axis / np.linalg.norm(axis), level)
-                _place(results, view, moved @ results["lidar2cam"][view])
+                shift = _CALIBRATIONS[self.kind](axis / np.linalg.norm(axis), level)
+                lidar2cam = shift @ results["lidar2cam"][view]
+                _set_extrinsics(results, view, lidar2cam=lidar2cam)
         elif self.kind == "fog":
             for view in views:
-                results["img"][view] = fog(results, view, _SIGHT_M[level])
+                results["img"][view] = fog(results, view, visibility_m=_VISIBILITY_M[level])
         else:
             for view, image in enumerate(results["img"]):
-                done = _IMAGES[self.kind](_grey_levels(image), level, rng)
-                results["img"][view] = done.astype(image.dtype)
+                corrupt = _IMAGES[self.kind]
+                corrupted = corrupt(_grey_levels(image), level, rng)
+                results["img"][view] = corrupted.astype(image.dtype)
         return results
 
 
 def _grey_levels(image: NDArray[Any]) -> Image:
-    """Return an image as whole grey levels. (H, W, 3)"""
+    """Clip an image to [0, 255] and convert it to uint8. (H, W, 3)"""
     return np.clip(image, 0, 255).astype(np.uint8)
 
 
-def fog(results: dict[str, Any], view: int, sight_m: float) -> NDArray[Any]:
-    """Return a view in fog in which one sees so far. (H, W, 3)
+def fog(results: dict[str, Any], view: int, visibility_m: float) -> NDArray[Any]:
+    """Add fog to a view.
 
-    The distance of a pixel is that of the level ground there, at most 60 m. A contrast of 5 % is
-    left at the end of sight (Koschmieder's law).
+    The contrast decreases exponentially with the distance and is 5 % at the limit of visibility
+    (Koschmieder's law). The distance of a pixel is the distance of level ground there, at most
+    60 m.
+
+    Args:
+        results: Results of the pipeline, with images and calibration.
+        view: Index of the view.
+        visibility_m: Limit of visibility in metres.
+
+    Returns:
+        Image. (H, W, 3)
     """
     image = results["img"][view]
     height, width = image.shape[:2]
-    pixels = np.stack([*np.meshgrid(np.arange(width), np.arange(height)), np.ones(image.shape[:2])])
-    inner = results["img_aug_matrix"][view][:3, :3] @ results["cam2img"][view][:3, :3]
+    cols, rows = np.meshgrid(np.arange(width), np.arange(height))
+    pixels = np.stack([cols, rows, np.ones((height, width))])  # (3, H, W)
+    intrinsics = results["img_aug_matrix"][view][:3, :3] @ results["cam2img"][view][:3, :3]
     ego_from_cam = results["lidar2ego"] @ invert_rigid(results["lidar2cam"][view])
-    rays = ego_from_cam[:3, :3] @ np.linalg.solve(inner, pixels.reshape(3, -1))
-    falls = np.minimum(rays[2] / np.linalg.norm(rays, axis=0), -1e-6)  # of a ray of 1 m
-    distance = np.minimum(np.maximum(ego_from_cam[2, 3], 0.1) / -falls, _FARTHEST_M)
-    seen = np.exp(np.log(0.05) / sight_m * distance).reshape(height, width, 1)
-    return (image * seen + _FOG * (1 - seen)).astype(image.dtype)
+    rays = ego_from_cam[:3, :3] @ np.linalg.solve(intrinsics, pixels.reshape(3, -1))  # (3, H * W)
+    slopes = rays[2] / np.linalg.norm(rays, axis=0)  # rise per metre of distance
+    slopes = np.minimum(slopes, -1e-6)
+    camera_height_m = np.maximum(ego_from_cam[2, 3], 0.1)
+    distance_m = np.minimum(camera_height_m / -slopes, _MAX_FOG_DISTANCE_M)
+    contrast = np.exp(np.log(0.05) / visibility_m * distance_m).reshape(height, width, 1)
+    return (image * contrast + _FOG_GREY * (1 - contrast)).astype(image.dtype)
 
 
 def rain(image: Image, level: int, rng: np.random.Generator) -> Image:
-    """Return an image with streaks of rain, and greyer. (H, W, 3)"""
+    """Add streaks of rain to an image and reduce its contrast.
+
+    Args:
+        image: Image, uint8. (H, W, 3)
+        level: Severity from 0 to 4.
+        rng: Generator for the places of the streaks.
+    """
     height, width = image.shape[:2]
-    drops = (rng.random((height, width)) < _DROPS[level]).astype(np.float32)
+    has_drop = rng.random((height, width)) < _RAIN_DENSITIES[level]
+    drops = has_drop.astype(np.float32)
     length = max(3, round(0.06 * height))
     streak = np.zeros((length, length), np.float32)
-    cv2.line(streak, (length * 2 // 5, 0), (length * 3 // 5, length - 1), (1.0,))  # nearly upright
-    veil = np.clip(cv2.filter2D(drops, -1, streak), 0, 1)[..., None] * 0.4
-    grey = 0.04 * (level + 1)
-    return _grey_levels((image * (1 - grey) + 128 * grey) * (1 - veil) + 210 * veil)
+    top = (length * 2 // 5, 0)
+    bottom = (length * 3 // 5, length - 1)  # nearly vertical
+    cv2.line(streak, top, bottom, color=(1.0,))
+    streaks = cv2.filter2D(drops, ddepth=-1, kernel=streak)
+    opacity = np.clip(streaks, 0, 1)[..., None] * 0.4
+    greyness = 0.04 * (level + 1)
+    grey_image = image * (1 - greyness) + 128 * greyness
+    return _grey_levels(grey_image * (1 - opacity) + 210 * opacity)
 
 
 def night(image: Image, level: int, rng: np.random.Generator) -> Image:
-    """Return an image that got less light, with the noise of that. (H, W, 3)"""
+    """Darken an image and add noise.
+
+    Args:
+        image: Image, uint8. (H, W, 3)
+        level: Severity from 0 to 4.
+        rng: Generator for the noise.
+    """
     exposure = _EXPOSURES[level]
-    noise = rng.normal(scale=_NOISE * (1 - exposure), size=image.shape)
+    noise = rng.normal(scale=_NIGHT_NOISE * (1 - exposure), size=image.shape)
     return _grey_levels(image * exposure + noise)
 
 
 def motion_blur(image: Image, level: int, rng: np.random.Generator) -> Image:
-    """Return an image blurred along its rows, as of a vehicle that turns. (H, W, 3)"""
-    length = 2 * round(_BLURS[level] * image.shape[1] / 2) + 1  # odd: nothing is shifted
+    """Blur an image along its rows, like the motion of a turning vehicle.
+
+    Args:
+        image: Image, uint8. (H, W, 3)
+        level: Severity from 0 to 4.
+        rng: Not used.
+    """
+    length = 2 * round(_BLUR_LENGTHS[level] * image.shape[1] / 2) + 1  # odd: without a shift
     return np.asarray(cv2.blur(image, (length, 1)), np.uint8)
 
 
 def jpeg(image: Image, level: int, rng: np.random.Generator) -> Image:
-    """Return an image after compression. (H, W, 3)"""
-    _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITIES[level]])
+    """Compress an image as JPEG and decode it.
+
+    Args:
+        image: Image, uint8. (H, W, 3)
+        level: Severity from 0 to 4.
+        rng: Not used.
+    """
+    settings = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITIES[level]]
+    _, data = cv2.imencode(".jpg", image, params=settings)
     return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
 
 
+def _rotation(axis: NDArray[np.float64], level: int) -> NDArray[np.float64]:
+    """Return a rotation about a unit vector. (3,) -> (4, 4)"""
+    rotation = Rotation.from_rotvec(axis * np.deg2rad(_TURNS_DEG[level]))
+    return rigid(rotation.as_matrix(), translation=np.zeros(3))
+
+
+def _translation(axis: NDArray[np.float64], level: int) -> NDArray[np.float64]:
+    """Return a translation along a unit vector. (3,) -> (4, 4)"""
+    return rigid(np.eye(3), translation=axis * _SHIFTS_M[level])
+
+
 _CALIBRATIONS: dict[str, Callable[[NDArray[np.float64], int], NDArray[np.float64]]] = {
-    "rotation": lambda axis, level: rigid(
-        Rotation.from_rotvec(axis * np.deg2rad(_TURNS_DEG[level])).as_matrix(), np.zeros(3)
-    ),
-    "translation": lambda axis, level: rigid(np.eye(3), axis * _SHIFTS_M[level]),
+    "rotation": _rotation,
+    "translation": _translation,
 }
 _IMAGES: dict[str, Callable[[Image, int, np.random.Generator], Image]] = {
     "rain": rain, "night": night, "motion_blur": motion_blur, "jpeg": jpeg,
@@ -179,15 +250,16 @@ KINDS = ("camera_lost", *_CALIBRATIONS, "fog", *_IMAGES)
 @TRANSFORMS.register_module()
 @dataclass(eq=False)
 class DelayCameras(BaseTransform):
-    """Let cameras show the sample before, of the same scene; in front of ``LoadCameraImages``.
+    """Replace the images of some cameras by the images of the previous sample of the scene.
 
-    The first sample of a scene stays as it is.
+    The first sample of a scene does not change. The transform must come before
+    ``LoadCameraImages``.
 
     Args:
-        ann_file: Annotation file of the data set.
-        severity: How many cameras, from 1 to 5; all but one at most.
+        ann_file: Annotation file of the data set, relative to ``data_root`` unless absolute.
+        severity: Number of cameras from 1 to 5; at least one camera does not change.
         data_root: Folder that image paths are relative to.
-        seed: Of which ones.
+        seed: Seed of the selection of the cameras.
     """
 
     ann_file: str
@@ -196,50 +268,65 @@ class DelayCameras(BaseTransform):
     seed: int = 0
 
     @cached_property
-    def _before(self) -> dict[str, int]:
-        """Row of the sample before, by token."""
-        file = self._file
-        columns = (file.column(name) for name in ("scene", "timestamp_ns", "token"))
-        order = sorted((*entry, row) for row, entry in enumerate(zip(*columns, strict=True)))
-        return {late[2]: early[3] for early, late in pairwise(order) if early[0] == late[0]}
+    def _previous_rows(self) -> dict[str, int]:
+        """Row of the previous sample of the scene, by the token of a sample."""
+        scenes = self._file.column("scene")
+        times_ns = self._file.column("timestamp_ns")
+        tokens = self._file.column("token")
+        rows = range(len(tokens))
+        samples = sorted(zip(scenes, times_ns, tokens, rows, strict=True))
+        previous_rows = {}
+        for previous, current in pairwise(samples):
+            previous_scene, _, _, previous_row = previous
+            scene, _, token, _ = current
+            if previous_scene == scene:
+                previous_rows[token] = previous_row
+        return previous_rows
 
     @cached_property
     def _file(self) -> AnnotationFile:
+        """Annotation file of the data set."""
         return AnnotationFile(Path(self.data_root, self.ann_file))
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Replace paths in ``results['images']``."""
-        row = self._before.get(results["token"])
+        row = self._previous_rows.get(results["token"])
         if row is None:
             return results
-        names, images = list(results["images"]), dict(results["images"])
+        images = dict(results["images"])
+        names = list(images)
         paths = {camera.name: camera.path for camera in self._file[row].cameras}
         rng = generator(self.seed, results["token"])
-        for view in rng.permutation(len(names))[: min(self.severity, len(names) - 1)].tolist():
-            path = str(Path(self.data_root, paths[names[view]]))
-            images[names[view]] = {**images[names[view]], "img_path": path}
+        num_late = min(self.severity, len(names) - 1)
+        for view in rng.permutation(len(names))[:num_late].tolist():
+            name = names[view]
+            path = str(Path(self.data_root, paths[name]))
+            images[name] = {**images[name], "img_path": path}
         return {**results, "images": images}
 
 
 @TRANSFORMS.register_module()
 @dataclass(eq=False)
 class DropCameras(BaseTransform):
-    """Lose cameras in training, so that a model learns to do without; behind the images' steps.
+    """Augmentation that blacks out random cameras, for models that are robust to missing cameras.
+
+    The transform must come after all image steps.
 
     Args:
-        prob: Share of the samples that lose cameras.
-        max_num: Largest number of lost cameras; each number is as probable. One is always left.
+        prob: Share of the samples with missing cameras, from 0 to 1.
+        max_num: Largest number of missing cameras. All numbers from 1 are equally probable. At
+            least one camera remains.
     """
 
     prob: float = 0.3
     max_num: int = 3
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Black out some of ``results['img']``."""
-        if np.random.random() < self.prob:  # noqa: NPY002 - mmengine seeds the global numbers
+        """Black out random views of ``results['img']``."""
+        if np.random.random() < self.prob:  # noqa: NPY002 - seeded by mmengine
             for key in ("img", "lidar2cam", "lidar2img"):
                 results[key] = list(results[key])
             views = np.random.permutation(len(results["img"]))  # noqa: NPY002
-            number = np.random.randint(1, self.max_num + 1)  # noqa: NPY002
-            lose_cameras(results, views[: min(number, len(views) - 1)])
+            num_lost = np.random.randint(1, self.max_num + 1)  # noqa: NPY002
+            lose_cameras(results, views[: min(num_lost, len(views) - 1)])
         return results

@@ -1,4 +1,4 @@
-"""Training targets of map elements: resampled points and their equivalent orders."""
+"""Training targets of map elements: resampled points in all equivalent orders."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -35,32 +35,36 @@ def map_targets(
     rng: np.random.Generator | None = None,
     orders_of: str = "vertices",
 ) -> InstanceData:
-    """Make a sample's training targets, as MapTR does ("v2" orders).
+    """Create the training targets of a sample, like MapTR with the "v2" orders.
 
     Args:
-        instances: Map elements at full resolution.
-        num_points: Points P per element.
-        x_range: Smallest and largest x in metres; points beyond are moved onto the edge.
-        y_range: Smallest and largest y in metres.
-        dim: Coordinates per point, 2 or 3; heights are interpolated and kept as they are.
-        rng: Draws the orders of rings with more than P - 1 vertices; None spreads them evenly.
-        orders_of: ``vertices``: a ring starts at each vertex, in its own direction (MapTR);
-            ``points``: at each of its P points, in both directions, and a line whose ends almost
-            meet is a ring too.
+        instances: K map elements at full resolution, in metres in the annotation frame.
+        num_points: Number P of points per element.
+        x_range: Smallest and largest x in metres. Points outside are moved to the edge.
+        y_range: Smallest and largest y in metres. Points outside are moved to the edge.
+        dim: Coordinates per point, 2 or 3. Heights are interpolated but not clamped.
+        rng: Generator for the selection of P - 1 orders of rings with more vertices; None for an
+            even selection.
+        orders_of: With ``vertices``, a ring has an order for each vertex, in the direction of the
+            ring (MapTR). With ``points``, a ring has an order for each of its P points in both
+            directions, and a line whose ends almost meet is treated as a ring.
 
     Returns:
-        ``labels_3d`` (K,) int64, ``pts`` (K, P, dim), ``pts_shifts`` (K, S, P, dim), ``boxes`` (K,
-        4), ``polylines`` (K, M, 2) float32 in metres, ``closed`` (K,) bool. Unused orders hold
-        -10000; polylines are at full resolution, the last vertex repeated up to the longest.
+        Targets of the elements: ``labels_3d`` (K,), int64; ``pts`` (K, P, dim), the resampled
+        points; ``pts_shifts`` (K, S, P, dim), the points in S equivalent orders, where unused
+        orders are -10000; ``boxes`` (K, 4), as (x_min, y_min, x_max, y_max); ``polylines``
+        (K, M, 2), the elements at full resolution, where the last vertex is repeated up to the
+        length of the longest element; ``closed`` (K,), bool, whether an element is a ring.
+        Coordinates are float32 in metres.
 
     Raises:
         ValueError: If elements have fewer coordinates than ``dim``, or ``orders_of`` is unknown.
     """
     if orders_of not in ORDERS:
         raise InputError(f"orders_of must be one of {ORDERS}, got {orders_of!r}.")
-    slots = max(num_points - 1, 2) if orders_of == "vertices" else 2 * (num_points - 1)
+    num_orders = max(num_points - 1, 2) if orders_of == "vertices" else 2 * (num_points - 1)
     points = np.empty((len(instances), num_points, dim))
-    orders = np.empty((len(instances), slots, num_points, dim))
+    orders = np.empty((len(instances), num_orders, num_points, dim))
     longest = max((len(instance.points) for instance in instances), default=2)
     polylines = np.empty((len(instances), longest, 2))
     closed = np.empty(len(instances), bool)
@@ -75,59 +79,79 @@ def map_targets(
         if orders_of == "vertices":
             orders[i] = equivalent_orders(line, num_points, rng)
         else:
-            orders[i] = sampled_orders(points[i], ends_meet(points[i], x_range, y_range))
+            is_ring = ends_meet(points[i], x_range=x_range, y_range=y_range)
+            orders[i] = sampled_orders(points[i], closed=is_ring)
         polylines[i, : len(line)] = line[:, :2]
         polylines[i, len(line) :] = line[-1, :2]
         closed[i] = is_closed(instance.points[:, :dim])
-    unused = orders == PADDING
-    metres = {"pts": points, "pts_shifts": orders, "polylines": polylines}
-    targets = {name: clamp(array, x_range, y_range) for name, array in metres.items()}
-    targets["pts_shifts"][unused] = PADDING
-    targets["boxes"] = bounding_boxes(targets["polylines"])
+    is_unused = orders == PADDING
+    points = clamp(points, x_range=x_range, y_range=y_range)
+    orders = clamp(orders, x_range=x_range, y_range=y_range)
+    orders[is_unused] = PADDING
+    polylines = clamp(polylines, x_range=x_range, y_range=y_range)
+    labels = [instance.label for instance in instances]
     return InstanceData(
-        labels_3d=torch.tensor([instance.label for instance in instances], dtype=torch.int64),
+        labels_3d=torch.tensor(labels, dtype=torch.int64),
         closed=torch.from_numpy(closed),
-        **{name: torch.from_numpy(a.astype(np.float32)) for name, a in targets.items()},
+        pts=_float_tensor(points),
+        pts_shifts=_float_tensor(orders),
+        polylines=_float_tensor(polylines),
+        boxes=_float_tensor(bounding_boxes(polylines)),
     )
+
+
+def _float_tensor(array: np.ndarray) -> torch.Tensor:
+    """Convert an array to a float32 tensor."""
+    return torch.from_numpy(array.astype(np.float32))
 
 
 def ends_meet(
     points: np.ndarray, x_range: tuple[float, float], y_range: tuple[float, float]
 ) -> bool:
-    """Say whether the ends of a line are within a thousandth of the map of each other. (P, D)"""
+    """Test whether the ends of a line are closer than a thousandth of the map along each axis.
+
+    Args:
+        points: Points of the line in metres. (P, D)
+        x_range: Smallest and largest x of the map in metres.
+        y_range: Smallest and largest y of the map in metres.
+    """
     extent = np.array([x_range[1] - x_range[0], y_range[1] - y_range[0]])
     first, last = (points[[0, -1], :2] - (x_range[0], y_range[0])) / extent
-    return bool(np.allclose(first, last, atol=1e-3))  # and the relative 1e-5 of numpy
+    return bool(np.allclose(first, last, atol=1e-3))  # besides the default rtol=1e-5
 
 
 @TRANSFORMS.register_module()
 @dataclass(eq=False)
 class FormatMapTargets(BaseTransform):
-    """Add ``gt_instances_3d``, the training targets, from ``map_instances``.
+    """Add ``gt_instances_3d``, the training targets of the map elements, see `map_targets`.
 
-    Points have as many coordinates as the data set hands on (its ``dim``). The orders of rings with
-    more than P - 1 vertices are drawn anew each time, as in MapTR.
+    Points have ``dim`` coordinates, as set in the data set. The orders of rings with more than
+    P - 1 vertices are drawn at random in each epoch, as in MapTR.
 
     Args:
-        num_points: Points P per element.
-        orders_of: Which orders a ring has, see `map_targets`.
+        num_points: Number P of points per element.
+        orders_of: Equivalent orders of a ring, ``vertices`` or ``points``, see `map_targets`.
     """
 
     num_points: int = 20
     orders_of: str = "vertices"
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Add the targets; ValueError if the sample has no ground truth."""
+        """Add the targets.
+
+        Raises:
+            ValueError: If the sample has no ground truth, or has no heights and ``dim`` is 3.
+        """
         elements = ground_truth_elements(results, self)
-        # seeded from the generator that mmengine seeds in each worker
+        # The seed comes from the global generator, which mmengine seeds in each worker.
         rng = np.random.default_rng(np.random.randint(2**31))  # noqa: NPY002
         results["gt_instances_3d"] = map_targets(
             elements,
-            self.num_points,
-            results["x_range"],
-            results["y_range"],
-            results.get("dim", 2),
-            rng,
-            self.orders_of,
+            num_points=self.num_points,
+            x_range=results["x_range"],
+            y_range=results["y_range"],
+            dim=results.get("dim", 2),
+            rng=rng,
+            orders_of=self.orders_of,
         )
         return results

@@ -1,4 +1,4 @@
-"""Segmentation targets: map elements drawn in BEV and in each camera's feature map."""
+"""Segmentation targets: masks of map elements in BEV and in the camera views."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -20,28 +20,38 @@ from gsmap.structures.polylines import resample
 from gsmap.utils.errors import InputError
 from gsmap.utils.settings import check_positive
 
-_PV_SAMPLES = 200
+_NUM_PV_POINTS = 200  # of an element that is projected into the cameras
 _MIN_DEPTH = 1e-7
 
 
-def cells_of(instance: MapInstance, results: dict[str, Any], size: tuple[int, int]) -> np.ndarray:
-    """Return an element's cells (column, row) on a raster of rows and columns. (n, 2)"""
+def bev_cells(instance: MapInstance, results: dict[str, Any], size: tuple[int, int]) -> np.ndarray:
+    """Compute the BEV cells of the vertices of an element, truncated to integers.
+
+    Args:
+        instance: Map element in metres in the annotation frame.
+        results: Results of the pipeline, with ``x_range`` and ``y_range`` in metres.
+        size: Rows and columns of the raster.
+
+    Returns:
+        Cells (column, row), int32. (n, 2)
+    """
     low, high = np.array([results["x_range"], results["y_range"]]).T
     scale = np.array(size[::-1]) / (high - low)
-    return ((instance.points[:, :2].astype(np.float64) - low) * scale).astype(np.int32)
+    points = instance.points[:, :2].astype(np.float64)
+    return ((points - low) * scale).astype(np.int32)
 
 
 @TRANSFORMS.register_module()
 @dataclass(eq=False)
 class MakeBEVMask(BaseTransform):
-    """Add ``gt_seg``: elements drawn in one channel, or in that of their class. (channels, H, W)
+    """Add ``gt_seg``, the BEV masks of the map elements, float32. (channels, H, W)
 
-    Pixel coordinates are truncated to integers, as released.
+    Coordinates of vertices are truncated to integers, as in the release.
 
     Args:
-        size: Rows H and columns W over the ground truth's range.
-        thickness_px: Width of the lines.
-        num_classes: Number of channels; None draws all elements in one.
+        size: Rows H and columns W over the range of the ground truth.
+        thickness_px: Width of the lines in cells.
+        num_classes: Number of channels, one for each class; None for one channel with all classes.
 
     Raises:
         ValueError: If a number is not positive.
@@ -52,16 +62,21 @@ class MakeBEVMask(BaseTransform):
     num_classes: int | None = None
 
     def __post_init__(self) -> None:
-        numbers = {"thickness_px": self.thickness_px, "num_classes": self.num_classes or 1}
-        check_positive(rows=self.size[0], columns=self.size[1], **numbers)
+        check_positive(rows=self.size[0], columns=self.size[1])
+        check_positive(thickness_px=self.thickness_px, num_classes=self.num_classes or 1)
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Draw the mask; ValueError if the sample has no ground truth."""
+        """Draw the masks.
+
+        Raises:
+            ValueError: If the sample has no ground truth, or a label is not less than
+                ``num_classes``.
+        """
         masks = np.zeros((self.num_classes or 1, *self.size), np.uint8)
         for instance in ground_truth_elements(results, self):
-            pixels = cells_of(instance, results, self.size)
+            cells = bev_cells(instance, results, size=self.size)
             channel = channel_of(instance, self.num_classes)
-            cv2.polylines(masks[channel], [pixels], False, (1,), self.thickness_px)
+            _draw_line(masks[channel], cells, thickness_px=self.thickness_px)
         results["gt_seg"] = torch.from_numpy(masks.astype(np.float32))
         return results
 
@@ -69,16 +84,17 @@ class MakeBEVMask(BaseTransform):
 @TRANSFORMS.register_module()
 @dataclass(eq=False)
 class MakeInstanceMasks(BaseTransform):
-    """Add ``masks`` (K, H, W) to ``gt_instances_3d``: each element's own cells in BEV.
+    """Add ``masks`` to ``gt_instances_3d``: a BEV mask of each element, bool. (K, H, W)
 
-    Of elements of one class the later one has the cells of both; near an element of a later class
-    all give way. Cells are truncated as in `MakeBEVMask`.
+    Masks of elements of one class do not overlap: a common cell belongs to the later element. Cells
+    near elements with a higher label are removed. Coordinates are truncated as in `MakeBEVMask`.
 
     Args:
-        size: Rows H and columns W over the ground truth's range.
-        thickness_px: Width of the lines.
-        gap_px: Width around elements of later classes.
-        mirrored: Mirror the masks left to right, as released; they then fit no BEV features.
+        size: Rows H and columns W over the range of the ground truth.
+        thickness_px: Width of the lines in cells.
+        gap_px: Width of the lines around elements with a higher label in which cells are removed.
+        mirrored: Whether to flip the masks left to right, as in the release. Flipped masks do not
+            fit the BEV features.
 
     Raises:
         ValueError: If a number is not positive.
@@ -90,26 +106,33 @@ class MakeInstanceMasks(BaseTransform):
     mirrored: bool = True
 
     def __post_init__(self) -> None:
-        widths = {"thickness_px": self.thickness_px, "gap_px": self.gap_px}
-        check_positive(rows=self.size[0], columns=self.size[1], **widths)
+        check_positive(rows=self.size[0], columns=self.size[1])
+        check_positive(thickness_px=self.thickness_px, gap_px=self.gap_px)
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Draw the masks; ValueError if the sample has no ground truth, or no targets yet."""
+        """Draw the masks.
+
+        Raises:
+            ValueError: If the sample has no ground truth, or `FormatMapTargets` is missing before.
+        """
         instances = ground_truth_elements(results, self)
         if "gt_instances_3d" not in results:
             raise InputError(
                 f"sample {results['token']!r} has no targets yet: put MakeInstanceMasks behind "
                 "FormatMapTargets in the pipeline."
             )
-        masks, gaps = np.zeros((2, len(instances), *self.size), np.uint8)
+        masks = np.zeros((len(instances), *self.size), np.uint8)
+        gaps = np.zeros_like(masks)
         for number, instance in enumerate(instances):
-            cells = cells_of(instance, results, self.size)
-            cv2.polylines(masks[number], [cells], False, (1,), self.thickness_px)
-            cv2.polylines(gaps[number], [cells], False, (1,), self.gap_px)
+            cells = bev_cells(instance, results, size=self.size)
+            _draw_line(masks[number], cells, thickness_px=self.thickness_px)
+            _draw_line(gaps[number], cells, thickness_px=self.gap_px)
         labels = np.array([instance.label for instance in instances])
         for number, label in enumerate(labels):
-            later = masks[number + 1 :][labels[number + 1 :] == label]
-            masks[number] &= ~np.concatenate([later, gaps[labels > label]]).any(0)
+            later_masks = masks[number + 1 :]
+            later_labels = labels[number + 1 :]
+            blocked = np.concatenate([later_masks[later_labels == label], gaps[labels > label]])
+            masks[number] &= ~blocked.any(0)
         masks = masks[..., ::-1] if self.mirrored else masks
         results["gt_instances_3d"].masks = torch.from_numpy(masks.astype(bool))
         return results
@@ -118,19 +141,21 @@ class MakeInstanceMasks(BaseTransform):
 @TRANSFORMS.register_module()
 @dataclass(eq=False)
 class MakePVMask(BaseTransform):
-    """Add ``gt_pv_seg``: elements projected into each camera's feature map. (V, channels, h, w)
+    """Add ``gt_pv_seg``, the masks of the elements in the camera views. (V, channels, h, w)
 
-    Comes after the images have their final scale. Two-dimensional elements lie at one height, or
-    at the heights that their file has.
+    The masks are float32 and have the resolution of the feature maps. The transform must follow all
+    transforms that resize images.
 
     Args:
         stride: Image pixels per feature pixel.
-        pad_size_divisor: To what the images are padded later.
-        ground_z_m: Height of the ground in the annotation frame, in metres.
+        pad_size_divisor: Divisor of the image size after the padding before the backbone.
+        ground_z_m: Height of the ground in the annotation frame in metres, used for elements
+            without heights.
         thickness_px: Width of the lines in feature pixels.
-        num_classes: Number of channels; None draws all elements in one.
-        heights: Whether two-dimensional elements of a file with heights lie at these, as published
-            for Argoverse 2. A file without heights is said once.
+        num_classes: Number of channels, one for each class; None for one channel with all classes.
+        heights: Whether two-dimensional elements have the heights in the annotation file, as
+            published for Argoverse 2. If the file has none, ``ground_z_m`` is used and a message
+            is logged.
 
     Raises:
         ValueError: If a number is not positive.
@@ -147,18 +172,20 @@ class MakePVMask(BaseTransform):
         check_positive(stride=self.stride, pad_size_divisor=self.pad_size_divisor)
         check_positive(thickness_px=self.thickness_px, num_classes=self.num_classes or 1)
 
-    def _points(self, points: np.ndarray) -> np.ndarray:
-        """Return an element as homogeneous points along it. (200, 4)."""
-        line = resample(points, _PV_SAMPLES)
-        height = line[:, 2:3] if line.shape[1] == 3 else np.full((len(line), 1), self.ground_z_m)
-        return np.concatenate([line[:, :2], height, np.ones((len(line), 1))], -1)
+    def _homogeneous_points(self, points: np.ndarray) -> np.ndarray:
+        """Resample a line to homogeneous points (x, y, z, 1) in metres. (n, 2 or 3) -> (200, 4)"""
+        line = resample(points, _NUM_PV_POINTS)
+        flat_heights = np.full((len(line), 1), self.ground_z_m)
+        heights = line[:, 2:3] if line.shape[1] == 3 else flat_heights
+        return np.concatenate([line[:, :2], heights, np.ones((len(line), 1))], axis=-1)
 
     def _elements(self, results: dict[str, Any]) -> Iterator[tuple[MapInstance, np.ndarray]]:
-        """Yield each element with the points that are drawn, (n, 2) or (n, 3)."""
+        """Yield each element with its points in metres, (n, 2) or (n, 3)."""
         elements = ground_truth_elements(results, self)
         heights = results.get("map_heights") if self.heights else None
-        if self.heights and heights is None and any(e.points.shape[1] == 2 for e in elements):
-            _say_flat(self.ground_z_m)
+        lacks_heights = any(element.points.shape[1] == 2 for element in elements)
+        if self.heights and heights is None and lacks_heights:
+            _log_flat_ground(self.ground_z_m)
         for number, element in enumerate(elements):
             points = element.points
             if heights is not None:
@@ -166,30 +193,52 @@ class MakePVMask(BaseTransform):
             yield element, points
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Draw the masks; ValueError if the sample has no ground truth."""
+        """Draw the masks.
+
+        Raises:
+            ValueError: If the sample has no ground truth, or a label is not less than
+                ``num_classes``.
+        """
         height, width = padded_size(results["img_shape"], self.pad_size_divisor)
-        size = height // self.stride, width // self.stride
-        views = results["lidar2img"]
-        masks = np.zeros((len(views), self.num_classes or 1, *size), np.uint8)
-        lines = [
-            (channel_of(instance, self.num_classes), self._points(points))
-            for instance, points in self._elements(results)
-        ]
-        shrink = np.diag([1 / self.stride, 1 / self.stride, 1.0, 1.0])
-        for view, lidar2img in zip(masks, views, strict=True):
+        matrices = results["lidar2img"]
+        num_channels = self.num_classes or 1
+        rows = height // self.stride
+        cols = width // self.stride
+        masks = np.zeros((len(matrices), num_channels, rows, cols), np.uint8)
+        lines = []
+        for instance, points in self._elements(results):
+            channel = channel_of(instance, self.num_classes)
+            lines.append((channel, self._homogeneous_points(points)))
+        feature_from_img = np.diag([1 / self.stride, 1 / self.stride, 1.0, 1.0])
+        for view_masks, lidar2img in zip(masks, matrices, strict=True):
+            feature_from_frame = feature_from_img @ lidar2img
             for channel, line in lines:
-                u, v, depth = (line @ (shrink @ lidar2img).T)[:, :3].T
-                front = depth > 0
-                pixels = np.stack([u[front], v[front]], -1) / (depth[front, None] + _MIN_DEPTH)
+                u, v, depth = (line @ feature_from_frame.T)[:, :3].T
+                is_ahead = depth > 0
+                pixels = np.stack([u[is_ahead], v[is_ahead]], axis=-1)
+                pixels /= depth[is_ahead, None] + _MIN_DEPTH
                 if len(pixels):
-                    clipped = pixels.clip(-1e6, 1e6).astype(np.int32)
-                    cv2.polylines(view[channel], [clipped], False, (1,), self.thickness_px)
+                    pixels = pixels.clip(-1e6, 1e6).astype(np.int32)
+                    _draw_line(view_masks[channel], pixels, thickness_px=self.thickness_px)
         results["gt_pv_seg"] = torch.from_numpy(masks.astype(np.float32))
         return results
 
 
+def _draw_line(mask: np.ndarray, cells: np.ndarray, thickness_px: int) -> None:
+    """Draw an open line through cells (column, row) into a mask. (n, 2), (H, W)"""
+    cv2.polylines(mask, [cells], isClosed=False, color=(1,), thickness=thickness_px)
+
+
 def channel_of(instance: MapInstance, num_classes: int | None) -> int:
-    """Return the channel that an element is drawn in; ValueError if that is beyond the classes."""
+    """Return the channel of an element in the masks.
+
+    Args:
+        instance: Map element.
+        num_classes: Number of channels; None for one channel with all classes.
+
+    Raises:
+        ValueError: If the label is negative or not less than ``num_classes``.
+    """
     if num_classes is None:
         return 0
     if not 0 <= instance.label < num_classes:
@@ -198,13 +247,13 @@ def channel_of(instance: MapInstance, num_classes: int | None) -> int:
 
 
 @cache
-def _say_flat(ground_z_m: float) -> None:
-    """Say once that masks of the cameras lie on flat ground, though heights are asked for."""
+def _log_flat_ground(ground_z_m: float) -> None:
+    """Log once that masks of the camera views are drawn on flat ground for lack of heights."""
     worker = get_worker_info()
     if worker is None or worker.id == 0:
         print_log(
             f"camera masks of elements lie on flat ground at z = {ground_z_m:g} m: the annotation "
             "file has no heights. Make it with `python tools/create_data.py av2 ... --dim 3` for "
             "those of the published systems, or set heights=False in MakePVMask.",
-            "current",
+            logger="current",
         )

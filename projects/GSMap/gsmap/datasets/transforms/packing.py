@@ -1,4 +1,4 @@
-"""Packing a sample for the model."""
+"""Packing of the results of the pipeline for the model."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -26,19 +26,28 @@ _MATRIX_KEYS = ("lidar2img", "cam2img", "lidar2cam", "img_aug_matrix")
 @TRANSFORMS.register_module()
 @dataclass(eq=False)
 class PackMapInputs(BaseTransform):
-    """Pack images, points, targets and metainfo as ``docs/architecture.md`` says.
+    """Pack images, points, targets and metainfo for the model (see ``docs/architecture.md``).
 
-    Whatever of the targets earlier transforms have made is packed; matrices become arrays (V, 4,
-    4).
+    All targets among ``TARGET_KEYS`` that earlier transforms have added are packed. Lists of
+    matrices become arrays. (V, 4, 4)
 
     Args:
-        with_points: Whether loaded points go to the model; they may have served for targets only.
+        with_points: Whether the model receives the loaded points. Set it to False if the points are
+            only used for targets.
     """
 
     with_points: bool = True
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Pack the sample; BrokenSampleError if an image holds NaN or infinity."""
+        """Pack the sample.
+
+        Returns:
+            ``inputs``, with ``img`` (V, 3, H, W) and ``points`` (n, C), and ``data_samples``, with
+            targets and metainfo.
+
+        Raises:
+            BrokenSampleError: If an image has values that are NaN or infinite.
+        """
         inputs = {}
         if "img" in results:
             inputs["img"] = self._images(results)
@@ -49,16 +58,20 @@ class PackMapInputs(BaseTransform):
             if key in results:
                 setattr(sample, key, results[key])
         metainfo = {key: results[key] for key in META_KEYS if key in results}
-        metainfo |= {key: np.stack(metainfo[key]) for key in _MATRIX_KEYS if key in metainfo}
+        for key in _MATRIX_KEYS:
+            if key in metainfo:
+                metainfo[key] = np.stack(metainfo[key])
         sample.set_metainfo(metainfo)
         return {"inputs": inputs, "data_samples": sample}
 
     def _images(self, results: dict[str, Any]) -> torch.Tensor:
-        """Stack the images, channels first. (V, 3, H, W)."""
+        """Stack images with channels first. V x (H, W, 3) -> (V, 3, H, W)"""
         images = results["img"]
-        if results.get("image_steps"):  # as decoded: a device puts the channels first
+        if results.get("image_steps"):
+            # A view of the decoded images: the GPU copies to channels first.
             return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2)
-        stacked = np.empty((len(images), 3, *images[0].shape[:2]), images[0].dtype)
+        height, width = images[0].shape[:2]
+        stacked = np.empty((len(images), 3, height, width), dtype=images[0].dtype)
         for name, img, planes in zip(results["cam_names"], images, stacked, strict=True):
             if img.dtype.kind == "f" and not _is_finite(img):
                 raise BrokenSampleError(
@@ -71,5 +84,5 @@ class PackMapInputs(BaseTransform):
 
 
 def _is_finite(image: NDArray[np.floating[Any]]) -> bool:
-    """Return whether all values are finite: in one pass, as a sum is finite only if they are."""
+    """Test whether all values are finite. A finite sum proves it in one fast pass."""
     return bool(np.isfinite(image.sum()) or np.isfinite(image).all())

@@ -1,4 +1,4 @@
-"""LiDAR points: sweep files, the annotation frame, and sparse depth maps for supervision."""
+"""Loading of LiDAR points, transformation to the annotation frame, and depth maps as targets."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,24 +19,26 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.faults import is_of_the_machine
 from gsmap.utils.inputs import heed_input
 
-# Argoverse 2's columns in the order of their use; the first five mean what nuScenes' values mean.
+# Columns of Argoverse 2. The first five have the meaning of the values in files of nuScenes.
 FEATHER_COLUMNS = ("x", "y", "z", "intensity", "laser_number", "offset_ns")
 
 
 def read_points(path: str, load_dim: int) -> np.ndarray:
-    """Read a LiDAR sweep of nuScenes (float32 values) or Argoverse 2 (``.feather``).
+    """Read and check a LiDAR sweep of nuScenes (float32 values) or Argoverse 2 (``.feather``).
 
     Args:
-        path: The file.
-        load_dim: Values per point; of a ``.feather`` file the first of ``FEATHER_COLUMNS``.
+        path: Point file.
+        load_dim: Values per point. For a ``.feather`` file, the number of columns to read, in the
+            order of ``FEATHER_COLUMNS``.
 
     Returns:
-        Points: x, y, z in metres in the frame of the file, intensity from 0 to 255, number of the
-        laser, and of a ``.feather`` file the time since the sweep's in nanoseconds. (n, load_dim)
+        Points with x, y, z in metres in the frame of the file, intensity from 0 to 255, number of
+        the laser, and for a ``.feather`` file the time since the start of the sweep in nanoseconds,
+        float32. (n, load_dim)
 
     Raises:
-        BrokenSampleError: If the file is missing, cut short or holds something else.
-        ValueError: If a ``.feather`` file cannot have so many values.
+        BrokenSampleError: If the file is missing or truncated, or has other content.
+        ValueError: If ``load_dim`` is more than the number of columns of a ``.feather`` file.
     """
     file = Path(path)
     if not file.is_file():
@@ -60,7 +62,7 @@ def read_points(path: str, load_dim: int) -> np.ndarray:
 
 
 def _read_feather(path: str, load_dim: int) -> np.ndarray:
-    """Read a sweep of Argoverse 2. (n, load_dim)."""
+    """Read a LiDAR sweep of Argoverse 2. (n, load_dim)"""
     if load_dim > len(FEATHER_COLUMNS):
         raise InputError(
             f"load_dim must be at most {len(FEATHER_COLUMNS)} for {path}, got {load_dim}."
@@ -79,13 +81,13 @@ def _read_feather(path: str, load_dim: int) -> np.ndarray:
         ) from error
     if not table.num_rows:
         raise BrokenSampleError(f"{path} holds no point: download it again.")
-    return np.stack(columns, -1)
+    return np.stack(columns, axis=-1)
 
 
-def _naming_sample(
+def _name_sample_in_errors(
     transform: Callable[[dict[str, Any]], dict[str, Any]], results: dict[str, Any]
 ) -> dict[str, Any]:
-    """Apply a transform; what it says of a broken file is preceded by the sample's token."""
+    """Apply a transform, and add the token of the sample to an error about a broken file."""
     try:
         return transform(results)
     except BrokenSampleError as error:
@@ -94,16 +96,20 @@ def _naming_sample(
 
 @TRANSFORMS.register_module()
 class LoadLidarPoints(LoadPointsFromFile):
-    """mmdet3d's ``LoadPointsFromFile``, with checks and for Argoverse 2's files too."""
+    """``LoadPointsFromFile`` of mmdet3d with checks and support for files of Argoverse 2."""
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Load ``results['lidar_points']``; BrokenSampleError if that is missing or damaged."""
+        """Load the point file of ``results['lidar_points']``.
+
+        Raises:
+            BrokenSampleError: If the sample has no LiDAR sweep, or the file is missing or damaged.
+        """
         if "lidar_points" not in results:
             raise BrokenSampleError(
                 f"sample {results['token']!r} has no LiDAR sweep: make the annotation file from "
                 "data with LiDAR, or take a config without it."
             )
-        return _naming_sample(super().transform, results)
+        return _name_sample_in_errors(super().transform, results)
 
     def _load_points(self, pts_filename: str) -> np.ndarray:
         return read_points(pts_filename, self.load_dim).reshape(-1)
@@ -111,14 +117,18 @@ class LoadLidarPoints(LoadPointsFromFile):
 
 @TRANSFORMS.register_module()
 class LoadLidarSweeps(LoadPointsFromMultiSweeps):
-    """mmdet3d's ``LoadPointsFromMultiSweeps``, with checks and for Argoverse 2's files too.
+    """``LoadPointsFromMultiSweeps`` of mmdet3d with checks and support for files of Argoverse 2.
 
-    The fifth value of each point becomes the sweep's age in seconds.
+    The fifth value of each point is replaced by the age of its sweep in seconds.
     """
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Add ``results['lidar_sweeps']``; BrokenSampleError if one is missing or damaged."""
-        return _naming_sample(super().transform, results)
+        """Add the points of ``results['lidar_sweeps']``.
+
+        Raises:
+            BrokenSampleError: If a file is missing or damaged.
+        """
+        return _name_sample_in_errors(super().transform, results)
 
     def _load_points(self, pts_filename: str) -> np.ndarray:
         if not Path(pts_filename).is_file():
@@ -131,9 +141,10 @@ class LoadLidarSweeps(LoadPointsFromMultiSweeps):
 
 @TRANSFORMS.register_module()
 class PointsToFrame(BaseTransform):
-    """Move the points of a sensor that is not the annotation frame into it.
+    """Transform points from the frame of the LiDAR to the annotation frame.
 
-    Comes between ``LoadLidarPoints`` and ``LoadLidarSweeps`` (whose sweeps are moved already).
+    The transform must come after ``LoadLidarPoints`` and before ``LoadLidarSweeps``, which
+    transforms the points of earlier sweeps.
     """
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
@@ -141,42 +152,50 @@ class PointsToFrame(BaseTransform):
         matrix = results["lidar2frame"]
         if not np.array_equal(matrix, np.eye(4)):
             points = results["points"].tensor
-            moved = torch.as_tensor(matrix, dtype=points.dtype)
-            points[:, :3] = points[:, :3] @ moved[:3, :3].T + moved[:3, 3]
+            frame_from_lidar = torch.as_tensor(matrix, dtype=points.dtype)
+            rotation = frame_from_lidar[:3, :3]
+            shift = frame_from_lidar[:3, 3]
+            points[:, :3] = points[:, :3] @ rotation.T + shift
         return results
 
 
 @TRANSFORMS.register_module()
 @dataclass(eq=False)
 class MakeDepthMap(BaseTransform):
-    """Add ``gt_depth``: the nearest return at each pixel in metres, 0 without one. (V, H, W)
+    """Add ``gt_depth``, the depth of the nearest point at each pixel in metres. (V, H, W)
 
-    Comes after the points are loaded and the images have their final scale.
+    Pixels without a point are 0. The transform must follow all transforms that load points or
+    resize images.
 
     Args:
-        depth_range: Smallest and largest depth to keep, in metres.
-        pad_size_divisor: To what the images are padded later.
+        depth_range: Smallest depth, included, and largest depth, excluded, in metres.
+        pad_size_divisor: Divisor of the image size after the padding before the backbone.
     """
 
     depth_range: tuple[float, float] = (1.0, 60.0)
     pad_size_divisor: int = 32
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Project the points into each camera."""
+        """Project the points into each camera view."""
         points = results["points"].tensor[:, :3].numpy().astype(np.float64)
-        homogeneous = np.concatenate([points, np.ones((len(points), 1))], -1)
-        padded = padded_size(results["img_shape"], self.pad_size_divisor)
-        depths = np.zeros((len(results["lidar2img"]), *padded), np.float32)
-        for view, (target, lidar2img) in enumerate(zip(depths, results["lidar2img"], strict=True)):
+        homogeneous = np.concatenate([points, np.ones((len(points), 1))], axis=-1)
+        height, width = padded_size(results["img_shape"], self.pad_size_divisor)
+        min_depth, max_depth = self.depth_range
+        depths = np.zeros((len(results["lidar2img"]), height, width), np.float32)
+        for view, lidar2img in enumerate(results["lidar2img"]):
             u, v, depth = (homogeneous @ lidar2img.T)[:, :3].T
-            keep = (depth >= self.depth_range[0]) & (depth < self.depth_range[1])
-            depth = depth[keep]
-            col, row = np.round(u[keep] / depth), np.round(v[keep] / depth)
-            scale = results["img_aug_matrix"][view]
-            rows, cols = np.round(results["raw_shapes"][view] * scale[[1, 0], [1, 0]])
-            inside = (col >= 0) & (col < cols) & (row >= 0) & (row < rows)  # not in the padding
-            far_first = np.argsort(-depth[inside], kind="stable")  # the nearest is written last
-            pixels = row[inside][far_first].astype(int), col[inside][far_first].astype(int)
-            target[pixels] = depth[inside][far_first]
+            in_range = (depth >= min_depth) & (depth < max_depth)
+            depth = depth[in_range]
+            col = np.round(u[in_range] / depth)
+            row = np.round(v[in_range] / depth)
+            img_scale = results["img_aug_matrix"][view][[1, 0], [1, 0]]
+            num_rows, num_cols = np.round(results["raw_shapes"][view] * img_scale)
+            # Without the padding at the bottom and right:
+            is_inside = (col >= 0) & (col < num_cols) & (row >= 0) & (row < num_rows)
+            depth = depth[is_inside]
+            col = col[is_inside].astype(int)
+            row = row[is_inside].astype(int)
+            far_first = np.argsort(-depth, kind="stable")  # the nearest point is written last
+            depths[view, row[far_first], col[far_first]] = depth[far_first]
         results["gt_depth"] = torch.from_numpy(depths)
         return results
