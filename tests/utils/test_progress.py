@@ -40,7 +40,7 @@ def test_a_file_gets_a_line_each_minute(capsys, monkeypatch):
 
 
 def test_compilation_is_announced_once(monkeypatch, caplog):
-    monkeypatch.setattr(NOTICE, "told", False)
+    monkeypatch.setattr(NOTICE, "has_logged", False)
     with caplog.at_level(logging.WARNING):
         for _ in range(2):
             numba.njit(lambda x: x + 1)(1)

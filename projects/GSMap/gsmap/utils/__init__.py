@@ -1,1 +1,1 @@
-"""Small things that every room may use: files, processes, errors of commands."""
+"""Helpers for all packages: files, processes, errors of commands."""

@@ -1,4 +1,4 @@
-"""What every command shares: its name in help, where it may write, and how it ends."""
+"""Argument parser and entry point of all commands: input checks, error messages and signals."""
 
 import _thread
 import argparse
@@ -25,179 +25,197 @@ from gsmap.utils.interrupt import SAID, is_first_rank
 from gsmap.utils.parallel import have_forks_die_too
 from gsmap.utils.terminal import print_safely
 
-BAD_INPUT = 2  # exit code, as argparse's for bad arguments
+BAD_INPUT = 2  # exit code, as for bad arguments in argparse
 ENDING = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
-_LONGEST_PATH = 4096  # as Linux has it
-CLEAN_UP_S = 5.0  # how long further Ctrl-C are not answered
-AGAIN_S = 0.05  # after which a signal that was dropped is sent again
+_LONGEST_PATH = 4096  # characters; PATH_MAX of Linux
+CLEAN_UP_S = 5.0  # time in which further signals are ignored
+AGAIN_S = 0.05  # delay before a lost signal is sent again
 
 
 class CommandParser(argparse.ArgumentParser):
-    """A parser that calls its command as the user does: ``gsmap NAME``, or by its script's name.
+    """Argument parser that shows the command as ``gsmap NAME`` or by the name of its script.
 
-    Arguments of the type `output_file` name what the command writes, and all others that name a
-    file what it reads: none may be both (`inputs.declare_files`).
+    Arguments of type `output_file` are outputs of the command, and all other arguments that name a
+    file are inputs. A file must not be both (`inputs.declare_files`).
+
+    Attributes:
+        program: Name of the command; None for a script.
+
+    Args:
+        prog: Name of the program, by default ``program``.
+        description: Text of the help.
+        **options: Further arguments of ``argparse.ArgumentParser``.
     """
 
     program: str | None = None
 
     def __init__(self, prog: str | None = None, description: str | None = None, **options: Any):
         if self.program and description:
-            description = re.sub(r"(python )?tools/(\w+)\.py", r"gsmap \2", description)
+            description = re.sub(r"(python )?tools/(\w+)\.py", repl=r"gsmap \2", string=description)
         super().__init__(prog or self.program, description=description, **options)
 
     def parse_known_args(  # type: ignore[override]
         self, *args: Any, **kwargs: Any
     ) -> tuple[argparse.Namespace, list[str]]:
-        """Parse arguments, and refuse NaN and an output that is an input."""
-        found, rest = super().parse_known_args(*args, **kwargs)
+        """Parse arguments; NaN, and files that are both input and output, are errors."""
+        namespace, rest = super().parse_known_args(*args, **kwargs)
         inputs: list[Path] = []
         outputs: list[tuple[Path, str]] = []
         for action in self._actions:
             option = action.option_strings[0] if action.option_strings else action.metavar
-            if _holds_nan(getattr(found, action.dest, None)):
+            value = getattr(namespace, action.dest, None)
+            if _has_nan(value):
                 self.error(f"{option or action.dest} must be a number, got nan")
-            for path in _files_in(getattr(found, action.dest, None)):
+            for path in _paths_in(value):
                 if action.type is output_file:
                     outputs.append((path, str(option or action.dest)))
                 elif path.is_file():
                     inputs.append(path)
-        declare_files(inputs, outputs)
-        return found, rest
+        declare_files(inputs=inputs, outputs=outputs)
+        return namespace, rest
 
 
-def _holds_nan(value: Any) -> bool:
-    """Whether an argument is NaN or a list with NaN, with which every comparison is false."""
+def _has_nan(value: Any) -> bool:
+    """Whether an argument is NaN or a list with NaN; range checks do not detect NaN."""
     if isinstance(value, list | tuple):
-        return any(map(_holds_nan, value))
+        return any(map(_has_nan, value))
     return isinstance(value, float) and math.isnan(value)
 
 
-def _files_in(value: Any) -> Iterator[Path]:
-    """Yield the paths, and the texts that may be such, in the value of an argument."""
+def _paths_in(value: Any) -> Iterator[Path]:
+    """Yield the paths in the value of an argument; every text may be a path."""
     if isinstance(value, Path):
         yield value
     elif isinstance(value, str) and 0 < len(value) < _LONGEST_PATH and "\0" not in value:
         yield Path(value)
     elif isinstance(value, list | tuple):
         for item in value:
-            yield from _files_in(item)
+            yield from _paths_in(item)
     elif isinstance(value, dict):
-        yield from _files_in(list(value.values()))
+        yield from _paths_in(list(value.values()))
 
 
 @inputs_kept()
 def run_command(command: Callable[[], str | None], heed_kill: bool = True) -> None:
-    """Run a command, print what it returns, and leave in words whatever a user can cause.
+    """Run a command, print its result, and report user errors in one line.
 
-    Nothing that it prints can make the terminal act (`terminal.printable`), and none of its outputs
-    replaces one of its inputs (`inputs.declare_files`).
+    Control characters are escaped in all output (`terminal.printable`), and no output replaces an
+    input (`inputs.declare_files`).
 
-    A file that cannot be read, understood or written, and whatever a ``raise`` statement says, end
-    with ``error: ...`` and exit code 2 (`faults.in_words`); Ctrl-C with one line and 130; ``kill``
-    with 143, and the end of its terminal with 129; each after the clean-up of half-written files.
-    Whoever started the command may have blocked these signals: they are let through, also to its
-    workers, and forked ones die with it. A slip in the code keeps its traceback,
-    and with the environment variable ``GSMAP_TRACEBACK`` every error does.
+    The command ends as follows:
+
+    * After an error that a user can cause (`faults.in_words`): ``error: ...`` and exit code 2.
+    * After Ctrl-C: one line and exit code 130.
+    * After ``kill``: exit code 143. After the end of its terminal: exit code 129.
+    * After any other error: a traceback.
+
+    Half-written files are removed in all cases. If the caller has blocked these signals, they are
+    unblocked for the command and its workers. Forked workers die with the command. With the
+    environment variable ``GSMAP_TRACEBACK`` every error has a traceback.
 
     Args:
-        command: Returns what to print, or None.
-        heed_kill: Whether ``kill`` lets the clean-up run; processes that wait for each other had
-            better die at once.
+        command: Function that returns the text to print, or None.
+        heed_kill: Whether the clean-up runs after ``kill``; processes that wait for each other
+            should die at once instead.
     """
     print_safely()
-    os.environ.setdefault("NO_COLOR", "1")  # colours are control characters as well
-    end = _End()
+    os.environ.setdefault("NO_COLOR", "1")  # colours are control characters
+    handler = _SignalHandler()
     try:
         try:
-            _listen(end, heed_kill)
+            _install(handler, heed_kill=heed_kill)
             text = command()
             if text is not None:
                 sys.stdout.write(f"{text}\n")
             sys.stdout.flush()
         except Exception as error:
-            heard = _heard_in(error)
-            if heard is not None and not isinstance(error, OSError):  # which a clean-up met
-                end.over = True
-                raise heard from None
-            if not _say(error):
+            cause = _signal_behind(error)
+            if cause is not None and not isinstance(error, OSError):  # not an error of a clean-up
+                handler.has_ended = True
+                raise cause from None
+            if not _report(error):
                 raise
             sys.exit(BAD_INPUT)
-        if end.heard is not None:  # a library has dropped it, and ended in peace
-            raise KeyboardInterrupt if end.heard == signal.SIGINT else SystemExit(128 + end.heard)
-    except KeyboardInterrupt:  # also of a rank whose peers' end was an error before
-        end.over = True
+        if handler.received is not None:  # a library has dropped the exception and returned
+            if handler.received == signal.SIGINT:
+                raise KeyboardInterrupt
+            raise SystemExit(128 + handler.received)
+    except KeyboardInterrupt:  # including a rank that met an error of its peers before
+        handler.has_ended = True
         if is_first_rank():
             sys.stderr.write(SAID)
         if "RANK" in os.environ and not heed_kill:
             sys.stderr.flush()
-            os._exit(128 + signal.SIGINT)  # the interpreter's own end would wait for other ranks
+            os._exit(128 + signal.SIGINT)  # the end of the interpreter would wait for other ranks
         sys.exit(128 + signal.SIGINT)
     finally:
-        end.over = True
+        handler.has_ended = True
 
 
-def _listen(end: "_End", heed_kill: bool) -> None:
-    """Answer signals, and let them through."""
-    logging.raiseExceptions = False  # a log file on a full disk is no reason for tracebacks
-    threading.excepthook = _end_of_thread
-    if getattr(sys.unraisablehook, "func", None) is not _drop_in_silence:
-        sys.unraisablehook = partial(_drop_in_silence, sys.unraisablehook)
+def _install(handler: "_SignalHandler", heed_kill: bool) -> None:
+    """Install the handlers of signals and of errors in threads, and unblock the signals."""
+    logging.raiseExceptions = False  # no traceback for a log file on a full disk
+    threading.excepthook = _report_thread_error
+    if getattr(sys.unraisablehook, "func", None) is not _hide_signal:
+        sys.unraisablehook = partial(_hide_signal, sys.unraisablehook)
     have_forks_die_too()
     tell_lost_batches()
-    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # as in a shell's background
-        signal.signal(signal.SIGINT, end)
-    signal.signal(signal.SIGTERM, end if heed_kill else signal.SIG_DFL)
-    if heed_kill and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # as nohup wants it
-        signal.signal(signal.SIGHUP, end)
+    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # ignored in the background of a shell
+        signal.signal(signal.SIGINT, handler)
+    signal.signal(signal.SIGTERM, handler if heed_kill else signal.SIG_DFL)
+    if heed_kill and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # ignored under nohup
+        signal.signal(signal.SIGHUP, handler)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)
 
 
-def _say(error: BaseException | None) -> bool:
-    """Say in a line what a user can cause; whether the error is such."""
-    words = error is not None and not os.environ.get("GSMAP_TRACEBACK") and in_words(error)
-    if words:
-        sys.stderr.write(f"error: {' '.join(words.split())}\n")
-    return bool(words)
+def _report(error: BaseException | None) -> bool:
+    """Print one line for an error that a user can cause; return whether it is one."""
+    if error is None or os.environ.get("GSMAP_TRACEBACK"):
+        return False
+    message = in_words(error)
+    if not message:
+        return False
+    sys.stderr.write(f"error: {' '.join(message.split())}\n")
+    return True
 
 
-def _end_of_thread(args: Any) -> None:
-    """Say why a library's thread ended, such as that of a log on a full disk."""
-    if not _say(args.exc_value):
+def _report_thread_error(args: Any) -> None:
+    """Report an error in a library's thread, for example of a log on a full disk."""
+    if not _report(args.exc_value):
         threading.__excepthook__(args)
 
 
-class _Heard(BaseException):
-    """What `_End` raises; it tells when it has been dropped on its way."""
+class _SignalError(BaseException):
+    """Exception for a signal, which reports when it is garbage collected."""
 
-    dropped: Callable[[], None]
+    on_drop: Callable[[], None]
 
     def __del__(self) -> None:
-        self.dropped()
+        self.on_drop()
 
 
-class _Interrupted(_Heard, KeyboardInterrupt):
-    """Ctrl-C."""
+class _InterruptError(_SignalError, KeyboardInterrupt):
+    """Exception for Ctrl-C."""
 
 
-class _Killed(_Heard, SystemExit):
-    """``kill``, or the end of the terminal; its code is the command's."""
+class _KillError(_SignalError, SystemExit):
+    """Exception for ``kill`` or the end of the terminal, with the exit code of the command."""
 
 
-class _End:
-    """Answers Ctrl-C and ``kill`` once, so that impatience does not cut a clean-up off.
+class _SignalHandler:
+    """Handler of Ctrl-C and ``kill`` that raises one exception, so that clean-ups run once.
 
-    It raises, so that clean-ups run. Python drops what is raised in a finalizer or at the end of a
-    fork, and C code and libraries drop what they like, above all while they are imported: a signal
-    whose exception is gone before `run_command` has seen it is sent again. Forked workers inherit
-    this, and leave Ctrl-C to the command's own process.
+    Further signals during the clean-up are ignored. Python drops exceptions that are raised in a
+    finalizer or at the end of a fork, and so do C code and libraries, above all during imports. If
+    the exception is garbage collected before `run_command` catches it, the signal is sent again.
+    Forked workers inherit the handler, and ignore Ctrl-C.
     """
 
     def __init__(self) -> None:
         self._main = os.getpid()
-        self._answered_s = -math.inf
-        self.heard: int | None = None  # a signal that has been raised
-        self.over = False  # whether the command has ended
+        self._raise_time_s = -math.inf
+        self.received: int | None = None  # signal whose exception was raised
+        self.has_ended = False
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         if os.getpid() != self._main:
@@ -205,28 +223,28 @@ class _End:
                 return
             sys.exit(128 + number)
         now_s = time.monotonic()
-        if now_s - self._answered_s < CLEAN_UP_S:
+        if now_s - self._raise_time_s < CLEAN_UP_S:
             return
-        if _starts_an_extension(frame):
+        if _imports_extension(frame):
             self._send_again(number)
             return
-        self._answered_s = now_s
-        self.heard = number
-        raise self._exception(number)  # by no name: its traceback would keep it alive
+        self._raise_time_s = now_s
+        self.received = number
+        raise self._exception(number)  # a variable would keep it alive by its traceback
 
-    def _exception(self, number: int) -> _Heard:
-        """Return what to raise for a signal."""
-        error = _Interrupted() if number == signal.SIGINT else _Killed(128 + number)
-        error.dropped = partial(self._dropped, number)
+    def _exception(self, number: int) -> _SignalError:
+        """Return the exception for a signal."""
+        error = _InterruptError() if number == signal.SIGINT else _KillError(128 + number)
+        error.on_drop = partial(self._handle_drop, number)
         return error
 
-    def _dropped(self, number: int) -> None:
-        if not self.over and os.getpid() == self._main:
-            self._answered_s = -math.inf
+    def _handle_drop(self, number: int) -> None:
+        if not self.has_ended and os.getpid() == self._main:
+            self._raise_time_s = -math.inf
             self._send_again(number)
 
     def _send_again(self, number: int) -> None:
-        """Send a signal a little later; without `threading`, whose locks may be taken here."""
+        """Send a signal after a delay; `threading` is not used, whose locks may be taken here."""
         _thread.start_new_thread(_send_later, (number,))
 
 
@@ -235,44 +253,48 @@ def _send_later(number: int) -> None:
     signal.pthread_kill(threading.main_thread().ident or 0, number)
 
 
-def _starts_an_extension(frame: FrameType | None) -> bool:
-    """Whether a module in C is being made, which may end the process if that fails."""
+def _imports_extension(frame: FrameType | None) -> bool:
+    """Whether an extension module is being imported; an exception there may end the process."""
     while frame is not None:
-        if frame.f_code.co_name in ("create_module", "exec_module") and isinstance(
-            frame.f_locals.get("self"), ExtensionFileLoader
-        ):
-            return True
+        if frame.f_code.co_name in ("create_module", "exec_module"):
+            loader = frame.f_locals.get("self")
+            if isinstance(loader, ExtensionFileLoader):
+                return True
         frame = frame.f_back
     return False
 
 
-def _heard_in(error: BaseException | None) -> _Heard | None:
-    """Return the signal that an exception is, or that it follows from."""
-    while error is not None and not isinstance(error, _Heard):
+def _signal_behind(error: BaseException | None) -> _SignalError | None:
+    """Return the signal exception in the chain of an exception, or None."""
+    while error is not None and not isinstance(error, _SignalError):
         error = error.__cause__ or error.__context__
     return error
 
 
-def _drop_in_silence(otherwise: Callable[[Any], object], args: Any) -> None:
-    """Say nothing of a signal that Python drops, as it is sent again; a ``sys.unraisablehook``."""
-    if not isinstance(args.exc_value, _Heard):
-        otherwise(args)
+def _hide_signal(default_hook: Callable[[Any], object], args: Any) -> None:
+    """Hide signal exceptions that Python drops, as they are sent again; ``sys.unraisablehook``."""
+    if not isinstance(args.exc_value, _SignalError):
+        default_hook(args)
 
 
 def output_file(text: str) -> Path:
-    """Read an argument that names what a command writes, before it begins to work.
+    """Parse the path of an output file, and check that it can be written.
 
     Raises:
-        OSError: If it is a folder, or no file can be made there.
+        OSError: If the path is a folder, or no file can be created there.
     """
     path = Path(text)
-    place = next(parent for parent in path.absolute().parents if parent.exists())
+    folder = next(parent for parent in path.absolute().parents if parent.exists())
     if path.is_dir():
-        number, at = errno.EISDIR, path
-    elif not place.is_dir():
-        number, at = errno.ENOTDIR, place
-    elif not os.access(path if path.exists() else place, os.W_OK):
-        number, at = errno.EACCES, place
-    else:
-        return path
-    raise OSError(number, os.strerror(number), str(at))
+        raise _os_error(number=errno.EISDIR, path=path)
+    if not folder.is_dir():
+        raise _os_error(number=errno.ENOTDIR, path=folder)
+    target = path if path.exists() else folder
+    if not os.access(target, mode=os.W_OK):
+        raise _os_error(number=errno.EACCES, path=folder)
+    return path
+
+
+def _os_error(number: int, path: Path) -> OSError:
+    """Return the error of the system with this number, for a path."""
+    return OSError(number, os.strerror(number), str(path))

@@ -1,4 +1,4 @@
-"""Python's garbage collection while many modules are imported."""
+"""Suspension of Python's garbage collection during the import of many modules."""
 
 import gc
 from collections.abc import Iterator
@@ -9,8 +9,8 @@ from contextlib import contextmanager
 def collection_paused() -> Iterator[None]:
     """Context without garbage collections.
 
-    An import makes some 700,000 objects that live as long as the process. Collections during the
-    import search all of them several times, a sixth of its processor time, and find nothing.
+    The import of the library makes some 700,000 objects that live as long as the process. Garbage
+    collections during the import would take a sixth of its processor time and free nothing.
     """
     was_enabled = gc.isenabled()
     gc.disable()

@@ -1,4 +1,4 @@
-"""A word about numba's compilation, which takes a while but happens once a machine."""
+"""Notice about the compilation of numba kernels, and a cache folder for them."""
 
 import logging
 import os
@@ -9,34 +9,34 @@ from numba.core import caching, event
 
 from gsmap.utils.interrupt import is_first_rank
 
-_KEPT = " They are kept for the next runs, in __pycache__ or NUMBA_CACHE_DIR."
+_CACHE_NOTE = " They are kept for the next runs, in __pycache__ or NUMBA_CACHE_DIR."
 
 
 class CompilationNotice(event.Listener):
-    """Says once that kernels are compiled; those that numba finds in its cache say nothing."""
+    """Logs once per process that kernels are compiled; cached kernels cause no message."""
 
-    told = False
+    has_logged = False
 
     def on_start(self, event: event.Event) -> None:
-        """Say it."""
-        if not self.told and is_first_rank():
+        """Log the notice before the first compilation."""
+        if not self.has_logged and is_first_rank():
             logging.getLogger("gsmap").warning(
                 "Kernels for the CPU are compiled, which takes up to a minute."
-                + ("" if _FOLDER else _KEPT)
+                + ("" if _FOLDER else _CACHE_NOTE)
             )
-        self.told = True
+        self.has_logged = True
 
     def on_end(self, event: event.Event) -> None:
-        """Say nothing."""
+        """Do nothing after a compilation."""
 
 
 def place_for_kernels() -> TemporaryDirectory | None:
-    """Make a folder for numba's kernels where numba finds none, as in an image that is read-only.
+    """Make a cache folder for numba's kernels if numba has none, as in a read-only container.
 
-    This process and those that it starts use it, and it goes with this one.
+    This process and its child processes use the folder. It is removed at the end of this process.
 
     Returns:
-        The folder; None where numba has a place.
+        The folder, or None if numba has a cache folder.
     """
     try:
         caching.CompileResultCacheImpl(place_for_kernels)
@@ -55,5 +55,5 @@ def place_for_kernels() -> TemporaryDirectory | None:
 
 
 NOTICE = CompilationNotice()
-event.register("numba:compile", NOTICE)
+event.register(kind="numba:compile", listener=NOTICE)
 _FOLDER = place_for_kernels()

@@ -1,25 +1,25 @@
 """Errors that a user can cause. A command prints their text; every other exception is a bug.
 
-Each class is also the exception of Python that the docstrings name (``Raises: ValueError``), so a
-caller needs to know none of them.
+Each class derives from the built-in exception that the docstrings name (``Raises: ValueError``), so
+callers can catch the built-in one.
 """
 
 
 class GsmapError(Exception):
-    """Base class of the errors whose text is written for the user: the fault and its remedy."""
+    """Base class of errors with a text for the user, which names the fault and a remedy."""
 
 
 class InputError(GsmapError, ValueError):
-    """An argument, a file or a setting has a value that cannot be used."""
+    """Invalid value of an argument, a file or a setting."""
 
 
 class InputTypeError(GsmapError, TypeError):
-    """An argument or a setting has a type that cannot be used."""
+    """Invalid type of an argument or a setting."""
 
 
 class WorkError(GsmapError, RuntimeError):
-    """The work cannot be done here: a package, a device or another process prevents it."""
+    """Work that a missing package, a device or another process prevents."""
 
 
 class NotFiniteError(GsmapError, FloatingPointError):
-    """Losses, costs or weights are NaN or infinite."""
+    """NaN or infinite losses, costs or weights."""

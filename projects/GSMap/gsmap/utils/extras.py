@@ -1,4 +1,4 @@
-"""Packages that only some of GSMap needs: extras of its own package."""
+"""Import of optional dependencies, the extras of the package."""
 
 import importlib
 from types import ModuleType
@@ -7,10 +7,14 @@ from gsmap.utils.errors import WorkError
 
 
 def import_extra(module: str, extra: str) -> ModuleType:
-    """Import a module that comes with an extra of this package (``pip install -e .[EXTRA]``).
+    """Import a module of an optional dependency (``pip install -e .[EXTRA]``).
+
+    Args:
+        module: Name of the module.
+        extra: Name of the extra that installs it.
 
     Raises:
-        RuntimeError: If it is not installed.
+        RuntimeError: If the module is not installed.
     """
     try:
         return importlib.import_module(module)

@@ -1,4 +1,4 @@
-"""Errors that a user can cause, in words; every other exception is a bug."""
+"""One-line messages for errors that a user can cause; every other exception is a bug."""
 
 import errno
 import re
@@ -8,20 +8,20 @@ from typing import Any
 
 from gsmap.utils.errors import GsmapError
 
-_FULL = "free some space there, or write elsewhere"
-_LESS = (
+_FREE_SPACE = "free some space there, or write elsewhere"
+_REDUCE_MEMORY = (
     "take a smaller batch (train_dataloader.batch_size=1), fewer processes (num_workers, "
     "--workers) or smaller images"
 )
-_SHORTENED = (
+_BUS_ERROR_ADVICE = (
     "a data file was shortened while it was read (end what writes there, make it again), or "
     "/dev/shm is full (take fewer num_workers)"
 )
-_FEWER = "use fewer processes (num_workers, --workers)"
+_FEWER_PROCESSES = "use fewer processes (num_workers, --workers)"
 _REMEDIES = {
-    errno.ENOSPC: _FULL,
-    errno.EDQUOT: _FULL,
-    errno.EFBIG: _FULL,
+    errno.ENOSPC: _FREE_SPACE,
+    errno.EDQUOT: _FREE_SPACE,
+    errno.EFBIG: _FREE_SPACE,
     errno.EACCES: "choose a place that you may read and write",
     errno.EPERM: "choose a place that you may read and write",
     errno.EROFS: "choose a place where you may write",
@@ -29,97 +29,109 @@ _REMEDIES = {
     errno.ENOTDIR: "a part of that path is a file",
     errno.EEXIST: "choose another name or remove it",
     errno.ENOENT: "check the path",
-    errno.EMFILE: _FEWER,
-    errno.ENFILE: _FEWER,
-    errno.ENOMEM: _FEWER,
+    errno.EMFILE: _FEWER_PROCESSES,
+    errno.ENFILE: _FEWER_PROCESSES,
+    errno.ENOMEM: _FEWER_PROCESSES,
 }
 _NO_MEMORY = re.compile(
     r"out of memory|(can't|Cannot|cannot) allocate memory|not enough memory|DataLoader worker \(pid"
 )
-_NO_HANDLES = re.compile("Too many open files. Communication with the workers")  # torch's words
+_NO_HANDLES = re.compile("Too many open files. Communication with the workers")  # message of torch
 _NO_DEVICE = re.compile(
     "not compiled with CUDA|no NVIDIA driver|No CUDA GPUs|invalid device ordinal|device string"
 )
-_NO_PEER = re.compile(r"gloo.*(closed|reset) by peer|NCCL.*remote process", re.DOTALL)
-_IN_WORKER = "Original Traceback (most recent call last)"  # in texts of torch's DataLoader
+_NO_PEER = re.compile(r"gloo.*(closed|reset) by peer|NCCL.*remote process", flags=re.DOTALL)
+_IN_WORKER = "Original Traceback (most recent call last)"  # in messages of torch's DataLoader
 
 
 def in_words(error: BaseException) -> str | None:
-    """Return the text of an error that a user can cause.
+    """Return the message of an error that a user can cause.
 
-    These are errors of ours (`GsmapError`), of the system (``OSError``), and those of libraries by
-    which a machine says that it lacks memory, a device or a process. Whoever calls a library with
-    a user's content turns its other errors into ours on the spot.
+    Such errors are this package's errors (`GsmapError`), system errors (``OSError``), and library
+    errors that report a lack of memory, a missing device or a dead process. Code that calls a
+    library with a user's content converts other library errors to `GsmapError` itself.
 
     Args:
         error: Exception that ended a command.
 
     Returns:
-        The text; None for a bug, which keeps its traceback.
+        The message, or None for a bug, which keeps its traceback.
     """
     text = str(error)
-    if _IN_WORKER in text:  # torch hands on the class, and the text within a traceback
-        text = text.rstrip().splitlines()[-1]
-        text = text.partition(": ")[2]
-    return (
-        _of_the_machine(error, text)
-        or _of_the_system(error, text)
-        or (text if isinstance(error, GsmapError) else None)
+    if _IN_WORKER in text:  # torch re-raises the class with a traceback as its message
+        last_line = text.rstrip().splitlines()[-1]
+        _, _, text = last_line.partition(": ")
+    message = _describe_machine_error(error=error, text=text) or _describe_system_error(
+        error=error, text=text
     )
+    if message:
+        return message
+    return text if isinstance(error, GsmapError) else None
 
 
 def is_of_the_machine(error: BaseException) -> bool:
-    """Whether an error tells what the system lacks or refuses, and nothing of a file's content."""
-    if isinstance(error, MemoryError):  # also Arrow's
+    """Whether an error comes from a limit of the system, independent of the content of a file."""
+    if isinstance(error, MemoryError):  # also raised by Arrow
         return True
     if isinstance(error, OSError) and error.errno:
-        return error.errno != errno.EINVAL  # as a damaged file leads to a place before its start
+        return error.errno != errno.EINVAL  # raised for negative positions in damaged files
     return isinstance(error, RuntimeError | OSError) and bool(_NO_MEMORY.search(str(error)))
 
 
 def nearest(name: str, names: Iterable[str]) -> str:
-    """Return ``; did you mean ...?`` with the nearest name, or nothing if none is near."""
-    close = get_close_matches(name, list(names), n=1)
-    return f"; did you mean {close[0]!r}?" if close else ""
+    """Return ``; did you mean ...?`` with the most similar name, empty if none is similar.
+
+    Args:
+        name: Unknown name.
+        names: Known names.
+    """
+    matches = get_close_matches(word=name, possibilities=list(names), n=1)
+    return f"; did you mean {matches[0]!r}?" if matches else ""
 
 
 def registry_names(registry: Any) -> list[str]:
-    """Return the names in a registry of mmengine, its parents and their children."""
-    while registry.parent is not None:
-        registry = registry.parent
-    family = [registry]
+    """Return the names in a registry of mmengine and in all registries of its family."""
+    root = registry
+    while root.parent is not None:
+        root = root.parent
+    family = [root]
+    for member in family:  # grows while it is read
+        family.extend(member.children.values())
+    names = []
     for member in family:
-        family += member.children.values()
-    return [name for member in family for name in member.module_dict]
+        names.extend(member.module_dict)
+    return names
 
 
-def _of_the_machine(error: BaseException, text: str) -> str | None:
-    """Speak of memory that does not suffice, and of devices and processes that are not there."""
+def _describe_machine_error(error: BaseException, text: str) -> str | None:
+    """Describe a lack of memory, a missing device or a dead process."""
+    is_runtime_error = isinstance(error, RuntimeError)
     reason = text.strip().splitlines()[0].rstrip(".") if text.strip() else type(error).__name__
     signals = f"{text} {error.__cause__}"
-    if isinstance(error, RuntimeError) and "signal: Bus error" in signals:
-        return f"bus error of a data loader's worker: {_SHORTENED}."
-    if (
-        isinstance(error, RuntimeError)
-        and "exited unexpectedly" in text
-        and "signal:" not in signals
-    ):
-        return f"{reason}, by a signal unknown: out of memory ({_LESS}), or {_SHORTENED}."
-    if isinstance(error, RuntimeError) and _NO_HANDLES.match(text):
-        return f"too many open files: raise their limit (ulimit -n), or {_FEWER}."
-    speaks = isinstance(error, (RuntimeError, OSError)) and _NO_MEMORY.search(text)
-    if isinstance(error, MemoryError) or speaks:
-        return f"out of memory ({reason}): {_LESS}."
-    if isinstance(error, RuntimeError) and _NO_PEER.search(text):
+    if is_runtime_error and "signal: Bus error" in signals:
+        return f"bus error of a data loader's worker: {_BUS_ERROR_ADVICE}."
+    if is_runtime_error and "exited unexpectedly" in text and "signal:" not in signals:
+        return (
+            f"{reason}, by a signal unknown: out of memory ({_REDUCE_MEMORY}), or "
+            f"{_BUS_ERROR_ADVICE}."
+        )
+    if is_runtime_error and _NO_HANDLES.match(text):
+        return f"too many open files: raise their limit (ulimit -n), or {_FEWER_PROCESSES}."
+    reports_memory = isinstance(error, (RuntimeError, OSError)) and _NO_MEMORY.search(text)
+    if isinstance(error, MemoryError) or reports_memory:
+        return f"out of memory ({reason}): {_REDUCE_MEMORY}."
+    if is_runtime_error and _NO_PEER.search(text):
         return "another rank has ended; its own words say why."
     if isinstance(error, (RuntimeError, AssertionError)) and _NO_DEVICE.search(text):
         return f"this machine does not have the device that was asked for ({reason}): give cpu."
     return None
 
 
-def _of_the_system(error: BaseException, text: str) -> str | None:
-    """Speak of what the system refuses."""
+def _describe_system_error(error: BaseException, text: str) -> str | None:
+    """Describe an error of the operating system, with a remedy if there is one for its code."""
     if not isinstance(error, OSError):
         return None
     remedy = _REMEDIES.get(error.errno or 0)
-    return f"{text}; {remedy}." if remedy and text.startswith("[Errno") else text
+    if remedy and text.startswith("[Errno"):
+        return f"{text}; {remedy}."
+    return text

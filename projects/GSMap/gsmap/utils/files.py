@@ -1,4 +1,4 @@
-"""Files that are whole or absent, whatever stops their writer."""
+"""Atomic writes, safe file names, locks, and reading of text and JSON files."""
 
 import codecs
 import hashlib
@@ -30,77 +30,99 @@ try:
 except ImportError:  # Windows, where files are not locked
     fcntl = None  # type: ignore[assignment]
 
-SUFFIX = ".gsmap-partial"  # no other program's name
-_BOOT = Path("/proc/sys/kernel/random/boot_id")  # the same for all containers of a machine
-_MACHINE = _BOOT.read_text()[:8] if _BOOT.exists() else secrets.token_hex(4)
-_OURS = re.compile(rf".+\.([0-9a-f]{{8}})-[0-9a-f]{{8}}{re.escape(SUFFIX)}", re.DOTALL)
+SUFFIX = ".gsmap-partial"  # not used by other programs
+_BOOT = Path("/proc/sys/kernel/random/boot_id")  # equal in all containers of a machine
+_MACHINE = _BOOT.read_text()[:8] if _BOOT.exists() else secrets.token_hex(nbytes=4)
+_PARTIAL_NAME = re.compile(
+    rf".+\.([0-9a-f]{{8}})-[0-9a-f]{{8}}{re.escape(SUFFIX)}", flags=re.DOTALL
+)
 _DAY_S = 24 * 3600.0
 _DEVICES = Path("/dev")
-_STREAMS = Path("/dev/fd"), Path("/proc/self/fd")  # links to what a process has open
+_STREAMS = Path("/dev/fd"), Path("/proc/self/fd")  # links to the open files of a process
 _OWN_FOLDERS: set[Path] = set()
 _HOLDER = re.compile(r"(process \d+ on \S+ since [\d: -]+)?")  # what `lock_folder` writes
-_CHANGED = re.compile(r"-[0-9a-f]{16}\Z")  # as `file_name` ends a changed name
-DAMAGED_ZIP = (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError)  # what it raises
+_DIGEST_ENDING = re.compile(r"-[0-9a-f]{16}\Z")  # of names that `file_name` has changed
+# Exceptions of `zipfile` for a damaged archive
+DAMAGED_ZIP = (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError)
 _LFS_POINTER = b"version https://git-lfs.github.com/"
-_LONGEST_NAME = 100  # bytes; a file system takes 255, with all that is appended
+_LONGEST_NAME = 100  # bytes; file systems allow 255, including all suffixes
 
 
 def file_name(foreign: str) -> str:
-    """Make the name of a file or folder from a name that a file brings.
+    """Convert a name from a file to a safe name of a file or folder.
 
-    It is one part of a path and leads nowhere else. Letters, digits and ``_.+=-`` stay. A name that
-    has others, is empty or long, begins with a dot or hyphen, ends with a dot, is not in Unicode's
-    form NFC, or ends as a changed name does is changed and gets a digest, so that two names never
-    make one file.
+    The result is a single path component. Letters, digits and ``_.+=-`` are kept. The name is
+    changed if it has other characters, is empty or longer than 100 bytes, begins with a dot or
+    hyphen, ends with a dot, is not in Unicode form NFC, or ends like a changed name. A changed name
+    ends with a digest of the original, so that different names make different files.
+
+    Args:
+        foreign: Untrusted name.
     """
     name = _plain_name(foreign)
-    if name == foreign and not _CHANGED.search(name):
+    if name == foreign and not _DIGEST_ENDING.search(name):
         return name
     return _changed_name(foreign)
 
 
 def file_names(foreign: Iterable[str], endings: Sequence[str] = ("",)) -> dict[str, str]:
-    """Make the names of several files (`file_name`), no two of which are one file.
+    """Convert names from a file to safe names of distinct files (`file_name`).
 
-    Where two differ in nothing but capitals, as some disks do not tell apart, or one is another
-    with an ending, both get a digest.
+    Names also get a digest if their files would differ in upper and lower case only, which some
+    file systems do not distinguish, or if a name with an ending would be the file of another name.
 
     Args:
-        foreign: The names that a file brings.
-        endings: What is appended to each name.
+        foreign: Untrusted names.
+        endings: Suffixes that the caller appends to each name.
 
     Returns:
-        The name of the file of each.
+        The safe name of each name.
     """
     names = {name: file_name(name) for name in foreign}
     while True:
-        uses = Counter(f"{name}{e}".casefold() for name in names.values() for e in endings)
-        met = [
-            name
-            for name, file in names.items()
-            if any(uses[f"{file}{e}".casefold()] > 1 for e in endings)
-        ]
-        changed = {name: _changed_name(name) for name in met}
-        if all(names[name] == new for name, new in changed.items()):
+        uses: Counter[str] = Counter()
+        for name in names.values():
+            uses.update(_folded_names(name=name, endings=endings))
+        has_changes = False
+        new_names = dict(names)
+        for original, name in names.items():
+            is_ambiguous = any(uses[file] > 1 for file in _folded_names(name=name, endings=endings))
+            changed_name = _changed_name(original)
+            if is_ambiguous and name != changed_name:
+                new_names[original] = changed_name
+                has_changes = True
+        if not has_changes:
             return names
-        names |= changed
+        names = new_names
+
+
+def _folded_names(name: str, endings: Sequence[str]) -> list[str]:
+    """Return a file name with each ending, without the distinction of upper and lower case."""
+    return [f"{name}{ending}".casefold() for ending in endings]
 
 
 def _plain_name(foreign: str) -> str:
-    composed = unicodedata.normalize("NFC", foreign)  # some disks do not tell the forms apart
-    letters = re.sub(r"[^\w.+=-]", "_", composed)
-    plain = letters.lstrip(".-").encode()[:_LONGEST_NAME]
-    return plain.decode(errors="ignore").rstrip(".") or "unnamed"
+    composed = unicodedata.normalize(
+        "NFC", foreign
+    )  # some file systems do not distinguish the forms
+    safe = re.sub(r"[^\w.+=-]", repl="_", string=composed)
+    start = safe.lstrip(".-").encode()[:_LONGEST_NAME]
+    return start.decode(errors="ignore").rstrip(".") or "unnamed"
 
 
 def _changed_name(foreign: str) -> str:
-    digest = hashlib.sha256(foreign.encode(errors="surrogatepass")).hexdigest()[:16]
-    return f"{_plain_name(foreign)}-{digest}"
+    content = foreign.encode(errors="surrogatepass")
+    digest = hashlib.sha256(content).hexdigest()
+    return f"{_plain_name(foreign)}-{digest[:16]}"
 
 
 @contextmanager
 def naming_file(path: Path) -> Iterator[None]:
-    """Say which file it was where the system refuses to write to one that is open."""
+    """Context that adds a path to system errors without one, such as a failed write.
+
+    Args:
+        path: File or folder that the block writes to.
+    """
     try:
         yield
     except OSError as error:
@@ -110,9 +132,9 @@ def naming_file(path: Path) -> Iterator[None]:
 
 
 def own_folder(path: Path) -> Path:
-    """Return a folder whose name a command chooses, and let no link below it be followed.
+    """Register a folder whose name a command chooses, and return it.
 
-    From then on `atomic_write` refuses (``ValueError``) what a link would lead out of it.
+    Afterwards `atomic_write` raises ``ValueError`` if a link would lead a file out of the folder.
     """
     require_no_link(path)
     _OWN_FOLDERS.add(path)
@@ -121,12 +143,16 @@ def own_folder(path: Path) -> Path:
 
 @contextmanager
 def atomic_write(path: str | Path, mode: Literal["w", "wb"] = "w") -> Iterator[IO[Any]]:
-    """Open a file that takes its name only when the block ends well.
+    """Open a file for writing that replaces ``path`` when the block ends without an exception.
 
-    Until then it is another file beside it (`partial_path`), which any exception removes. A reader
-    sees the old file or the new one. It has the mode of the file that it replaces. A link is
-    replaced, not followed. A device or a pipe, such as ``/dev/null``, is written to as it is.
-    Parent folders are made; text is UTF-8.
+    The content is written to a file beside it (`partial_path`), which is removed after an
+    exception, so a reader opens either the old file or the complete new one. The new file keeps the
+    permissions of the old one. A link is replaced, not followed. A device or a pipe, such as
+    ``/dev/null``, is written directly. Missing parent folders are created. Text is UTF-8.
+
+    Args:
+        path: File to create or replace.
+        mode: ``"w"`` for text, ``"wb"`` for bytes.
 
     Raises:
         InputReplacedError: If the file is an input of the command (`inputs.declare_files`).
@@ -135,39 +161,39 @@ def atomic_write(path: str | Path, mode: Literal["w", "wb"] = "w") -> Iterator[I
     require_no_input(path)
     for folder in _OWN_FOLDERS:
         if path.is_relative_to(folder):
-            require_no_link(path.parent, folder.parent)
+            require_no_link(path.parent, below=folder.parent)
     encoding = None if "b" in mode else "utf-8"
     special = _is_special(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     failures: list[OSError] = []
     try:
         with (
-            nullcontext(path) if special else partial_path(path) as made,
-            io.BufferedWriter(_Raw(made, failures)) as buffer,
-            buffer if encoding is None else io.TextIOWrapper(buffer, encoding) as file,
+            nullcontext(path) if special else partial_path(path) as partial_file,
+            io.BufferedWriter(_RawFile(partial_file, failures=failures)) as buffer,
+            buffer if encoding is None else io.TextIOWrapper(buffer, encoding=encoding) as file,
         ):
             if not special:
-                _keep_mode(path, file.fileno())
+                _keep_mode(path=path, handle=file.fileno())
             yield file
             file.flush()
             if not special:
                 os.fsync(file.fileno())
                 forget_output(path)
-                os.replace(made, path)
+                os.replace(src=partial_file, dst=path)
     except Exception as raised:
         error = failures[0] if failures else raised
         if not isinstance(error, OSError) or not error.errno:
             raise
-        if error.filename and not _OURS.fullmatch(str(error.filename)):
+        if error.filename and not _PARTIAL_NAME.fullmatch(str(error.filename)):
             raise
         raise type(error)(error.errno, error.strerror, str(path)) from raised
 
 
-class _Raw(io.FileIO):
-    """A file that notes why it cannot be written: some libraries tell it in words of their own."""
+class _RawFile(io.FileIO):
+    """File that records its write errors, because some libraries raise an error of another type."""
 
     def __init__(self, path: Path, failures: list[OSError]) -> None:
-        super().__init__(str(path), "w", opener=_open_unlinked)
+        super().__init__(str(path), mode="w", opener=_open_unlinked)
         self._failures = failures
 
     def write(self, data: Any) -> int | None:  # type: ignore[override]
@@ -179,33 +205,34 @@ class _Raw(io.FileIO):
 
 
 def _open_unlinked(path: str, flags: int) -> int:
-    """Open a file, or a pipe that somebody reads from, for writing; no file elsewhere by a link."""
-    follows = _is_special(Path(path))  # /dev/stdout
-    return os.open(path, flags | (0 if follows else os.O_NOFOLLOW), 0o666)
+    """Open a file for writing; links are followed for devices and pipes only."""
+    if not _is_special(Path(path)):  # such as /dev/stdout
+        flags |= os.O_NOFOLLOW
+    return os.open(path, flags=flags, mode=0o666)
 
 
 def _keep_mode(path: Path, handle: int) -> None:
-    """Give an open file the permissions of the one that it is to replace."""
+    """Copy the permissions of a file to the open file that will replace it."""
     with suppress(FileNotFoundError):
-        before, own = path.lstat().st_mode, os.fstat(handle).st_mode
-        wanted = stat.S_IMODE(before) & 0o777
-        if stat.S_ISREG(before) and stat.S_IMODE(own) != wanted:
-            os.fchmod(handle, wanted)
+        old_mode = path.lstat().st_mode
+        new_mode = os.fstat(handle).st_mode
+        permissions = stat.S_IMODE(old_mode) & 0o777
+        if stat.S_ISREG(old_mode) and stat.S_IMODE(new_mode) != permissions:
+            os.fchmod(handle, mode=permissions)
 
 
 def open_to_append(path: Path) -> io.FileIO:
-    """Open a file to read it and add to it, unbuffered; it is made if there is none.
+    """Open a file for reading and appending, unbuffered; create it if it does not exist.
 
     Raises:
-        ValueError: If it is no plain file of one name: a link leads elsewhere, and a pipe or a
-            folder holds no text.
+        ValueError: If the path is a link, a pipe or a folder, or a file with several hard links.
     """
     flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     status = None
     with suppress(FileNotFoundError):
         status = path.lstat()
     if status is None or _is_plain(status):
-        file = io.FileIO(os.open(path, flags, 0o666), "a+")
+        file = io.FileIO(os.open(path, flags=flags, mode=0o666), mode="a+")
         if _is_plain(os.fstat(file.fileno())):
             return file
         file.close()
@@ -216,14 +243,15 @@ def open_to_append(path: Path) -> io.FileIO:
 
 
 def require_no_link(path: Path, below: Path | None = None) -> None:
-    """Refuse a folder that a link leads elsewhere from.
+    """Require a folder whose path has no links.
 
     Args:
-        path: A folder whose name the command chooses.
-        below: A folder above it that the user named, through whatever links; by default its parent.
+        path: Folder whose name the command chooses.
+        below: Folder above it that the user has named, and whose path may have links; by default
+            its parent.
 
     Raises:
-        ValueError: If it, or a folder between the two, is a link.
+        ValueError: If the folder, or a folder between the two, is a link.
     """
     top = path.parent if below is None else below
     for folder in (path, *path.parents):
@@ -237,7 +265,7 @@ def require_no_link(path: Path, below: Path | None = None) -> None:
 
 
 def take_from_link(path: Path) -> None:
-    """Free a name that a library is to write to from what leads elsewhere: a link, a hard link."""
+    """Remove a link, or one of several hard links, before a library writes to this path."""
     with suppress(FileNotFoundError):
         if not _is_plain(path.lstat()):
             path.unlink()
@@ -248,18 +276,23 @@ def _is_plain(status: os.stat_result) -> bool:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text file in one step, in UTF-8."""
+    """Write a text file in UTF-8 atomically."""
     with atomic_write(path) as file:
         file.write(text)
 
 
 def is_hidden(path: Path) -> bool:
-    """Whether a file or folder is of the kind that systems leave beside others, as ``._a.jpg``."""
+    """Whether a file or folder is hidden, such as the ``._a.jpg`` that macOS adds to ``a.jpg``."""
     return path.name.startswith(".")
 
 
 def fetch_advice(start: bytes, otherwise: str) -> str:
-    """Return how to get a file that is not what its name says, by the bytes it starts with."""
+    """Return advice for a file that is a Git LFS pointer or a web page instead of its content.
+
+    Args:
+        start: First bytes of the file, at least 100.
+        otherwise: Advice for all other files.
+    """
     if start.startswith(_LFS_POINTER):
         return "it is a pointer of Git LFS: fetch the file itself with `git lfs pull`"
     if start[:100].lstrip().lower().startswith((b"<!doctype html", b"<html")):
@@ -268,21 +301,25 @@ def fetch_advice(start: bytes, otherwise: str) -> str:
 
 
 def read_text(path: str | Path) -> str:
-    """Return the content of a text file in UTF-8, without a byte order mark.
+    """Read a text file in UTF-8, without its byte order mark.
 
     Raises:
-        ValueError: With its name and the remedy, if it is in another encoding.
+        ValueError: If the file has another encoding.
     """
     try:
         return Path(path).read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        wide = error.object.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-        reason = "it is UTF-16" if wide else str(error)
+        is_utf16 = error.object.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        reason = "it is UTF-16" if is_utf16 else str(error)
         raise InputError(f"{path} cannot be read: {reason}; save it as UTF-8.") from error
 
 
 def read_json(path: str | Path) -> Any:
-    """Return the value in a JSON file; ValueError with its name if it is none."""
+    """Read a JSON file.
+
+    Raises:
+        ValueError: If the file is not valid JSON.
+    """
     try:
         return json.loads(read_text(path))
     except json.JSONDecodeError as error:
@@ -292,34 +329,39 @@ def read_json(path: str | Path) -> Any:
 
 
 def write_bytes(path: str | Path, content: bytes) -> None:
-    """Write a file in one step."""
-    with atomic_write(path, "wb") as file:
+    """Write a file atomically."""
+    with atomic_write(path, mode="wb") as file:
         file.write(content)
 
 
-_touch = partial(Path.touch, exist_ok=False)  # not through a link
+_touch = partial(Path.touch, exist_ok=False)  # does not follow links
 
 
 @contextmanager
 def partial_path(path: Path, make: Callable[[Path], object] = _touch) -> Iterator[Path]:
-    """Make an empty file or folder beside ``path``, which the block fills and gives that name.
+    """Context with a temporary file or folder beside ``path``, which the block fills and renames.
 
-    It is ``PATH.<machine>-<random>.gsmap-partial``, locked while the block runs, and goes with its
-    end. Those of killed writers in that folder go first: who gets their lock may remove them.
+    Its name is ``PATH.<machine>-<random>.gsmap-partial``. It is locked during the block and removed
+    at its end. Before, temporary files of killed writers in the folder are removed, which their
+    free locks identify.
+
+    Args:
+        path: Final path of the file or folder.
+        make: Function that creates the empty file or folder at a path, by default a file.
     """
     _remove_leftovers(path.parent)
     while True:
-        made = path.with_name(f"{path.name}.{_MACHINE}-{secrets.token_hex(4)}{SUFFIX}")
-        make(made)
+        temporary = path.with_name(f"{path.name}.{_MACHINE}-{secrets.token_hex(nbytes=4)}{SUFFIX}")
+        make(temporary)
         with suppress(FileNotFoundError):  # removed by another writer that locked it first
-            handle = _open(made)
-            if try_lock(handle) is not False and made.exists():
+            handle = _open(temporary)
+            if try_lock(handle) is not False and temporary.exists():
                 break
             os.close(handle)
     try:
-        yield made
+        yield temporary
     finally:
-        _remove(made)
+        _remove(temporary)
         os.close(handle)
 
 
@@ -327,7 +369,8 @@ def try_lock(file: IO[Any] | int) -> bool | None:
     """Lock an open file or folder for as long as it is open.
 
     Returns:
-        False if another process has locked it, None if the file system has no locks.
+        True on success, False if another process holds the lock, None if the file system has no
+        locks.
     """
     if fcntl is None:
         return None
@@ -341,38 +384,48 @@ def try_lock(file: IO[Any] | int) -> bool | None:
 
 
 def lock(file: IO[Any] | int, held: str) -> None:
-    """Lock an open file or folder for as long as it is open; warn where there are no locks.
+    """Lock an open file or folder for as long as it is open; warn if there are no locks.
+
+    Args:
+        file: Open file, or the handle of a file or folder.
+        held: Message of the error if another process holds the lock.
 
     Raises:
-        RuntimeError: If another process has locked it, with the text ``held``.
+        RuntimeError: If another process holds the lock.
     """
-    if (locked := try_lock(file)) is False:
+    is_locked = try_lock(file)
+    if is_locked is False:
         raise WorkError(held)
-    if locked is None:
+    if is_locked is None:
         text = "files cannot be locked here: take care that one process works at a time."
         logging.getLogger("gsmap").warning(text)
 
 
 def lock_folder(folder: Path, name: str, advice: str) -> IO[str]:
-    """Keep a folder for this process alone until the file that is returned is closed.
+    """Reserve a folder for this process until the returned file is closed.
 
     Args:
-        folder: The folder; it is made.
-        name: Name of a file in it, for the lock and for who holds it.
-        advice: What to do if another process has it.
+        folder: Folder; created if it does not exist.
+        name: Name of the lock file in the folder, which describes the process that holds it.
+        advice: Remedy if another process holds the folder, for the message.
+
+    Returns:
+        The open lock file.
 
     Raises:
-        RuntimeError: If another process has it; its number, its machine and since when.
+        ValueError: If another program has written the lock file.
+        RuntimeError: If another process holds the folder; the message has its process ID, its
+            machine and its start.
     """
     folder.mkdir(parents=True, exist_ok=True)
     raw = open_to_append(folder / name)
-    file = io.TextIOWrapper(io.BufferedRandom(raw), "utf-8", "replace")
-    os.register_at_fork(after_in_child=file.close)  # workers must not hold it for a killed parent
+    file = io.TextIOWrapper(io.BufferedRandom(raw), encoding="utf-8", errors="replace")
+    os.register_at_fork(after_in_child=file.close)  # workers would hold the lock of a killed parent
     file.seek(0)
     holder = file.read(200)
     if not _HOLDER.fullmatch(holder):
         raise InputError(f"{folder / name} is another program's file: write elsewhere.")
-    lock(file, f"{folder} is in use by {holder or 'another process'}: {advice}.")
+    lock(file, held=f"{folder} is in use by {holder or 'another process'}: {advice}.")
     file.truncate(0)
     file.write(f"process {os.getpid()} on {platform.node()} since {time.strftime('%F %T')}")
     file.flush()
@@ -380,38 +433,46 @@ def lock_folder(folder: Path, name: str, advice: str) -> IO[str]:
 
 
 def _remove_leftovers(folder: Path) -> None:
-    """Remove what killed writers left; another machine's, whose lock may not reach, after a day."""
+    """Remove temporary files of killed writers.
+
+    Locks of other machines may be invisible here, so their files are removed after a day.
+    """
     for name in os.listdir(folder):
-        if not (found := _OURS.fullmatch(name)):
+        match = _PARTIAL_NAME.fullmatch(name)
+        if match is None:
             continue
-        with suppress(OSError):  # it has gone meanwhile, or is another user's
+        with suppress(OSError):  # removed in the meantime, or owned by another user
             handle = _open(folder / name)
             try:
-                rested_s = time.time() - os.fstat(handle).st_mtime
-                if (found[1] == _MACHINE or rested_s > _DAY_S) and try_lock(handle):
+                age_s = time.time() - os.fstat(handle).st_mtime
+                if (match[1] == _MACHINE or age_s > _DAY_S) and try_lock(handle):
                     _remove(folder / name)
             finally:
                 os.close(handle)
 
 
 def _open(path: Path) -> int:
-    """Open a file or folder to lock it; network disks lock files only for who may write."""
-    return os.open(path, os.O_NOFOLLOW | (os.O_RDONLY if path.is_dir() else os.O_RDWR))
+    """Open a file or folder to lock it; network file systems lock only files open for writing."""
+    access = os.O_RDONLY if path.is_dir() else os.O_RDWR
+    return os.open(path, flags=os.O_NOFOLLOW | access)
 
 
 def _remove(path: Path) -> None:
-    shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _is_special(path: Path) -> bool:
-    """Whether a path is a device, a pipe or the like, which must not be replaced by a file.
+    """Whether a path is a device, a pipe or a socket, which a file must not replace.
 
-    A link to one is a file's name like any other, but for those that the system makes.
+    Links to them count only in ``/dev`` and in the folders of open files.
     """
     follow = path.parent in (_DEVICES, *_STREAMS)
     try:
         mode = path.stat(follow_symlinks=follow).st_mode
     except OSError:
         return False
-    plain = stat.S_ISREG(mode) and path.parent != _DEVICES
-    return not (plain or stat.S_ISDIR(mode) or stat.S_ISLNK(mode))
+    is_plain = stat.S_ISREG(mode) and path.parent != _DEVICES
+    return not (is_plain or stat.S_ISDIR(mode) or stat.S_ISLNK(mode))

@@ -1,4 +1,4 @@
-"""A batch that a worker cannot hand over ends its command, which would wait for it for ever."""
+"""Errors for batches that a worker process cannot send; otherwise the command waits forever."""
 
 from multiprocessing import queues
 from typing import Any
@@ -10,28 +10,32 @@ _REMEDY = (
     "-f), or read in the command's own process: num_workers=0, persistent_workers=False, "
     "--workers 1"
 )
-_otherwise = queues.Queue._on_queue_feeder_error  # type: ignore[attr-defined]
+_default_handler = queues.Queue._on_queue_feeder_error  # type: ignore[attr-defined]
 
 
 def tell_lost_batches() -> None:
-    """Send on, from this process and its workers, why a batch did not fit through.
+    """Report batches that cannot be sent, in this process and in its forked workers.
 
-    A worker packs its batches in a thread, where Python prints an error and goes on without them.
+    A worker serialises its batches in a thread, in which Python prints an error and drops the
+    batch. The replacement sends the error in place of the batch.
     """
     queues.Queue._on_queue_feeder_error = _send_error  # type: ignore[attr-defined]
 
 
 def _send_error(queue: "queues.Queue[Any]", error: Exception, item: Any) -> None:
-    """Put an error in the place of a batch, which comes with its number."""
-    from torch._utils import ExceptionWrapper  # a worker of torch has it
+    """Send an error with the index of a batch in place of the batch."""
+    from torch._utils import ExceptionWrapper  # torch is loaded in a worker of a data loader
 
-    number, batch = item if isinstance(item, tuple) and len(item) == 2 else (None, None)
-    if not isinstance(number, int) or isinstance(batch, ExceptionWrapper):
-        _otherwise(error, item)
+    index: Any = None
+    batch: Any = None
+    if isinstance(item, tuple) and len(item) == 2:
+        index, batch = item
+    if not isinstance(index, int) or isinstance(batch, ExceptionWrapper):
+        _default_handler(error, item)
         return
     try:
         raise InputError(
             f"a worker could not hand over what it read ({error}): {_REMEDY}."
         ) from error
     except ValueError:
-        queue.put((number, ExceptionWrapper(where="in a data loader's worker")))
+        queue.put((index, ExceptionWrapper(where="in a data loader's worker")))

@@ -1,4 +1,4 @@
-"""The files that a command reads: plain files, none of which its outputs may replace."""
+"""Protection of the input files of a command from its outputs, and from pipes and devices."""
 
 import os
 import stat
@@ -10,54 +10,54 @@ from typing import Any, ClassVar
 
 from gsmap.utils.errors import InputError, WorkError
 
-_Identity = tuple[int, int, int]  # device and number of a file, and when it was last changed
+_Identity = tuple[int, int, int]  # device, inode and modification time of a file
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
-_OF_THE_SYSTEM = ("/dev/", "/proc/", "/sys/")  # pipes and devices that are no stranger's
+_SYSTEM_FOLDERS = ("/dev/", "/proc/", "/sys/")  # pipes and devices there may be read
 
 
 class InputReplacedError(WorkError):
-    """A command would write over a file that it reads."""
+    """Error of a command that would overwrite a file that it reads."""
 
 
 class _Command:
-    """What the command that runs reads and writes."""
+    """Input and output files of the running command."""
 
-    runs = False
-    inputs: ClassVar[dict[_Identity, Path]] = {}  # files that its arguments name
-    outputs: ClassVar[dict[_Identity, str]] = {}  # files there already that an option names
-    hooked = False
+    is_running = False
+    inputs: ClassVar[dict[_Identity, Path]] = {}  # files that arguments name
+    outputs: ClassVar[dict[_Identity, str]] = {}  # option and path of existing output files
+    has_hook = False
 
 
 def watch_files() -> None:
-    """Check every file that this process opens from now on (`heed_input`)."""
-    _Command.runs = True
-    if not _Command.hooked:
+    """Check every file that this process opens after this call (`heed_input`)."""
+    _Command.is_running = True
+    if not _Command.has_hook:
         sys.addaudithook(_on_event)
-        _Command.hooked = True
+        _Command.has_hook = True
 
 
 @contextmanager
 def inputs_kept() -> Iterator[None]:
-    """Refuse, while the block runs, to write over an input (`declare_files`) or to read a pipe."""
+    """Context in which overwriting an input (`declare_files`) or reading a pipe is an error."""
     watch_files()
     try:
         yield
     finally:
-        _Command.runs = False
+        _Command.is_running = False
         _Command.inputs.clear()
         _Command.outputs.clear()
 
 
 def declare_files(inputs: Iterable[Path], outputs: Sequence[tuple[Path, str]]) -> None:
-    """Tell which files a command's arguments name, before it begins to work.
+    """Declare the files that a command's arguments name, before the command begins.
 
-    From then on reading a file that is an output ends the command, wherever it is read: by an
-    argument, in a folder that is read, by a name in a config, also by another name of it (a link or
-    a hard link). Writing over an input does, too.
+    Afterwards, reading a declared output and overwriting a declared input raise an error. This
+    includes files that are found in a folder or named in a config, and other names of a file
+    (symbolic and hard links).
 
     Args:
-        inputs: Files that it reads.
-        outputs: Files that it writes, each with the option that names it.
+        inputs: Files that the command reads.
+        outputs: Files that the command writes, each with the option that names it.
 
     Raises:
         InputReplacedError: If a file is an input and an output.
@@ -65,52 +65,61 @@ def declare_files(inputs: Iterable[Path], outputs: Sequence[tuple[Path, str]]) -
     """
     places: dict[str, str] = {}
     for path, option in outputs:
-        if path.is_file() or not path.exists():  # a device may take several
+        if path.is_file() or not path.exists():  # a device may receive several outputs
             first = places.setdefault(os.path.realpath(path), option)
             if first != option:
                 raise InputError(f"{first} and {option} both name {path}: give two names.")
-    there = {i: f"{option} {path}" for path, option in outputs if (i := _identity(path))}
+    existing_outputs: dict[_Identity, str] = {}
+    for path, option in outputs:
+        identity = _identity(path)
+        if identity is not None:
+            existing_outputs[identity] = f"{option} {path}"
     for path in inputs:
-        _require_other(path, there)
-    if not _Command.runs:
+        _refuse_output(path=path, outputs=existing_outputs)
+    if not _Command.is_running:
         return
-    _Command.inputs |= {i: path for path in inputs if (i := _identity(path))}
-    _Command.outputs |= there
+    for path in inputs:
+        identity = _identity(path)
+        if identity is not None:
+            _Command.inputs[identity] = path
+    _Command.outputs |= existing_outputs
 
 
 def heed_input(path: str | bytes | os.PathLike) -> None:
-    """Check a file before it is read; for libraries that open files without Python.
+    """Check a file before it is read.
+
+    Code calls this for libraries that do not open files through Python.
 
     Args:
-        path: The file.
+        path: Path of the file.
 
     Raises:
-        InputReplacedError: If it is an output of the command.
-        ValueError: If it is a pipe, a socket or a device outside the folders of the system. A pipe
-            in a data set would let the command wait forever, and a link to a device never ends.
+        InputReplacedError: If the file is an output of the command.
+        ValueError: If the file is a pipe, a socket or a device outside of the system folders. With
+            a pipe in a data set the command would wait forever, and a device may have no end.
     """
-    if not _Command.runs:
+    if not _Command.is_running:
         return
     try:
         status = os.stat(path)
-    except (OSError, ValueError):  # its reader says why
+    except (OSError, ValueError):  # the reader reports it
         return
     if stat.S_ISREG(status.st_mode):
         if _Command.outputs:
-            _require_other(path, _Command.outputs)
+            _refuse_output(path=path, outputs=_Command.outputs)
     elif not stat.S_ISDIR(status.st_mode):
         name = os.fsdecode(path)
-        if not os.path.abspath(name).startswith(_OF_THE_SYSTEM):
+        if not os.path.abspath(name).startswith(_SYSTEM_FOLDERS):
             raise InputError(f"{name} is a pipe, a socket or a device: give a plain file.")
 
 
-def _require_other(path: str | bytes | os.PathLike, outputs: Mapping[_Identity, str]) -> None:
-    found = _identity(path) if outputs else None
-    if found is not None and found in outputs:
-        output = outputs[found]
+def _refuse_output(path: str | bytes | os.PathLike, outputs: Mapping[_Identity, str]) -> None:
+    """Raise an error if a file to read is one of the outputs."""
+    identity = _identity(path) if outputs else None
+    if identity is not None and identity in outputs:
         raise InputReplacedError(
-            f"{output} would replace what this command reads ({os.fsdecode(path)}): give another "
-            "name."
+            f"{outputs[identity]} would replace what this command reads ({os.fsdecode(path)}): "
+            "give another name."
         )
 
 
@@ -118,37 +127,40 @@ def require_no_input(path: Path) -> None:
     """Refuse to replace a file that the command's arguments name as an input.
 
     Raises:
-        InputReplacedError: If it is one.
+        InputReplacedError: If the file is an input.
     """
-    found = _identity(path) if _Command.inputs else None
-    if found is not None and found in _Command.inputs:
-        read = _Command.inputs[found]
+    identity = _identity(path) if _Command.inputs else None
+    if identity is not None and identity in _Command.inputs:
         raise InputReplacedError(
-            f"{path} would replace what this command reads ({read}): name another place for what "
-            "it writes."
+            f"{path} would replace what this command reads ({_Command.inputs[identity]}): name "
+            "another place for what it writes."
         )
 
 
 def forget_output(path: Path) -> None:
-    """Let a file be read again: it is to be replaced, and what takes its name is an output."""
-    if _Command.outputs and (found := _identity(path)) is not None:
-        _Command.outputs.pop(found, None)
+    """Allow a file to be read again, because an output is about to replace it."""
+    if not _Command.outputs:
+        return
+    identity = _identity(path)
+    if identity is not None:
+        _Command.outputs.pop(identity, None)
 
 
 def _on_event(event: str, arguments: tuple[Any, ...]) -> None:
-    """Check each file that Python opens (an audit hook), and each of SQLite."""
-    if not _Command.runs:
+    """Check each file that Python or SQLite opens; an audit hook."""
+    if not _Command.is_running:
         return
     if event == "open":
         path, _, flags = arguments
         if isinstance(path, str | bytes) and not (flags or 0) & _WRITING:
             heed_input(path)
     elif event == "sqlite3.connect" and isinstance(arguments[0], str):
-        heed_input(arguments[0].removeprefix("file:").partition("?")[0])
+        path, _, _ = arguments[0].removeprefix("file:").partition("?")
+        heed_input(path)
 
 
 def _identity(path: str | bytes | os.PathLike) -> _Identity | None:
-    """Return what tells a file from others, under any of its names; None if there is none."""
+    """Return a value that identifies a file under all of its names; None if it is not a file."""
     try:
         status = os.stat(path)
     except (OSError, ValueError):  # a name with a zero byte

@@ -1,4 +1,4 @@
-"""The items of a long list in a JSON file, one after another."""
+"""Incremental reading of a long list in a JSON file, item by item."""
 
 import json
 import re
@@ -11,9 +11,9 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.files import fetch_advice
 
 Place = tuple[int, int]
-"""Where an item begins, and its length, in bytes."""
-_BLOCK = 1 << 20
-_SHOWN = 5  # names in a message
+"""Offset and length of an item in its file, in bytes."""
+_BLOCK = 1 << 20  # bytes
+_LISTED_NAMES = 5  # in a message
 _KINDS = {"{": "an object", "[": "a list", '"': "a text"}
 _SPACE = re.compile(r"[ \t\n\r]*")
 _DECODER = json.JSONDecoder()
@@ -22,133 +22,148 @@ _DECODER = json.JSONDecoder()
 def items_of(
     path: Path, key: str | None, advice: str, beside: dict[str, Any] | None = None
 ) -> Iterator[tuple[Any, Place]]:
-    """Yield value and place of each item of a list.
-
-    What is in memory does not grow with the list.
+    """Yield the value and the place of each item of a list, with constant memory.
 
     Args:
-        path: The file.
-        key: Of the file's object, where the list is; None: the file is the list.
-        advice: What to do if it is not, for the message.
-        beside: Gets the values of the object that have the names in it, as they are found.
+        path: JSON file.
+        key: Key of the list in the file's object; None if the file itself is a list.
+        advice: Remedy for a file without the list, for the message.
+        beside: Dictionary whose keys name further entries of the object; their values are filled in
+            as the file is read.
 
     Raises:
         FileNotFoundError: If the file does not exist.
-        ValueError: If it is no JSON, or has no list there; maybe only after some items.
+        ValueError: If the file is not valid JSON or lacks the list, possibly after some items.
     """
     with path.open("rb") as file:
         under = "" if key is None else f" under {key!r}"
         try:
-            yield from _Text(file).items(key, beside or {})
+            yield from _Parser(file).items(key=key, beside=beside or {})
         except _FormError as error:
             raise InputError(f"{path} holds {error} and no list{under}: {advice}.") from error
         except (ValueError, RecursionError) as error:
             file.seek(0)
-            advice = fetch_advice(file.read(100), advice)
+            advice = fetch_advice(start=file.read(100), otherwise=advice)
             raise InputError(
                 f"{path} is empty or holds no complete list{under} ({error!r:.80}): {advice}."
             ) from error
 
 
 class _FormError(ValueError):
-    """There is JSON, but another value where the list should be."""
+    """Valid JSON with another value in place of the list."""
 
 
-class _Text:
-    """A part of a file's text, from which JSON is taken value by value."""
+class _Parser:
+    """Incremental JSON parser that reads a file in blocks and consumes value by value."""
 
     def __init__(self, file: IO[bytes]) -> None:
-        self._file, self._decode = file, getincrementaldecoder("utf-8")().decode
+        self._file = file
+        self._decode = getincrementaldecoder("utf-8")().decode
         self._text = ""
-        self._at = 0  # where the next value begins, in the text
-        self._byte = len(BOM_UTF8) if file.read(len(BOM_UTF8)) == BOM_UTF8 else 0  # in the file
-        file.seek(self._byte)
+        self._position = 0  # of the next value, in the text
+        starts_with_mark = file.read(len(BOM_UTF8)) == BOM_UTF8
+        self._offset = len(BOM_UTF8) if starts_with_mark else 0  # of the next value, in the file
+        file.seek(self._offset)
 
     def items(self, key: str | None, beside: dict[str, Any]) -> Iterator[tuple[Any, Place]]:
-        """Yield the items of the list under a key, and note the values of names in ``beside``."""
-        found, names = False, []
-        self._require("[" if key is None else "{", "")
-        for _ in () if key is None else self._parts("{", "}"):
-            if self._sign() != '"':
+        """Yield the items of the list under a key, and fill in the values of ``beside``."""
+        if key is None:
+            self._require(opening="[", where="")
+            yield from self._list_items()
+        else:
+            self._require(opening="{", where="")
+            yield from self._items_under(key=key, beside=beside)
+        if self._next_character():
+            raise self._error("more text")
+
+    def _items_under(self, key: str, beside: dict[str, Any]) -> Iterator[tuple[Any, Place]]:
+        """Yield the items of the list under a key of an object."""
+        is_complete = False
+        names = []
+        for _ in self._members(opening="{", closing="}"):
+            if self._next_character() != '"':
                 raise self._error("no name")
-            name, _ = self._value()
-            self._take(":")
+            name, _ = self._read_value()
+            self._consume(":")
             if name != key:
                 names.append(f"{name:.30}")
-                value, _ = self._value()
+                value, _ = self._read_value()
                 if name in beside:
                     beside[name] = value
                 continue
-            if found:
+            if is_complete:
                 raise self._error(f"a second {key!r}")
-            self._require("[", f" under {key!r}")
-            found = True
-            yield from (self._value() for _ in self._parts("[", "]"))
-        if key is None:
-            yield from (self._value() for _ in self._parts("[", "]"))
-        elif not found:
-            raise _FormError(f"an object with {names[:_SHOWN] or 'nothing'}")
-        if self._sign():
-            raise self._error("more text")
+            self._require(opening="[", where=f" under {key!r}")
+            is_complete = True
+            yield from self._list_items()
+        if not is_complete:
+            raise _FormError(f"an object with {names[:_LISTED_NAMES] or 'nothing'}")
+
+    def _list_items(self) -> Iterator[tuple[Any, Place]]:
+        for _ in self._members(opening="[", closing="]"):
+            yield self._read_value()
 
     def _require(self, opening: str, where: str) -> None:
-        """Refuse another value than the one that begins so; what is no value is left."""
-        sign = self._sign()
-        if sign != opening and sign in _KINDS:
-            raise _FormError(_KINDS[sign] + where)
+        """Require that the next value begins with a character; invalid JSON is reported later."""
+        character = self._next_character()
+        if character != opening and character in _KINDS:
+            raise _FormError(_KINDS[character] + where)
 
-    def _parts(self, opening: str, closing: str) -> Iterator[None]:
-        """Stop before each part of an object or a list, for that to be taken."""
-        self._take(opening)
-        more = self._sign() != closing
-        while more:
+    def _members(self, opening: str, closing: str) -> Iterator[None]:
+        """Consume an object or a list; at each yield, the caller consumes one member."""
+        self._consume(opening)
+        has_more = self._next_character() != closing
+        while has_more:
             yield
-            more = self._sign() == ","
-            if more:
-                self._take(",")
-        self._take(closing)
+            has_more = self._next_character() == ","
+            if has_more:
+                self._consume(",")
+        self._consume(closing)
 
-    def _value(self) -> tuple[Any, Place]:
-        """Take a value, and return it with its place."""
-        self._sign()
+    def _read_value(self) -> tuple[Any, Place]:
+        """Consume a value, and return it with its place."""
+        self._next_character()
         while True:
             try:
-                value, end = _DECODER.raw_decode(self._text, self._at)
+                value, end = _DECODER.raw_decode(self._text, idx=self._position)
             except json.JSONDecodeError as error:
-                if not self._read():
+                if not self._read_block():
                     raise self._error(error.msg) from error
                 continue
-            if end < len(self._text) or not self._read():  # a number may go on
-                start = self._byte
-                self._move(end)
-                return value, (start, self._byte - start)
+            # a number at the end of the text may continue in the next block
+            if end < len(self._text) or not self._read_block():
+                start = self._offset
+                self._advance(end)
+                return value, (start, self._offset - start)
 
-    def _sign(self) -> str:
-        """Skip white space and return the character that follows, nothing at the end."""
+    def _next_character(self) -> str:
+        """Skip white space, and return the next character; empty at the end of the file."""
         while True:
-            self._move(_SPACE.match(self._text, self._at).end())  # type: ignore[union-attr]
-            if self._at < len(self._text):
-                return self._text[self._at]
-            if not self._read():
+            space = _SPACE.match(self._text, pos=self._position)
+            self._advance(space.end())  # type: ignore[union-attr]
+            if self._position < len(self._text):
+                return self._text[self._position]
+            if not self._read_block():
                 return ""
 
-    def _take(self, sign: str) -> None:
-        """Take a character that must follow."""
-        if self._sign() != sign:
-            raise self._error(f"no {sign!r}")
-        self._move(self._at + 1)
+    def _consume(self, character: str) -> None:
+        """Consume a character, which must come next."""
+        if self._next_character() != character:
+            raise self._error(f"no {character!r}")
+        self._advance(self._position + 1)
 
-    def _move(self, end: int) -> None:
-        """Go on to a place in the text."""
-        self._byte += len(self._text[self._at : end].encode())
-        self._at = end
+    def _advance(self, end: int) -> None:
+        """Move to a position in the text."""
+        self._offset += len(self._text[self._position : end].encode())
+        self._position = end
 
-    def _read(self) -> bool:
-        """Read on, as much again as is left and at least a block; return whether there was any."""
-        block = self._file.read(max(_BLOCK, len(self._text) - self._at))
-        self._text = self._text[self._at :] + self._decode(block, not block)
-        self._at = 0
+    def _read_block(self) -> bool:
+        """Read as many bytes as text is left, at least a block; False at the end of the file."""
+        rest = self._text[self._position :]
+        block = self._file.read(max(_BLOCK, len(rest)))
+        self._text = rest + self._decode(block, final=not block)
+        self._position = 0
         return bool(block)
 
-    def _error(self, what: str) -> ValueError:
-        return InputError(f"{what} at byte {self._byte}")
+    def _error(self, fault: str) -> ValueError:
+        return InputError(f"{fault} at byte {self._offset}")

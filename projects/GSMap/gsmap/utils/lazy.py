@@ -1,4 +1,4 @@
-"""Names of a package that are imported when they are first used (PEP 562)."""
+"""Lazy import of the names of a package, on first use (PEP 562)."""
 
 import sys
 from collections.abc import Callable, Mapping
@@ -9,18 +9,25 @@ from typing import Any
 def lazy_names(
     package: str, modules: Mapping[str, str]
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """Return ``__getattr__``, ``__dir__`` and ``__all__`` of a package.
+    """Make ``__getattr__``, ``__dir__`` and ``__all__`` of a package with lazy names.
 
     Args:
-        package: Its ``__name__``.
-        modules: The module, relative to the package, that each name comes from.
+        package: ``__name__`` of the package.
+        modules: Module, relative to the package, that defines each name.
+
+    Returns:
+        ``__getattr__``, ``__dir__`` and ``__all__``.
     """
 
     def load(name: str) -> Any:
         if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        value = getattr(import_module(f"{package}.{modules[name]}"), name)
+        module = import_module(f"{package}.{modules[name]}")
+        value = getattr(module, name)
         setattr(sys.modules[package], name, value)
         return value
 
-    return load, lambda: sorted({*vars(sys.modules[package]), *modules}), sorted(modules)
+    def list_names() -> list[str]:
+        return sorted({*vars(sys.modules[package]), *modules})
+
+    return load, list_names, sorted(modules)

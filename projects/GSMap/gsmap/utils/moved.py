@@ -1,4 +1,4 @@
-"""Former names of modules, for configs and code outside this repository."""
+"""Import of modules by their former names, for configs and code outside this repository."""
 
 from collections.abc import Mapping, Sequence
 from importlib import import_module
@@ -7,8 +7,9 @@ from importlib.machinery import ModuleSpec
 from importlib.util import spec_from_loader
 from types import MappingProxyType, ModuleType
 
-_MAPTR, _BASE = "gsmap.models.maptr", "gsmap.models.base"
-_WHOLE = ("coder", "decoder", "head", "layers", "masks", "pairs", "parts")
+_MAPTR = "gsmap.models.maptr"
+_BASE = "gsmap.models.base"
+_BASE_MODULES = ("coder", "decoder", "head", "layers", "masks", "pairs", "parts")
 _EVALUATION = {
     "core": (
         "average_precision",
@@ -37,32 +38,46 @@ _EVALUATION = {
     ),
 }
 
-# former name -> the modules that hold its contents now
-MOVED: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {
-        **{f"{_MAPTR}.{name}": (f"{_BASE}.{name}",) for name in _WHOLE},
-        f"{_MAPTR}.attention": (f"{_BASE}.attention", f"{_MAPTR}.self_attention"),
-        f"{_MAPTR}.matching": (f"{_BASE}.matching", f"{_MAPTR}.cost"),
-        **{
-            f"gsmap.evaluation.{name}": (f"gsmap.evaluation.{room}.{name}",)
-            for room, names in _EVALUATION.items()
-            for name in names
-        },
-    }
-)
+
+def _successors() -> dict[str, tuple[str, ...]]:
+    """Return the modules that hold the contents of each former module."""
+    successors: dict[str, tuple[str, ...]] = {}
+    for name in _BASE_MODULES:
+        successors[f"{_MAPTR}.{name}"] = (f"{_BASE}.{name}",)
+    successors[f"{_MAPTR}.attention"] = (f"{_BASE}.attention", f"{_MAPTR}.self_attention")
+    successors[f"{_MAPTR}.matching"] = (f"{_BASE}.matching", f"{_MAPTR}.cost")
+    for package, names in _EVALUATION.items():
+        for name in names:
+            successors[f"gsmap.evaluation.{name}"] = (f"gsmap.evaluation.{package}.{name}",)
+    return successors
+
+
+MOVED: Mapping[str, tuple[str, ...]] = MappingProxyType(_successors())
+"""Modules that hold the contents of each former module."""
 
 
 class MovedModules(MetaPathFinder, Loader):
-    """Import a module by its former name: it holds the contents of its successors."""
+    """Importer of former module names; a former module holds the contents of its successors."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """Return a spec for the former name of a module, else None."""
-        return spec_from_loader(fullname, self) if fullname in MOVED else None
+        """Find a module by its former name.
+
+        Args:
+            fullname: Name of the module.
+            path: Search path of the parent package; not used.
+            target: Module that is reloaded; not used.
+
+        Returns:
+            Spec of the module, or None if the name is not a former name.
+        """
+        return spec_from_loader(name=fullname, loader=self) if fullname in MOVED else None
 
     def exec_module(self, module: ModuleType) -> None:
         """Fill a module with the contents of its successors, which register their classes."""
-        for name in MOVED[module.__name__]:
-            contents = vars(import_module(name))
-            vars(module).update({k: v for k, v in contents.items() if not k.startswith("__")})
+        for successor in MOVED[module.__name__]:
+            contents = vars(import_module(successor))
+            for name, value in contents.items():
+                if not name.startswith("__"):
+                    setattr(module, name, value)

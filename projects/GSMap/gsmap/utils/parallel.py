@@ -1,4 +1,4 @@
-"""Work spread over processes, in order, with bounded memory, and without a way to hang."""
+"""Parallel map over worker processes: ordered, with bounded memory and without deadlocks."""
 
 import ctypes
 import multiprocessing
@@ -24,69 +24,75 @@ from gsmap.utils.terminal import print_safely
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-LAUNCHER = "GSMAP_LAUNCHER"  # variable with the number of torchrun's process, for its ranks
+LAUNCHER = "GSMAP_LAUNCHER"  # environment variable with the process ID of torchrun, for its ranks
 _interpreter_flags = util._args_from_interpreter_flags  # type: ignore[attr-defined]
 
 
-def _found_prctl() -> Callable[..., Any] | None:
-    """Return the function of Linux by which a process dies with its parent; None elsewhere."""
-    return ctypes.CDLL(None).prctl if sys.platform == "linux" else None
-
-
-_PRCTL = _found_prctl()  # before a fork, which may happen within a lock
+# Linux's function for signals at the death of a parent; loaded early, as a fork may hold locks
+_PRCTL: Callable[..., Any] | None = None
+if sys.platform == "linux":
+    _PRCTL = ctypes.CDLL(None).prctl
 
 
 def _safe_interpreter_flags() -> list[str]:
-    """Return options for Python processes that take no code from the working folder.
+    """Return interpreter options that exclude the working folder from the module search path.
 
-    They are started with ``-c``, which puts that folder first on their search path until they have
-    been sent that of their parent.
+    Worker processes start with ``-c``, which puts the working folder first on the search path until
+    they receive the search path of their parent.
     """
-    safe = "-P" if sys.version_info >= (3, 11) else "-I"
+    safe_flag = "-P" if sys.version_info >= (3, 11) else "-I"
     flags = _interpreter_flags()
-    return flags if safe in flags else [*flags, safe]
+    return flags if safe_flag in flags else [*flags, safe_flag]
 
 
 util._args_from_interpreter_flags = _safe_interpreter_flags  # type: ignore[attr-defined]
 
 
 def default_workers() -> int:
-    """Number of processes that use every core this process may run on."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0))
 
 
 def die_with_parent(parent: int) -> None:
-    """Have Linux kill this process when its parent, of that number, dies, however it dies.
+    """Let Linux kill this process when its parent dies for any reason.
 
-    Other systems have no such order: there only the workers of `ordered_map` end with their parent.
+    On other systems this has no effect, and only the workers of `ordered_map` end with their
+    parent.
+
+    Args:
+        parent: Process ID of the parent.
     """
     if _PRCTL is None:
         return
     _PRCTL(1, signal.SIGKILL)
-    if os.getppid() != parent:  # it is dead already
+    if os.getppid() != parent:  # the parent has died before the call
         os.kill(os.getpid(), signal.SIGKILL)
 
 
 def have_forks_die_too() -> None:
-    """Have every process that this one forks, and every one that those fork, die with it."""
-    parent = [0]
+    """Let all forked child processes, and their children, die with their parent."""
+    parent = 0
 
-    def note() -> None:
-        parent[0] = os.getpid()
+    def record_parent() -> None:
+        nonlocal parent
+        parent = os.getpid()
 
-    os.register_at_fork(before=note, after_in_child=lambda: die_with_parent(parent[0]))
+    def follow_parent() -> None:
+        die_with_parent(parent)
+
+    os.register_at_fork(before=record_parent, after_in_child=follow_parent)
 
 
 class _Worker:
     """State of a worker process."""
 
     function: Callable[[Any], Any]
-    stopping = False
-    busy = False
+    must_stop = False
+    is_working = False
 
 
 def _start_worker(setup: Path) -> None:
-    """Prepare a worker process, which ends with its parent, however that ends."""
+    """Prepare a worker process, which ends with its parent."""
     print_safely()
     watch_files()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C for all
@@ -97,27 +103,28 @@ def _start_worker(setup: Path) -> None:
 
 
 def _end_with_parent() -> None:
-    if (parent := multiprocessing.parent_process()) is not None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
         parent.join()
         os._exit(1)
 
 
 def _stop_worker(number: int, _frame: object) -> None:
-    """Leave the task at hand through its clean-up, and take up no other."""
-    _Worker.stopping = True
-    if _Worker.busy:  # in between, results are on their way and must not be cut off
+    """Interrupt the current task, whose clean-up runs, and start no other task."""
+    _Worker.must_stop = True
+    if _Worker.is_working:  # between tasks, a result is being sent and must be complete
         raise SystemExit(128 + number)
 
 
 def _work(task: Any) -> Any:
-    """Do a task in a worker unless it is to stop."""
-    _Worker.busy = True
+    """Run a task in a worker process unless the worker must stop."""
+    _Worker.is_working = True
     try:
-        if _Worker.stopping:
+        if _Worker.must_stop:
             raise SystemExit(128 + signal.SIGTERM)
         return _Worker.function(task)
     finally:
-        _Worker.busy = False
+        _Worker.is_working = False
 
 
 def ordered_map(
@@ -126,21 +133,21 @@ def ordered_map(
     workers: int,
     timeout_s: float | None = 600.0,
 ) -> Iterator[Result]:
-    """Apply a function to tasks in worker processes and yield each one's result, in order.
+    """Apply a function to tasks in worker processes, and yield the results in order.
 
-    At most three tasks per worker are under way, so that neither tasks nor results pile up. With
-    one worker everything runs in this process. Whatever ends it early, such as an error or Ctrl-C,
-    stops the tasks under way, through their own clean-up.
+    At most three tasks per worker are in progress, so neither tasks nor results accumulate. With
+    one worker, the function runs in this process. An error, Ctrl-C or the end of the generator
+    interrupts the tasks in progress, and their clean-up runs.
 
     Args:
-        function: A picklable function; it reaches each process once, not with every task.
-        tasks: Its arguments, picklable; drawn as they are needed.
+        function: Picklable function; it is sent to each worker once.
+        tasks: Picklable arguments of the function, consumed on demand.
         workers: Number of processes, >= 1.
-        timeout_s: Longest time that one result may take, in seconds; None for any.
+        timeout_s: Time limit for one result, in seconds; None for no limit.
 
     Raises:
         ValueError: If ``workers`` is below 1.
-        RuntimeError: If a worker dies or a result takes too long; the others are stopped.
+        RuntimeError: If a worker dies or a result exceeds the time limit; all workers are stopped.
     """
     if workers < 1:
         raise InputError(f"workers must be >= 1, got {workers}.")
@@ -148,18 +155,23 @@ def ordered_map(
         yield from map(function, tasks)
         return
     with TemporaryDirectory() as folder:
-        # Through a file: what a new process is handed goes through a pipe, and if it is long and
-        # the process dies before it reads it, this one would wait for ever.
+        # The function goes through a file. Arguments of a new process go through a pipe, and this
+        # process would wait forever if the new one died before it had read a long argument.
         setup = Path(folder, "setup.pickle")
         setup.write_bytes(pickle.dumps(function))
-        context = multiprocessing.get_context("spawn")  # no copies of this process's tables
-        pool = ProcessPoolExecutor(workers, context, _start_worker, (setup,))
+        context = multiprocessing.get_context("spawn")  # without copies of this process's memory
+        pool = ProcessPoolExecutor(
+            workers, mp_context=context, initializer=_start_worker, initargs=(setup,)
+        )
         try:
-            yield from _in_order(pool, tasks, 3 * workers, timeout_s)
-        except BaseException as error:  # the generator's end before its time as well
-            # Python 3.14 has a public `terminate_workers`; before, only this dictionary knows them
+            yield from _in_order(pool, tasks=tasks, limit=3 * workers, timeout_s=timeout_s)
+        except BaseException as error:  # including GeneratorExit
+            # Python 3.14 has a public `terminate_workers`; older versions only have this attribute
             for process in list((pool._processes or {}).values()):
-                process.kill() if isinstance(error, TimeoutError) else process.terminate()
+                if isinstance(error, TimeoutError):
+                    process.kill()
+                else:
+                    process.terminate()
             if isinstance(error, BrokenProcessPool):
                 raise WorkError(
                     "a worker process died: most likely for want of memory (run again with fewer "
@@ -178,43 +190,49 @@ def ordered_map(
 
 @contextmanager
 def signals_later() -> Iterator[None]:
-    """Hold signals back, as while processes start: a half-started one answers with a traceback.
+    """Context that delays signals; a process that is starting would print a traceback.
 
-    The mask is for this thread and the new processes. Another thread may be given the signal, whose
-    Python handler the main thread then runs at once: so that one waits, too.
+    The signal mask applies to this thread and to new processes. Another thread may receive the
+    signal, and Python would run the handler in the main thread at once, so handlers are delayed as
+    well.
     """
-    came: list[int] = []
+    delayed: list[int] = []
     handlers = {}
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+
+    def delay(number: int, _frame: object) -> None:
+        delayed.append(number)
+
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
     try:
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
-                if (handler := signal.getsignal(number)) not in (None, signal.SIG_IGN):
+                handler = signal.getsignal(number)
+                if handler not in (None, signal.SIG_IGN):
                     handlers[number] = handler
-                    signal.signal(number, lambda number, _frame: came.append(number))
+                    signal.signal(number, delay)
         yield
-    finally:  # what this process was sent meanwhile reaches it here
+    finally:  # signals that arrived in the meantime are handled here
         for number, handler in handlers.items():
             signal.signal(number, handler)
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        for late in came:
-            signal.raise_signal(late)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        for delayed_number in delayed:
+            signal.raise_signal(delayed_number)
 
 
 def result_of(future: "Future[Result]", timeout_s: float | None = None) -> Result:
-    """Wait for a future's result, in a way that a signal can end.
+    """Wait for the result of a future in a way that a signal can interrupt.
 
-    ``future.result`` takes a lock. A signal's handler that raises right then leaves it taken: the
-    thread that brings the result waits for it for ever, and the end of the pool for that thread.
+    ``future.result`` holds a lock while it waits. If a signal handler raises at this moment, the
+    lock is never released, and the thread that delivers the result waits forever.
 
     Args:
-        future: Of a pool of threads or processes.
-        timeout_s: Longest time to wait, in seconds; None for any.
+        future: Future of a pool of threads or processes.
+        timeout_s: Time limit in seconds; None for no limit.
 
     Raises:
-        TimeoutError: If there is no result by then.
+        TimeoutError: If there is no result within the time limit.
     """
-    done: SimpleQueue[Future[Result]] = SimpleQueue()  # it waits in C, with no lock to leave taken
+    done: SimpleQueue[Future[Result]] = SimpleQueue()  # waits in C without a Python lock
     with signals_later():
         future.add_done_callback(done.put)
     try:
@@ -228,12 +246,12 @@ def result_of(future: "Future[Result]", timeout_s: float | None = None) -> Resul
 def _in_order(
     pool: ProcessPoolExecutor, tasks: Iterable[Any], limit: int, timeout_s: float | None
 ) -> Iterator[Any]:
-    """Keep at most ``limit`` tasks in the pool and yield the oldest one's result."""
+    """Keep at most ``limit`` tasks in the pool, and yield their results in order."""
     pending: deque[Future[Any]] = deque()
     for task in tasks:
         with signals_later():
             pending.append(pool.submit(_work, task))
         if len(pending) == limit:
-            yield result_of(pending.popleft(), timeout_s)
+            yield result_of(pending.popleft(), timeout_s=timeout_s)
     while pending:
-        yield result_of(pending.popleft(), timeout_s)
+        yield result_of(pending.popleft(), timeout_s=timeout_s)

@@ -1,4 +1,4 @@
-"""Progress of long work: a bar on a terminal, a line now and then in a file or a pipe."""
+"""Progress display: a bar on a terminal, a line per minute in a file or a pipe."""
 
 import sys
 from typing import Any, TextIO
@@ -13,19 +13,25 @@ _UNKNOWN_TOTAL = "{desc}{n_fmt} {unit}, {elapsed}"
 
 
 class Progress(tqdm):
-    """tqdm's bar; where nobody watches, a plain line each minute, at the start and at the end."""
+    """tqdm's progress bar; without a terminal, a plain line per minute, at the start and the end.
+
+    Args:
+        *args: Positional arguments of ``tqdm``.
+        **kwargs: Keyword arguments of ``tqdm``.
+    """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         if not sys.stderr.isatty():
             title = f"{kwargs['desc']}: " if kwargs.get("desc") else ""
             kwargs |= {**_PLAIN, "desc": title, "bar_format": _FORMAT, "file": _Lines(sys.stderr)}
         else:
-            kwargs.setdefault("file", own_stream(sys.stderr))  # it moves the cursor
+            # the bar moves the cursor, which `PrintableStream` would suppress
+            kwargs.setdefault("file", own_stream(sys.stderr))
         super().__init__(*args, **kwargs)
 
     @property
     def format_dict(self) -> dict[str, Any]:
-        """What a line is made of; one whose total is not known yet does not ask for it."""
+        """Values of a line; without a known total, the format omits it."""
         values: dict[str, Any] = super().format_dict
         if values["bar_format"] == _FORMAT and values["total"] is None:
             values["bar_format"] = _UNKNOWN_TOTAL
@@ -33,7 +39,7 @@ class Progress(tqdm):
 
 
 class _Lines:
-    """Turns what overwrites itself on a terminal into lines."""
+    """Stream that writes each update of a progress bar as a line."""
 
     def __init__(self, file: TextIO) -> None:
         self._file = file

@@ -1,4 +1,4 @@
-"""All shards of a command on a Ray cluster: the same commands, started wherever there is room."""
+"""Execution of all shards of a command on a Ray cluster."""
 
 import argparse
 import math
@@ -22,60 +22,80 @@ _RETRIES = 5
 
 
 class ShardKilledError(Exception):
-    """A shard's process ended by a signal; another try may end well."""
+    """Error of a shard whose process was ended by a signal, so that another try may succeed."""
 
 
 def run_on_ray(
     arguments: argparse.Namespace, words: Sequence[str], patience_s: float = 60.0
 ) -> str:
-    """Run a command once for each shard on a Ray cluster that sees the same files.
+    """Run a command once per shard on a Ray cluster whose nodes share a file system.
 
-    A shard that a signal, the end of its worker or of its node stops is run again. One that takes
-    more than twice as long as the longest so far, while there is room, is run a second time beside
-    the first; the first to end counts.
+    A shard is repeated if a signal, or the failure of its worker or node, has stopped it. Once the
+    cluster has had free resources for twice the duration of the longest shard so far, and for at
+    least ``patience_s``, each unfinished shard is started a second time, and the first result
+    counts.
 
     Args:
-        arguments: Parsed; ``shards`` and ``per_shard`` are used.
-        words: The command's words, ``--executor`` and its like included.
-        patience_s: Shortest time after which a shard is run a second time, in seconds.
+        arguments: Parsed arguments; ``shards``, ``shard`` and ``per_shard`` are used.
+        words: Words of the command, including ``--executor`` and the options for all shards.
+        patience_s: Minimum time before a shard is started a second time, in seconds.
 
     Returns:
-        How many shards were made, and how long they took.
+        A summary with the number of shards and their durations.
 
     Raises:
-        RuntimeError: If Ray is not installed, or shards fail; the others are made.
+        ValueError: If ``--shards`` is below 1, or ``--shard`` is given as well.
+        RuntimeError: If Ray is not installed, or if shards fail; all other shards are complete.
     """
     if arguments.shards < 1 or arguments.shard.count:
         raise InputError("--executor needs --shards N of at least 1, and no --shard I/N.")
-    ray = import_extra("ray", "ray")
+    ray = import_extra(module="ray", extra="ray")
     if not ray.is_initialized():
         ray.init(log_to_driver=False, include_dashboard=False)
-    run = _Run(ray, _plain(words), arguments.shards, dict(arguments.per_shard), patience_s)
-    failures = run.all()
+    run = _Run(
+        ray=ray,
+        words=_without_cluster_options(words),
+        count=arguments.shards,
+        resources=dict(arguments.per_shard),
+        patience_s=patience_s,
+    )
+    failures = run.run_all()
     if failures:
         raise WorkError(f"{len(failures)} of {arguments.shards} shards failed: {failures[0]}")
-    middle, longest = statistics.median(run.seconds), max(run.seconds)
+    median_s = statistics.median(run.durations_s)
+    longest_s = max(run.durations_s)
     return (
-        f"{arguments.shards} shards made, {middle:.1f} s each (median), at most {longest:.1f} s, "
-        f"{run.repeated} run twice at once; tools/merge.py joins them"
+        f"{arguments.shards} shards made, {median_s:.1f} s each (median), at most {longest_s:.1f} "
+        f"s, {run.repeated} run twice at once; tools/merge.py joins them"
     )
 
 
-def _plain(words: Sequence[str]) -> list[str]:
-    """Return a command's words without the options for all shards."""
-    kept: list[str] = []
-    skipping = False
+def _without_cluster_options(words: Sequence[str]) -> list[str]:
+    """Remove the options for all shards from a command."""
+    rest: list[str] = []
+    is_resource = False
     for word in without_options(words, "--executor", "--shards"):
-        name = word.split("=")[0]
-        skipping = name == "--per-shard" or (skipping and name.startswith(("num_", "memory")))
-        kept += [] if skipping else [word]
-    return kept
+        name, _, _ = word.partition("=")
+        follows_resource = is_resource and name.startswith(("num_", "memory"))
+        is_resource = name == "--per-shard" or follows_resource
+        if not is_resource:
+            rest.append(word)
+    return rest
 
 
-def _make(words: Sequence[str], shard: str, folder: str) -> tuple[str, float]:
-    """Run a command for one shard; return what failed, if anything, and the time in seconds."""
-    start = time.perf_counter()
-    ended = subprocess.run(
+def _run_shard(words: Sequence[str], shard: str, folder: str) -> tuple[str, float]:
+    """Run a command for one shard.
+
+    Args:
+        words: Words of the command.
+        shard: Shard as ``I/N``.
+        folder: Working folder of the command.
+
+    Returns:
+        The failure, empty on success, and the duration in seconds.
+    """
+    start_s = time.perf_counter()
+    process = subprocess.run(
         [*words, "--shard", shard],
         cwd=folder,
         capture_output=True,
@@ -83,56 +103,87 @@ def _make(words: Sequence[str], shard: str, folder: str) -> tuple[str, float]:
         errors="replace",
         preexec_fn=partial(die_with_parent, os.getpid()),
     )
-    if ended.returncode < 0 or ended.returncode >= 128:
-        raise ShardKilledError(f"shard {shard} was killed: exit code {ended.returncode}")
-    said = (ended.stderr or ended.stdout).strip().rsplit("\n", 1)[-1]
-    failed = f"{shard} ended with exit code {ended.returncode}: {said}" if ended.returncode else ""
-    return failed, time.perf_counter() - start
+    code = process.returncode
+    if code < 0 or code >= 128:
+        raise ShardKilledError(f"shard {shard} was killed: exit code {code}")
+    duration_s = time.perf_counter() - start_s
+    if not code:
+        return "", duration_s
+    output = process.stderr or process.stdout
+    return f"{shard} ended with exit code {code}: {_last_line(output)}", duration_s
+
+
+def _last_line(text: str) -> str:
+    return text.strip().rsplit("\n", maxsplit=1)[-1]
 
 
 @dataclass
 class _Run:
-    """One command's shards on a cluster."""
+    """Run of all shards of a command on a cluster.
+
+    Attributes:
+        ray: Module of Ray.
+        words: Words of the command without the options for all shards.
+        count: Number of shards.
+        resources: Resources of each shard, by Ray's names.
+        patience_s: Minimum time before a shard is started a second time, in seconds.
+        durations_s: Durations of the finished shards, in seconds.
+        repeated: Number of shards that were started a second time.
+    """
 
     ray: Any
     words: list[str]
     count: int
     resources: Mapping[str, float]
     patience_s: float
-    seconds: list[float] = field(default_factory=list)
+    durations_s: list[float] = field(default_factory=list)
     repeated: int = 0
 
-    def all(self) -> list[str]:
-        """Make all shards and return what failed."""
-        under_way = {self._start(index): index for index in range(self.count)}
-        again: set[int] = set()
-        done: set[int] = set()
+    def run_all(self) -> list[str]:
+        """Run all shards, and return the failures."""
+        running = {self._start(index): index for index in range(self.count)}
+        repeated: set[int] = set()
+        finished: set[int] = set()
         failures: list[str] = []
-        room_since: float | None = None
-        while len(done) < self.count:
-            ready, _ = self.ray.wait(list(under_way), num_returns=1, timeout=_POLL_S)
-            for ref in ready:
-                index, failed = under_way.pop(ref), self._result(ref)
-                if index not in done and not (failed and index in under_way.values()):
-                    done.add(index)
-                    failures += [failed] if failed else []
-            for ref in [ref for ref, index in under_way.items() if index in done]:
-                self.ray.cancel(ref, force=True)
-                del under_way[ref]
-            now = time.monotonic()
-            room_since = (room_since or now) if self._has_room() else None
-            too_long_s = max(self.patience_s, 2 * max(self.seconds, default=math.inf))
-            if room_since and now - room_since > too_long_s:
-                late = set(under_way.values()) - again
-                again |= late
+        room_since_s: float | None = None
+        while len(finished) < self.count:
+            ready, _ = self.ray.wait(list(running), num_returns=1, timeout=_POLL_S)
+            for task in ready:
+                index = running.pop(task)
+                failure = self._result(task)
+                is_still_running = index in running.values()
+                if index in finished or (failure and is_still_running):
+                    continue
+                finished.add(index)
+                if failure:
+                    failures.append(failure)
+            self._cancel_duplicates(running, finished=finished)
+            now_s = time.monotonic()
+            if not self._has_room():
+                room_since_s = None
+            elif room_since_s is None:
+                room_since_s = now_s
+            longest_s = max(self.durations_s, default=math.inf)
+            limit_s = max(self.patience_s, 2 * longest_s)
+            if room_since_s is not None and now_s - room_since_s > limit_s:
+                late = set(running.values()) - repeated
+                repeated |= late
                 self.repeated += len(late)
-                under_way |= {self._start(index): index for index in late}
+                for index in late:
+                    running[self._start(index)] = index
         return failures
 
+    def _cancel_duplicates(self, running: dict[Any, int], finished: set[int]) -> None:
+        """Cancel and remove the running tasks of finished shards."""
+        for task, index in list(running.items()):
+            if index in finished:
+                self.ray.cancel(task, force=True)
+                del running[task]
+
     def _start(self, index: int) -> Any:
-        """Hand a shard to the cluster."""
+        """Submit a shard to the cluster."""
         options = {"num_cpus": 1, **self.resources}
-        task = self.ray.remote(_make).options(
+        task = self.ray.remote(_run_shard).options(
             max_retries=_RETRIES,
             retry_exceptions=[ShardKilledError],
             scheduling_strategy="SPREAD",
@@ -140,19 +191,20 @@ class _Run:
             **options,
         )
         words = [sys.executable, *self.words]
-        return task.remote(words, f"{index}/{self.count}", os.getcwd())
+        return task.remote(words, shard=f"{index}/{self.count}", folder=os.getcwd())
 
-    def _result(self, ref: Any) -> str:
-        """Return what failed in a task that ended, if anything, and note its time."""
+    def _result(self, task: Any) -> str:
+        """Return the failure of a finished task, empty on success, and record its duration."""
         try:
-            failed, seconds = self.ray.get(ref)
+            failure, duration_s = self.ray.get(task)
         except self.ray.exceptions.RayError as error:
-            return str(error).strip().rsplit("\n", 1)[-1]
-        self.seconds.append(seconds)
-        return failed
+            return _last_line(str(error))
+        self.durations_s.append(duration_s)
+        return failure
 
     def _has_room(self) -> bool:
-        """Whether another shard could start, so that none is waiting."""
+        """Whether the resources of another shard are free, so that no shard is waiting."""
         free = self.ray.available_resources()
-        cpus, gpus = self.resources.get("num_cpus", 1), self.resources.get("num_gpus", 0)
+        cpus = self.resources.get("num_cpus", 1)
+        gpus = self.resources.get("num_gpus", 0)
         return free.get("CPU", 0) >= cpus and free.get("GPU", 0) >= gpus

@@ -1,10 +1,17 @@
-"""Checks of settings that many parts have."""
+"""Checks of settings."""
 
 from gsmap.utils.errors import InputError
 
 
 def check_positive(**values: float) -> None:
-    """Raise ValueError if a number is not more than 0; its name is that in the message."""
+    """Require positive numbers.
+
+    Args:
+        **values: Numbers, by the names for the message.
+
+    Raises:
+        ValueError: If a number is not greater than 0.
+    """
     for name, value in values.items():
         if not value > 0:
             raise InputError(f"{name} must be more than 0, got {value}.")

@@ -1,7 +1,7 @@
-"""Parts of one command's work for several machines, and the check that all parts fit.
+"""Shards of a command's work for several machines, and checks that the shards belong together.
 
-A shard's file stands where the whole would, as ``NAME.00003-of-00016.SUFFIX``, with a manifest
-beside it. The manifest comes last and counts: a file without one is not finished.
+The file of a shard lies in the folder of the complete file, as ``NAME.00003-of-00016.SUFFIX``, with
+a manifest beside it. The manifest is written last, so a file without a manifest is incomplete.
 """
 
 import argparse
@@ -21,21 +21,21 @@ from gsmap.utils.files import write_text
 Items = TypeVar("Items", bound=Sequence[Any])
 
 _COMMON = ("kind", "target", "of", "version", "input", "options")
-_TYPES = {  # of a manifest's entries
+_TYPES = {  # of the entries of a manifest
     **dict.fromkeys(("kind", "target", "version", "input", "sha256"), str),
     **dict.fromkeys(("shard", "of", "samples", "bytes"), int),
     "options": dict,
 }
-_MOST = 99_999  # shards of a file: numbers in names have five digits
+_MAX_SHARDS = 99_999  # numbers in file names have five digits
 
 
 @dataclass(frozen=True)
 class Shard:
-    """One of several equal parts of an ordered list of work; ``WHOLE`` is all of it.
+    """One of several equal parts of an ordered list of work; ``WHOLE`` is the complete list.
 
     Args:
-        index: Which part, from 0.
-        count: How many parts there are; 0 for the whole, unnamed.
+        index: Index of the part, from 0.
+        count: Number of parts; 0 for the complete list.
     """
 
     index: int
@@ -43,27 +43,28 @@ class Shard:
 
     @classmethod
     def parse(cls, text: str) -> "Shard":
-        """Read ``I/N``; I counts from 0.
+        """Parse ``I/N``, with I from 0 to N - 1.
 
         Raises:
-            argparse.ArgumentTypeError: If it is anything else.
+            argparse.ArgumentTypeError: If the text has another form.
         """
-        match = re.fullmatch(r"(\d{1,5})/(\d{1,5})", text)
+        match = re.fullmatch(r"(\d{1,5})/(\d{1,5})", string=text)
         if not match or int(match[1]) >= int(match[2]):
             raise argparse.ArgumentTypeError(
                 f"expected I/N with I from 0 to N - 1, such as 0/16 or 15/16, got {text!r}"
             )
-        return cls(int(match[1]), int(match[2]))
+        return cls(index=int(match[1]), count=int(match[2]))
 
     def part(self, items: Items) -> Items:
-        """Return this shard's items: neighbours, and in the order of the shards all of them."""
+        """Return the contiguous range of items of this shard; all shards cover all items."""
         if not self.count:
             return items
-        start, stop = (len(items) * i // self.count for i in (self.index, self.index + 1))
+        start = len(items) * self.index // self.count
+        stop = len(items) * (self.index + 1) // self.count
         return items[start:stop]  # type: ignore[return-value]
 
     def path_of(self, target: Path) -> Path:
-        """Return where this shard of a file goes."""
+        """Return the path of this shard, given the path of the complete file."""
         if not self.count:
             return target
         number = f"{self.index:05d}-of-{self.count:05d}"
@@ -72,44 +73,50 @@ class Shard:
     def seal(
         self, target: Path, kind: str, source: str, options: Mapping[str, Any], samples: int
     ) -> None:
-        """Write the manifest of this shard's file, which is whole; nothing for the whole.
+        """Write the manifest of this shard's complete file; does nothing for `WHOLE`.
 
         Args:
-            target: Where the whole would be.
-            kind: What the file holds; says how shards are joined.
-            source: Digest of what it was made from.
-            options: What else decides its content, in JSON's types.
-            samples: How many samples it holds.
+            target: Path of the complete file.
+            kind: Kind of the content, which determines how shards are merged.
+            source: Digest of the input.
+            options: Further settings that the content depends on, as JSON types.
+            samples: Number of samples in the shard.
         """
-        if self.count:
-            path = self.path_of(target)
-            manifest = {
-                "kind": kind,
-                "target": target.name,
-                "shard": self.index,
-                "of": self.count,
-                "version": __version__,
-                "input": source,
-                "options": options,
-                "samples": samples,
-                "bytes": path.stat().st_size,
-                "sha256": digest(path),
-            }
-            write_text(_manifest_path(path), json.dumps(manifest, indent=1) + "\n")
+        if not self.count:
+            return
+        path = self.path_of(target)
+        manifest = {
+            "kind": kind,
+            "target": target.name,
+            "shard": self.index,
+            "of": self.count,
+            "version": __version__,
+            "input": source,
+            "options": options,
+            "samples": samples,
+            "bytes": path.stat().st_size,
+            "sha256": digest(path),
+        }
+        write_text(_manifest_path(path), text=json.dumps(manifest, indent=1) + "\n")
 
 
-WHOLE = Shard(0, 0)
+WHOLE = Shard(index=0, count=0)
 
 
 class ShardFile(NamedTuple):
-    """A shard's file and what its manifest says."""
+    """File of a shard with its manifest.
+
+    Attributes:
+        path: Path of the file.
+        manifest: Entries of the manifest, as `Shard.seal` writes them.
+    """
 
     path: Path
     manifest: dict[str, Any]
 
 
 def add_shard_options(parser: argparse.ArgumentParser) -> None:
-    """Add ``--shard I/N``, and the options that make all shards on a cluster."""
+    """Add ``--shard I/N``, and the options that compute all shards on a cluster."""
     group = parser.add_argument_group("several machines (docs/scale.md)")
     group.add_argument(
         "--shard",
@@ -131,7 +138,7 @@ def add_shard_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _amount(text: str) -> tuple[str, float]:
-    """Read an amount of a resource."""
+    """Parse ``NAME=AMOUNT`` of a resource of Ray."""
     name, _, amount = text.partition("=")
     if name not in ("num_cpus", "num_gpus", "memory"):
         raise argparse.ArgumentTypeError(f"expected num_cpus=, num_gpus= or memory=, got {text!r}")
@@ -139,83 +146,110 @@ def _amount(text: str) -> tuple[str, float]:
 
 
 def without_options(words: Sequence[str], *names: str) -> list[str]:
-    """Return the words of a command without some of its options, of one value each."""
-    pairs = zip(["", *words], words, strict=False)
-    return [w for before, w in pairs if before not in names and w.split("=")[0] not in names]
+    """Remove options with one value each from a command.
+
+    Args:
+        words: Words of the command.
+        *names: Options to remove, given as ``--option VALUE`` or ``--option=VALUE``.
+    """
+    rest = []
+    previous = ""
+    for word in words:
+        option, _, _ = word.partition("=")
+        if previous not in names and option not in names:
+            rest.append(word)
+        previous = word
+    return rest
 
 
 def digest(path: Path) -> str:
-    """Return the SHA-256 of a file's content."""
-    total = hashlib.sha256()
+    """Return the SHA-256 of the content of a file, as hexadecimal digits."""
+    sha256 = hashlib.sha256()
     with path.open("rb") as file:
         while block := file.read(1 << 20):
-            total.update(block)
-    return total.hexdigest()
+            sha256.update(block)
+    return sha256.hexdigest()
 
 
 def digest_of_common(file: ShardFile) -> str:
-    """Return a digest of what all shards of one file have in common."""
+    """Return a digest of the manifest entries that all shards of one file share."""
     common = {name: file.manifest[name] for name in _COMMON}
-    return hashlib.sha256(json.dumps(common, sort_keys=True).encode()).hexdigest()
+    text = json.dumps(common, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def read_shard(path: Path) -> ShardFile:
-    """Return a shard's file with its manifest, the one checked against the other.
+    """Read the manifest of a shard, and check that it describes the file.
+
+    Args:
+        path: Path of the shard's file.
 
     Raises:
-        FileNotFoundError: If one of them is missing.
-        ValueError: If the manifest is none, or the file is not the one that it tells of.
+        FileNotFoundError: If the manifest is missing.
+        ValueError: If the manifest is damaged, or if it does not describe the file.
     """
-    beside = _manifest_path(path)
+    manifest_path = _manifest_path(path)
     try:
-        manifest = json.loads(beside.read_text(encoding="utf-8"))
-        wrong = [name for name, kind in _TYPES.items() if type(manifest[name]) is not kind]
-        shard = Shard(manifest["shard"], manifest["of"])
-        if wrong or not 0 <= shard.index < shard.count <= _MOST or manifest["samples"] < 0:
-            raise InputError(f"{wrong or ['shard', 'of', 'samples']} cannot be")
-        right = shard.path_of(path.with_name(manifest["target"]))
+        manifest = json.loads(manifest_path.read_text(encoding="utf-8"))
+        wrong_names = [name for name, kind in _TYPES.items() if type(manifest[name]) is not kind]
+        shard = Shard(index=manifest["shard"], count=manifest["of"])
+        is_shard = 0 <= shard.index < shard.count <= _MAX_SHARDS
+        if wrong_names or not is_shard or manifest["samples"] < 0:
+            raise InputError(f"{wrong_names or ['shard', 'of', 'samples']} cannot be")
+        named_path = shard.path_of(path.with_name(manifest["target"]))
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError(f"{beside} is damaged ({error!r}): make that shard again.") from error
+        message = f"{manifest_path} is damaged ({error!r}): make that shard again."
+        raise InputError(message) from error
     same_size = path.is_file() and path.stat().st_size == manifest["bytes"]
     if not same_size or digest(path) != manifest["sha256"]:
         raise InputError(f"{path} is missing, or not what its manifest tells of: make it again.")
-    if path != right:
+    if path != named_path:
         raise InputError(
             f"{path} is another shard by its manifest: {shard.index} of {shard.count} of "
             f"{manifest['target']}; take it away, and make the right one."
         )
-    return ShardFile(path, manifest)
+    return ShardFile(path=path, manifest=manifest)
 
 
 def find_shards(target: Path) -> list[ShardFile]:
-    """Return all shards of a file, in their order, from beside it.
+    """Find all shards of a file in its folder.
+
+    Args:
+        target: Path of the complete file.
+
+    Returns:
+        The shards in their order.
 
     Raises:
-        FileNotFoundError: If there is none, or one is missing.
-        ValueError: If one is damaged, another one than its name says, or of other work: another
-            number of shards, other options, another input or version.
+        FileNotFoundError: If there are no shards, or some are missing.
+        ValueError: If a shard is damaged, does not match its file name, or differs from the others
+            in the number of shards, the options, the input or the version.
     """
     pattern = f"{glob.escape(target.stem)}.*-of-*{glob.escape(target.suffix)}.manifest"
-    found = [read_shard(path.with_suffix("")) for path in sorted(target.parent.glob(pattern))]
-    if not found:
+    manifest_paths = sorted(target.parent.glob(pattern))
+    shards = [read_shard(path.with_suffix("")) for path in manifest_paths]
+    if not shards:
         raise FileNotFoundError(f"there are no shards of {target}: --shard I/N makes them.")
-    first = found[0]
-    for other in found[1:]:
-        names = _differences(first.manifest, other.manifest)
-        if names:
+    first = shards[0]
+    for other in shards[1:]:
+        differences = _differences(first=first.manifest, other=other.manifest)
+        if differences:
             raise InputError(
-                f"{first.path} and {other.path} are shards of different work, by {names}: make "
-                "those anew that are not of this."
+                f"{first.path} and {other.path} are shards of different work, by {differences}: "
+                "make those anew that are not of this."
             )
-    count, there = first.manifest["of"], {file.manifest["shard"] for file in found}
-    missing = [str(index) for index in range(count) if index not in there]
+    count = first.manifest["of"]
+    indices = {shard.manifest["shard"] for shard in shards}
+    missing = [str(index) for index in range(count) if index not in indices]
     if missing:
-        some = ", ".join(missing[:10]) + (", ..." if len(missing) > 10 else "")
+        some = ", ".join(missing[:10])
+        if len(missing) > 10:
+            some += ", ..."
         raise FileNotFoundError(
             f"{target} lacks {len(missing)} of its {count} shards: {some}; run the command again "
             f"with --shard {missing[0]}/{count}."
         )
-    return found
+    return shards
 
 
 def _manifest_path(path: Path) -> Path:
@@ -223,9 +257,17 @@ def _manifest_path(path: Path) -> Path:
 
 
 def _differences(first: Mapping[str, Any], other: Mapping[str, Any]) -> str:
-    """Say by which entries, and which options, two manifests tell of different work."""
-    pairs = {name: (first[name], other[name]) for name in _COMMON if name != "options"}
-    one, two = first["options"], other["options"]
-    pairs |= {name: (one.get(name), two.get(name)) for name in {**one, **two}}
-    differing = {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
-    return ", ".join(f"{name} ({a!r:.80}, {b!r:.80})" for name, (a, b) in differing.items())
+    """Describe the entries and options in which two manifests differ; empty if there are none."""
+    pairs: dict[str, tuple[Any, Any]] = {}
+    for name in _COMMON:
+        if name != "options":
+            pairs[name] = (first[name], other[name])
+    first_options = first["options"]
+    other_options = other["options"]
+    for name in {**first_options, **other_options}:
+        pairs[name] = (first_options.get(name), other_options.get(name))
+    differences = []
+    for name, (value, other_value) in pairs.items():
+        if value != other_value:
+            differences.append(f"{name} ({value!r:.80}, {other_value!r:.80})")
+    return ", ".join(differences)

@@ -1,23 +1,26 @@
-"""Where the files are that come with the library: configs, commands, trained models."""
+"""Location of the files that are installed with the library: configs, commands, models."""
 
 from pathlib import Path
 
 import gsmap
 
-_MARK = "models/registry.json"
+_MARKER = "models/registry.json"
 
 
 def shipped(path: str = "") -> Path:
-    """Return a file or folder that comes with the library, given its path in the repository.
+    """Return the installed place of a file or folder of the repository.
 
-    A wheel has them in ``gsmap/.mim``; an editable installation reads the repository around it.
+    A wheel installs these files to ``gsmap/.mim``; an editable installation uses the repository.
+
+    Args:
+        path: Path of the file or folder in the repository.
 
     Raises:
-        FileNotFoundError: If the installation is not whole.
+        FileNotFoundError: If the installation is incomplete.
     """
     package = Path(gsmap.__file__).parent
     for root in (package / ".mim", *package.parents):
-        if (root / _MARK).is_file():
+        if (root / _MARKER).is_file():
             return root / path
     raise FileNotFoundError(
         f"{package} is without its configs, commands and models: install GSMap again."

@@ -1,4 +1,4 @@
-"""Which list of scenes stands behind data, models and results: a name with a digest of the list."""
+"""Identity of the scene list behind data, models and results: a name and a digest."""
 
 import hashlib
 import json
@@ -9,57 +9,81 @@ from typing import Any
 from gsmap.utils.errors import InputError
 
 SPLIT_LIST = "split_list"  # key in annotation files, checkpoints and results
-TRAINED_ON = "trained_on"  # key in results: the model's list, where it is of the same data set
-_FORM = re.compile(r"[\w.+=-]{1,100}(@[0-9a-f]{16})?")
+TRAINED_ON = "trained_on"  # key in results: training list of a model of this data set
+_IDENTITY = re.compile(r"[\w.+=-]{1,100}(@[0-9a-f]{16})?")
 
 
 def list_identity(name: str, scenes: Mapping[str, Collection[str]]) -> str:
-    """Return ``name@digest`` of a list: scenes by the part of the split, in any order."""
-    plain = json.dumps({part: sorted(names) for part, names in scenes.items()}, sort_keys=True)
-    return f"{name}@{hashlib.sha256(plain.encode()).hexdigest()[:16]}"
+    """Return the identity of a scene list, ``name@digest``.
+
+    Args:
+        name: Name of the list.
+        scenes: Names of the scenes in each part of the split, in any order.
+    """
+    sorted_scenes = {part: sorted(names) for part, names in scenes.items()}
+    text = json.dumps(sorted_scenes, sort_keys=True)
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    return f"{name}@{digest[:16]}"
 
 
 def checked_identity(text: Any) -> str:
-    """Return what a file calls its list, nothing where it says nothing; ValueError for others."""
+    """Validate the identity of a scene list from a file.
+
+    Args:
+        text: Value from the file; None or empty if the list is unknown.
+
+    Returns:
+        The identity, empty if the list is unknown.
+
+    Raises:
+        ValueError: If the value is not a name with an optional digest.
+    """
     if text in (None, ""):
         return ""
-    if not isinstance(text, str) or not _FORM.fullmatch(text):
+    if not isinstance(text, str) or not _IDENTITY.fullmatch(text):
         raise InputError(f"{SPLIT_LIST} must be a name with a digest, got {text!r:.60}.")
     return text
 
 
 def require_same_list(model: Any, data: Any, subject: str, remedy: str) -> None:
-    """Refuse data whose places a model may have been trained on, as another split has them.
+    """Refuse evaluation data of another split than the training data of a model.
+
+    Other splits of a data set may evaluate on places of the training.
 
     Args:
-        model: The list that it was trained on; nothing if that is unknown, as in older files.
-        data: The list of the data, likewise.
-        subject: What was trained, for the message.
-        remedy: What allows it.
+        model: Identity of the training list; None or empty if unknown, as in older files.
+        data: Identity of the list of the evaluation data; None or empty if unknown.
+        subject: Description of the trained model, for the message.
+        remedy: Option that allows another split, for the message.
 
     Raises:
-        ValueError: If both are known and differ.
+        ValueError: If both lists are known and differ.
     """
-    first, second = checked_identity(model), checked_identity(data)
-    if first and second and first != second:
+    model_identity = checked_identity(model)
+    data_identity = checked_identity(data)
+    if model_identity and data_identity and model_identity != data_identity:
         raise InputError(
-            f"{subject} was trained on the split {first}, and the data to score is of {second}, "
-            "whose places may be among those of the training: take data of the same split, or "
-            f"allow it with {remedy}."
+            f"{subject} was trained on the split {model_identity}, and the data to score is of "
+            f"{data_identity}, whose places may be among those of the training: take data of the "
+            f"same split, or allow it with {remedy}."
         )
 
 
 def require_results_of(split_list: str, about: Mapping[str, Any], path: object) -> None:
-    """Refuse results of a model of another list than that of the data to score.
+    """Refuse results of a model that was trained on another split than the evaluation data.
 
     Args:
-        split_list: The list of the data; nothing if it is unknown.
-        about: What the result file says of itself.
-        path: The result file, for the message.
+        split_list: Identity of the list of the evaluation data; empty if unknown.
+        about: Metadata of the result file.
+        path: Result file, for the message.
 
     Raises:
-        ValueError: If both are known and differ.
+        ValueError: If both lists are known and differ.
     """
     for name in (TRAINED_ON, SPLIT_LIST):
-        subject = f"the model of {path}"
-        require_same_list(about.get(name), split_list, subject, "--allow-other-split")
+        require_same_list(
+            model=about.get(name),
+            data=split_list,
+            subject=f"the model of {path}",
+            remedy="--allow-other-split",
+        )

@@ -1,39 +1,44 @@
-"""Text on its way to a terminal, which must not act on what files bring."""
+"""Escaping of control characters in terminal output, which may come from untrusted files."""
 
 import re
 import sys
 from collections.abc import Iterable
 from typing import Any, TextIO
 
-_DOUBTFUL = re.compile(r"[^\x20-\x7e\n\t]+")  # nearly all text has none
+_UNCOMMON = re.compile(r"[^\x20-\x7e\n\t]+")  # absent from nearly all text
 
 
 def printable(text: str) -> str:
-    r"""Return a text whose control characters are written out, as ``repr`` writes them.
+    r"""Escape the control characters of a text, as ``repr`` does.
 
-    These are all that a terminal may act on, or hide: ``ESC`` and the other codes below a space,
-    those from 0x7f to 0x9f, the marks that turn the direction of writing, and halves of a character
-    that could not be decoded. Ends of lines and tabulators stay.
+    Control characters are ``ESC`` and the other codes below a space, the codes from 0x7f to 0x9f,
+    marks that change the writing direction, and lone surrogates of undecodable bytes. Newlines and
+    tabs are kept.
     """
-    return _DOUBTFUL.sub(_written_out, text)
+    return _UNCOMMON.sub(repl=_escape, string=text)
 
 
-def _written_out(found: re.Match[str]) -> str:
-    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in found[0])
+def _escape(match: re.Match[str]) -> str:
+    escaped = []
+    for character in match[0]:
+        escaped.append(character if character.isprintable() else ascii(character)[1:-1])
+    return "".join(escaped)
 
 
 class PrintableStream:
-    """A stream of text that passes on what is `printable`; in all else it is the other one.
+    """Text stream that escapes control characters (`printable`) before it writes to another stream.
+
+    All other attributes come from the wrapped stream.
 
     Args:
-        stream: The other one, such as ``sys.stdout``.
+        stream: Stream to wrap, such as ``sys.stdout``.
     """
 
     def __init__(self, stream: TextIO) -> None:
         self.stream = stream
 
     def write(self, text: str) -> int:
-        """Write a text, and return its length."""
+        """Write a text, and return its length before escaping."""
         self.stream.write(printable(text))
         return len(text)
 
@@ -43,8 +48,9 @@ class PrintableStream:
             self.write(line)
 
     def __eq__(self, other: object) -> bool:
-        """Whether both write to one place; tqdm asks, to keep texts apart from its bars."""
-        return self.stream is (other.stream if isinstance(other, PrintableStream) else other)
+        """Whether both streams write to one stream; tqdm compares the streams of its bars."""
+        other_stream = other.stream if isinstance(other, PrintableStream) else other
+        return self.stream is other_stream
 
     def __hash__(self) -> int:
         return hash(self.stream)
@@ -54,7 +60,7 @@ class PrintableStream:
 
 
 def print_safely() -> None:
-    """Let ``sys.stdout`` and ``sys.stderr`` pass on printable text only, to the process's end."""
+    """Escape control characters in ``sys.stdout`` and ``sys.stderr`` until the process ends."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if not isinstance(stream, PrintableStream):
@@ -62,5 +68,5 @@ def print_safely() -> None:
 
 
 def own_stream(stream: TextIO) -> TextIO:
-    """Return what lies below a `PrintableStream`, for a bar that moves the terminal's cursor."""
+    """Return the stream below a `PrintableStream`, for a bar that moves the terminal's cursor."""
     return stream.stream if isinstance(stream, PrintableStream) else stream

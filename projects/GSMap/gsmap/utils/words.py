@@ -1,15 +1,23 @@
-"""Numbers in sentences and in tables."""
+"""Formatting of counts and tables."""
 
 from collections.abc import Iterable, Sequence
 
 
 def counted(count: int, noun: str) -> str:
-    """Return a number with its noun, in the plural unless it is one: ``3 samples``."""
+    """Format a number with its noun, in the plural unless the number is 1: ``3 samples``."""
+    if count == 1:
+        return f"{count} {noun}"
     ending = "es" if noun.endswith("s") else "s"
-    return f"{count} {noun}{'' if count == 1 else ending}"
+    return f"{count} {noun}{ending}"
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table in Markdown, a line per row."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    """Format a Markdown table.
+
+    Args:
+        head: Titles of the columns.
+        rows: Cells of each row.
+    """
+    rule = ["---"] * len(head)
+    lines = ["| " + " | ".join(cells) + " |" for cells in (head, rule, *rows)]
+    return "\n".join(lines)
