@@ -1,1 +1,1 @@
-"""Configs of the original repositories, read without running them and turned into ours."""
+"""Conversion of configs of the original repositories to GSMap configs, without running them."""

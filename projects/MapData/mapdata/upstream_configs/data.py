@@ -1,4 +1,4 @@
-"""Data set, pipeline and schedule of an original config."""
+"""Conversion of data set, pipeline and schedule of an original config."""
 
 from typing import Any
 
@@ -9,20 +9,20 @@ DATASETS = (
     "CustomNuScenesLocalMapDataset", "CustomNuScenesOfflineLocalMapDataset",
     "CustomAV2LocalMapDataset", "CustomAV2OfflineLocalMapDataset",
 )  # fmt: skip
-# steps that ours does elsewhere (migration.md), or that only concern 3D boxes
+# pipeline steps that GSMap does elsewhere (migration.md), or that only concern 3D boxes
 KNOWN_STEPS = {
     "LoadMultiViewImageFromFiles", "CustomLoadMultiViewImageFromFiles",
     "PhotoMetricDistortionMultiViewImage", "LoadAnnotations3D", "ObjectRangeFilter",
     "ObjectNameFilter", "PadMultiViewImage", "PadMultiViewImageDepth", "DefaultFormatBundle3D",
     "LoadPointsFromFile", "CustomPointToMultiViewDepth",
 }  # fmt: skip
-# what a converter's annotation file holds, or what only concerns history and 3D boxes
-OF_THE_FILE = (
+# settings that annotation files contain, or that only concern history and 3D boxes
+FILE_SETTINGS = (
     "type ann_file map_ann_file classes modality test_mode use_valid_flag bev_size "
     "eval_use_same_gt_sample_num_flag padding_value queue_length box_type_3d samples_per_gpu "
     "load_interval aux_seg fixed_ptsnum_per_line"
 )
-FLAT = {"pred_z_flag": False, "gt_z_flag": False}  # z_cfg of points without height
+FLAT = {"pred_z_flag": False, "gt_z_flag": False}  # z_cfg of points without heights
 SCHEDULE = {
     "lr_config.warmup_iters": "param_scheduler.0.end",
     "lr_config.warmup_ratio": "param_scheduler.0.start_factor",
@@ -36,25 +36,37 @@ SCHEDULE = {
 
 
 def data_settings(fields: Fields) -> dict[str, Any]:
-    """Return the settings of data and image normalisation; ValueError if the data set is unknown.
+    """Convert the settings of the data and the image normalisation.
 
-    Besides: ``steps`` (settings of pipeline steps by type), ``z_range``, ``with_depth``.
+    Args:
+        fields: Settings of the config, from which the converted ones are removed.
+
+    Returns:
+        Settings by dotted name in GSMap, and further entries for the conversion of the model:
+        ``grid`` (``x_range`` and ``y_range``) and ``z_range`` in metres, ``classes``,
+        ``data_root``, ``steps`` (settings of pipeline steps by type) and ``with_depth``.
+
+    Raises:
+        ValueError: If the data set is unknown.
     """
     train = dict(fields.section("data.train"))
     if train.get("type") not in DATASETS:
         raise InputError(
             f"data.train.type must be one of {sorted(DATASETS)}, got {train.get('type')!r}."
         )
-    classes, root = list(train["map_classes"]), train.get("data_root")
-    x_range, y_range, z_range = ([train["pc_range"][i], train["pc_range"][i + 3]] for i in range(3))
-    shared = {"grid": {"x_range": x_range, "y_range": y_range}, "classes": classes}
+    classes = list(train["map_classes"])
+    data_root = train.get("data_root")
+    pc_range = train["pc_range"]  # smallest x, y, z, then largest x, y, z
+    grid = {"x_range": [pc_range[0], pc_range[3]], "y_range": [pc_range[1], pc_range[4]]}
     settings: dict[str, Any] = {
-        **shared,
-        **{f"model.{name}": value for name, value in shared.items()},
+        "grid": grid,
+        "classes": classes,
+        "model.grid": grid,
+        "model.classes": classes,
         "train_dataloader.batch_size": fields.take("data.samples_per_gpu"),
         "train_dataloader.num_workers": fields.take("data.workers_per_gpu"),
-        "data_root": root,
-        "z_range": z_range,
+        "data_root": data_root,
+        "z_range": [pc_range[2], pc_range[5]],
         "steps": {
             "FormatMapTargets": {"num_points": train["fixed_ptsnum_per_line"]},
             "MakeBEVMask": {"num_classes": len(classes)},
@@ -62,34 +74,38 @@ def data_settings(fields: Fields) -> dict[str, Any]:
         },
         "with_depth": False,
     }
-    fields.drop("data", "shuffler_sampler nonshuffler_sampler")
+    fields.drop("data", names="shuffler_sampler nonshuffler_sampler")
     for part in ("train", "val", "test"):
-        own, dataset = f"data.{part}", f"{part}_dataloader.dataset."
-        settings |= {dataset + name: value for name, value in shared.items()}
-        settings[dataset + "data_root"] = fields.take(own + ".data_root", root)
-        fields.drop(own, OF_THE_FILE, pc_range=train["pc_range"], map_classes=classes, z_cfg=FLAT)
-        for step in fields.items(own + ".pipeline") if "pipeline" in fields.section(own) else []:
-            _place_step(fields, step, settings)
+        section = f"data.{part}"
+        dataset = f"{part}_dataloader.dataset"
+        settings[f"{dataset}.grid"] = grid
+        settings[f"{dataset}.classes"] = classes
+        settings[f"{dataset}.data_root"] = fields.take(f"{section}.data_root", default=data_root)
+        fields.drop(
+            section, names=FILE_SETTINGS, pc_range=pc_range, map_classes=classes, z_cfg=FLAT
+        )
+        if "pipeline" in fields.section(section):
+            for step in fields.items(f"{section}.pipeline"):
+                _convert_step(fields, step, settings=settings)
     return settings
 
 
-def _place_step(fields: Fields, name: str, settings: dict[str, Any]) -> None:
-    """Place a step of a pipeline; one that is unknown stays."""
+def _convert_step(fields: Fields, name: str, settings: dict[str, Any]) -> None:
+    """Convert a pipeline step and add it to ``settings``; unknown steps remain in ``fields``."""
     step = fields.section(name)
     kind = step.get("type")
     if kind == "MultiScaleFlipAug3D" and not step.get("flip"):
-        for inner in fields.items(name + ".transforms"):
-            _place_step(fields, inner, settings)
-        fields.drop(name, "type flip img_scale pts_scale_ratio")
+        for inner_step in fields.items(f"{name}.transforms"):
+            _convert_step(fields, inner_step, settings=settings)
+        fields.drop(name, names="type flip img_scale pts_scale_ratio")
     elif kind == "RandomScaleImageMultiViewImage" and len(step["scales"]) == 1:
         settings["steps"]["ScaleImages"] = {"scale": step["scales"][0]}
         step.clear()
     elif kind == "NormalizeMultiviewImage":
-        ours = {"to_rgb": "bgr_to_rgb", "mean": "mean", "std": "std"}
-        settings |= fields.move(
-            {f"{name}.{key}": f"model.data_preprocessor.{new}" for key, new in ours.items()}
-        )
-        fields.drop(name, "type")
+        settings["model.data_preprocessor.bgr_to_rgb"] = fields.take(f"{name}.to_rgb")
+        settings["model.data_preprocessor.mean"] = fields.take(f"{name}.mean")
+        settings["model.data_preprocessor.std"] = fields.take(f"{name}.std")
+        fields.drop(name, names="type")
     elif kind == "CustomCollect3D":
         settings["with_depth"] |= "gt_depth" in step["keys"]
         step.clear()
@@ -98,24 +114,32 @@ def _place_step(fields: Fields, name: str, settings: dict[str, Any]) -> None:
 
 
 def schedule_settings(fields: Fields) -> dict[str, Any]:
-    """Return the settings of optimizer, learning rate, epochs and checkpoints."""
-    optimizer = fields.take("optimizer", {})
+    """Convert the settings of optimizer, learning rate, epochs, checkpoints and log.
+
+    Args:
+        fields: Settings of the config, from which the converted ones are removed.
+
+    Returns:
+        Settings by dotted name in GSMap.
+    """
+    optimizer = fields.take("optimizer", default={})
     settings = {
         "optim_wrapper.optimizer": optimizer,
-        "optim_wrapper.clip_grad": fields.take("optimizer_config.grad_clip", None),
+        "optim_wrapper.clip_grad": fields.take("optimizer_config.grad_clip", default=None),
         **fields.move(SCHEDULE, required=False),
     }
     if "paramwise_cfg" in optimizer:
         settings["optim_wrapper.paramwise_cfg"] = optimizer.pop("paramwise_cfg")
-    epochs = fields.take("total_epochs", None)
-    epochs = fields.take("runner.max_epochs", epochs)
+    epochs = fields.take("total_epochs", default=None)
+    epochs = fields.take("runner.max_epochs", default=epochs)
     if epochs is not None:
         settings["train_cfg.max_epochs"] = epochs
-    scale = fields.take("fp16.loss_scale", None)
+    scale = fields.take("fp16.loss_scale", default=None)
     if scale is not None:
-        settings |= {"optim_wrapper.type": "AmpOptimWrapper", "optim_wrapper.loss_scale": scale}
+        settings["optim_wrapper.type"] = "AmpOptimWrapper"
+        settings["optim_wrapper.loss_scale"] = scale
     fields.drop("lr_config", policy="CosineAnnealing", warmup="linear")
     fields.drop("runner", type="EpochBasedRunner")
-    fields.drop("evaluation", "pipeline metric save_best rule")
-    fields.drop("log_config", "hooks")
+    fields.drop("evaluation", names="pipeline metric save_best rule")
+    fields.drop("log_config", names="hooks")
     return settings

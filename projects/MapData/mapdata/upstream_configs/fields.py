@@ -1,4 +1,4 @@
-"""The settings of an original config that still have to be placed."""
+"""Settings of an original config that are not converted yet."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -9,26 +9,44 @@ _REQUIRED = object()
 
 
 class Fields:
-    """A config's settings by dotted name; what is taken or dropped is gone, the rest is left over.
+    """Settings of a config by dotted name.
 
-    A number in a name is a place in a list. The dict that is given is used up.
+    Settings that are taken or dropped are removed from ``values``, so the remaining ones have no
+    counterpart in GSMap. A number in a name is an index of a list.
+
+    Args:
+        values: Settings of the config, nested dicts and lists. Modified in place.
     """
 
     def __init__(self, values: dict[str, Any]) -> None:
         self._values = values
 
     def section(self, name: str) -> dict[str, Any]:
-        """Return the settings below a name; an empty dict where there are none."""
+        """Look up the settings below a name; an empty dict if there are none.
+
+        Args:
+            name: Dotted name, such as ``model.pts_bbox_head``.
+        """
         value: Any = self._values
         for key in name.split("."):
             if isinstance(value, (list, tuple)):
                 value = dict(enumerate(value)).get(int(key))
+            elif isinstance(value, dict):
+                value = value.get(key)
             else:
-                value = value.get(key) if isinstance(value, dict) else None
+                return {}
         return value if isinstance(value, dict) else {}
 
     def take(self, name: str, default: Any = _REQUIRED) -> Any:
-        """Return a setting, which counts as placed; ValueError if it must be there and is not."""
+        """Remove a setting and return its value.
+
+        Args:
+            name: Dotted name.
+            default: Value if the setting is missing.
+
+        Raises:
+            ValueError: If the setting is missing and there is no default.
+        """
         section, _, key = name.rpartition(".")
         values = self.section(section) if section else self._values
         if key not in values and default is _REQUIRED:
@@ -36,42 +54,77 @@ class Fields:
         return values.pop(key, default)
 
     def items(self, name: str) -> list[str]:
-        """Return the names of a list's items; ValueError if there is no such list."""
+        """List the dotted names of the items of a list.
+
+        Args:
+            name: Dotted name of the list.
+
+        Raises:
+            ValueError: If the setting is missing or not a list.
+        """
         section, _, key = name.rpartition(".")
         values = self.section(section).get(key)
         if not isinstance(values, (list, tuple)):
             raise InputError(f"{name} must be a list, got {values!r}.")
         return [f"{name}.{i}" for i in range(len(values))]
 
-    def move(self, places: dict[str, str], required: bool = True) -> dict[str, Any]:
-        """Take settings by their names and return them by their new ones."""
+    def move(self, new_names: dict[str, str], required: bool = True) -> dict[str, Any]:
+        """Take settings and rename them.
+
+        Args:
+            new_names: Dotted names in GSMap, by dotted name.
+            required: Whether a missing setting is an error. Otherwise missing settings and None
+                are left out.
+
+        Returns:
+            Values by dotted name in GSMap.
+
+        Raises:
+            ValueError: If a required setting is missing.
+        """
         default = _REQUIRED if required else None
-        found = {new: self.take(name, default) for name, new in places.items()}
-        return {name: value for name, value in found.items() if required or value is not None}
+        settings = {}
+        for name, new_name in new_names.items():
+            value = self.take(name, default=default)
+            if required or value is not None:
+                settings[new_name] = value
+        return settings
 
     def drop(self, section: str, names: str = "", **fixed: Any) -> None:
-        """Leave out settings of a section that mean nothing here, named with spaces between.
+        """Remove settings without a counterpart in GSMap.
 
-        Of those in ``fixed`` this holds for one value, which ours has too.
+        Args:
+            section: Dotted name of the section of the settings.
+            names: Names of settings to remove, separated by spaces.
+            fixed: Settings to remove if they have this value, which GSMap has always.
         """
-        found = self.section(section)
+        values = self.section(section)
         for name in names.split():
-            found.pop(name, None)
+            values.pop(name, None)
         for name, value in fixed.items():
-            if found.get(name) == value:
-                found.pop(name)
+            if values.get(name) == value:
+                values.pop(name)
 
     def left_over(self) -> list[str]:
-        """Return dotted name and value of every setting that was not placed."""
-        return [f"{name} = {v!r}" for name, v in _leaves(self._values, "") if v is not None]
+        """List the remaining settings except None, each as ``name = value``."""
+        lines = []
+        for name, value in _leaves(self._values, path=""):
+            if value is not None:
+                lines.append(f"{name} = {value!r}")
+        return lines
 
 
 def _leaves(value: Any, path: str) -> Iterator[tuple[str, Any]]:
-    """Yield the values of nested dicts and lists of dicts; what is empty holds none."""
+    """Yield dotted name and value of each leaf of nested dicts and lists of dicts.
+
+    Args:
+        value: Dict, list or leaf.
+        path: Dotted name of ``value``.
+    """
     if isinstance(value, (list, tuple)) and all(isinstance(inner, dict) for inner in value):
         value = dict(enumerate(value))
     if not isinstance(value, dict):
         yield path, value
         return
     for key, inner in value.items():
-        yield from _leaves(inner, f"{path}.{key}" if path else str(key))
+        yield from _leaves(inner, path=f"{path}.{key}" if path else str(key))

@@ -1,4 +1,4 @@
-"""Read a config file of plain assignments without running it."""
+"""Reader of config files of plain assignments that does not run them."""
 
 import ast
 import copy
@@ -14,21 +14,26 @@ ARITHMETIC: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
     ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul,
     ast.Div: operator.truediv, ast.FloorDiv: operator.floordiv,
 }  # fmt: skip
-_COPIED = 50_000  # values and characters that all earlier names stand for together
-_LARGEST = 1e15  # numbers
-_DEEPEST = 20
+_COPIED = 50_000  # limit of copied values and characters, over all uses of earlier names
+_LARGEST = 1e15  # limit of numbers
+_DEEPEST = 20  # limit of nesting
 CALLS: dict[str, Callable[[Any], Any]] = {"len": len, "list": list, "tuple": tuple}
 
 
 def read_assignments(path: str | Path) -> dict[str, Any]:
-    """Return the values of a file's top-level names, as its last assignments leave them.
+    """Read the values of the top-level names of a config file.
 
-    Known are literals, earlier names, ``dict(...)`` with ``**``, ``len``, ``list``, ``tuple``,
-    indices, and arithmetic of numbers, strings and lists. Nothing is executed, and no value shares
-    a part with another.
+    Supported are literals, earlier names, ``dict(...)`` with ``**``, ``len``, ``list``, ``tuple``,
+    indices, and arithmetic of numbers, strings and lists. No code is executed.
+
+    Args:
+        path: Config file in Python.
+
+    Returns:
+        Values by name after the last assignment. The values share no mutable parts.
 
     Raises:
-        ValueError: If the file holds anything else; the message names the line.
+        ValueError: If the file contains anything else; the message names the line.
     """
     names = _Names()
     source = read_text(path)
@@ -57,33 +62,46 @@ def read_assignments(path: str | Path) -> dict[str, Any]:
 
 
 class _Names(dict[str, Any]):
-    """Values by name; what is taken is copied, and counts, as names of names of names grow fast."""
+    """Values by name, which are copied for each use.
 
-    _left = _COPIED
+    The total size of the copies is limited, because nested uses of names grow exponentially.
+    """
 
-    def take(self, name: str) -> Any:
-        """Return a copy of a value; ValueError if there is none, or all copies are too much."""
+    _remaining = _COPIED
+
+    def copy_of(self, name: str) -> Any:
+        """Copy the value of a name.
+
+        Raises:
+            ValueError: If the name is not assigned, or the limit of the copies is exceeded.
+        """
         if name not in self:
             raise InputError(f"{name} is not assigned before")
-        self._count(self[name], 0)
+        self._count(self[name], depth=0)
         return copy.deepcopy(self[name])
 
     def _count(self, value: Any, depth: int) -> None:
-        self._left -= len(value) if isinstance(value, str) else 1
-        if self._left < 0 or depth > _DEEPEST:
+        """Subtract the size of a value from the remaining size; ``depth`` is its nesting."""
+        self._remaining -= len(value) if isinstance(value, str) else 1
+        if self._remaining < 0 or depth > _DEEPEST:
             raise InputError("earlier names stand for too much, or for lists nested too deep")
-        if isinstance(value, (list, tuple, dict)):
-            for inner in (*value, *value.values()) if isinstance(value, dict) else value:
-                self._count(inner, depth + 1)
+        if isinstance(value, dict):
+            items: Iterable[Any] = (*value, *value.values())
+        elif isinstance(value, (list, tuple)):
+            items = value
+        else:
+            return
+        for item in items:
+            self._count(item, depth=depth + 1)
 
 
 def _value(node: ast.expr, names: _Names) -> Any:
-    """Return what an expression stands for."""
+    """Evaluate an expression."""
     match node:
         case ast.Constant(value):
             return value
         case ast.Name(name):
-            return names.take(name)
+            return names.copy_of(name)
         case ast.List(items):
             return [_value(item, names) for item in items]
         case ast.Tuple(items):
@@ -91,15 +109,19 @@ def _value(node: ast.expr, names: _Names) -> Any:
         case ast.Dict(keys, values):
             return _mapping(zip(keys, values, strict=True), names)
         case ast.Subscript(value, index):
-            return _value(value, names)[_value(index, names)]
-    return _computed(node, names)
+            container = _value(value, names)
+            return container[_value(index, names)]
+    return _compute(node, names)
 
 
-def _computed(node: ast.expr, names: _Names) -> Any:
-    """Return the value of a call or of arithmetic."""
+def _compute(node: ast.expr, names: _Names) -> Any:
+    """Evaluate a call or an arithmetic expression."""
     match node:
         case ast.Call(ast.Name("dict"), [], keywords):
-            pairs = [(k.arg and ast.Constant(k.arg), k.value) for k in keywords]
+            pairs: list[tuple[ast.expr | None, ast.expr]] = []
+            for keyword in keywords:
+                key = ast.Constant(keyword.arg) if keyword.arg else None
+                pairs.append((key, keyword.value))
             return _mapping(pairs, names)
         case ast.Call(ast.Name(name), [argument], []) if name in CALLS:
             return CALLS[name](_value(argument, names))
@@ -108,11 +130,13 @@ def _computed(node: ast.expr, names: _Names) -> Any:
         case ast.UnaryOp(ast.USub(), operand):
             return -_value(operand, names)
         case ast.BinOp(left, sign, right) if type(sign) in ARITHMETIC:
-            sides = _value(left, names), _value(right, names)
-            # a text or list multiplied may fill the memory
-            if isinstance(sign, ast.Mult) and not all(isinstance(v, (int, float)) for v in sides):
+            first = _value(left, names)
+            second = _value(right, names)
+            are_numbers = isinstance(first, (int, float)) and isinstance(second, (int, float))
+            # a repeated text or list may exceed the memory
+            if isinstance(sign, ast.Mult) and not are_numbers:
                 raise InputError("only numbers are multiplied")
-            result = ARITHMETIC[type(sign)](*sides)
+            result = ARITHMETIC[type(sign)](first, second)
             if isinstance(result, (int, float)) and not abs(result) <= _LARGEST:
                 raise InputError(f"no setting is beyond {_LARGEST:g}")
             return result
@@ -120,8 +144,12 @@ def _computed(node: ast.expr, names: _Names) -> Any:
 
 
 def _mapping(pairs: Iterable[Any], names: _Names) -> dict[Any, Any]:
-    """Return a dict of pairs of key and value nodes; a key of None stands for ``**``."""
+    """Evaluate pairs of key and value nodes to a dict; a key of None stands for ``**``."""
     values: dict[Any, Any] = {}
-    for key, node in pairs:
-        values |= _value(node, names) if key is None else {_value(key, names): _value(node, names)}
+    for key_node, value_node in pairs:
+        if key_node is None:
+            values |= _value(value_node, names)
+        else:
+            key = _value(key_node, names)
+            values[key] = _value(value_node, names)
     return values

@@ -1,4 +1,4 @@
-"""A config of MapTR, MapTRv2, GeMap or MapVR in their authors' form, as settings of ours."""
+"""Conversion of the original configs of MapTR, MapTRv2, GeMap and MapVR to GSMap configs."""
 
 import math
 import re
@@ -16,75 +16,80 @@ from mapdata.upstream_configs.fields import Fields
 _KEY = re.compile(r"[a-zA-Z][\w.-]*", re.ASCII)
 _TYPE = re.compile(r"(mmdet\.)?\w+")
 METHODS = ("MapTR", "MapTRv2", "GeMap", "GeMapFull")
-# top-level names that mean something by themselves; others are variables of the file
-RUN = (
+# top-level names with a meaning; others are variables of the file
+TOP_LEVEL_NAMES = (
     "_base_", "model", "data", "optimizer", "optimizer_config", "lr_config", "total_epochs",
     "runner", "evaluation", "fp16", "checkpoint_config", "log_config", "load_from",
     "resume_from", "custom_hooks", "momentum_config",
 )  # fmt: skip
+# sections of a GSMap config
 _HEAD = "model.map_head."
 _DECODER = _HEAD + "decoder."
 _BEV = "model.bev_encoder."
-# theirs
-_THEIRS = "model.pts_bbox_head"
+# sections of an original config
+_PTS_HEAD = "model.pts_bbox_head"
 _TRAINING = "model.train_cfg.pts"
 _COSTS = f"{_TRAINING}.assigner"
-_TRANSFORMER = f"{_THEIRS}.transformer"
+_TRANSFORMER = f"{_PTS_HEAD}.transformer"
 _ENCODER = f"{_TRANSFORMER}.encoder"
 _PILLARS = f"{_ENCODER}.transformerlayers"
 _SPATIAL = f"{_PILLARS}.attn_cfgs.1"  # after the temporal attention
 _LAYER = f"{_TRANSFORMER}.decoder.transformerlayers"
-MOVED = {
+# names in GSMap of settings of the model, by name in an original config
+MODEL_NAMES = {
     f"{_TRANSFORMER}.decoder.num_layers": _DECODER + "num_layers",
     f"{_LAYER}.feedforward_channels": _DECODER + "layer.ffn_dims",
     f"{_LAYER}.ffn_dropout": _DECODER + "layer.dropout",
-    f"{_THEIRS}.num_pts_per_vec": _HEAD + "num_points",
-    f"{_THEIRS}.bbox_coder.max_num": _HEAD + "coder.max_num",
-    f"{_THEIRS}.loss_cls": _HEAD + "loss_cls",
-    f"{_THEIRS}.loss_pts.loss_weight": _HEAD + "losses.0.loss_weight",
-    f"{_THEIRS}.loss_dir.loss_weight": _HEAD + "losses.1.loss_weight",
+    f"{_PTS_HEAD}.num_pts_per_vec": _HEAD + "num_points",
+    f"{_PTS_HEAD}.bbox_coder.max_num": _HEAD + "coder.max_num",
+    f"{_PTS_HEAD}.loss_cls": _HEAD + "loss_cls",
+    f"{_PTS_HEAD}.loss_pts.loss_weight": _HEAD + "losses.0.loss_weight",
+    f"{_PTS_HEAD}.loss_dir.loss_weight": _HEAD + "losses.1.loss_weight",
     f"{_COSTS}.cls_cost.weight": _HEAD + "match_costs.0.weight",
     f"{_COSTS}.pts_cost.weight": _HEAD + "match_costs.1.weight",
 }
-MOVED_OF_PILLARS = {
+# names in GSMap of settings of BEVFormer's encoder, by name in an original config
+PILLAR_NAMES = {
     f"{_ENCODER}.num_layers": _BEV + "num_layers",
     f"{_PILLARS}.feedforward_channels": _BEV + "layer_cfg.ffn_dims",
     f"{_PILLARS}.ffn_dropout": _BEV + "layer_cfg.dropout",
 }
-# the kinds of parts that ours has, too
+# supported types of parts, by section
 KINDS: dict[str, tuple[str, ...]] = {
     "model": METHODS,
-    _THEIRS: tuple(f"{method}Head" for method in METHODS),
+    _PTS_HEAD: tuple(f"{method}Head" for method in METHODS),
     _ENCODER: ("BEVFormerEncoder", "LSSTransform"),
     _LAYER: ("DetrTransformerDecoderLayer", "DecoupledDetrTransformerDecoderLayer"),
 }
 _SELF_ATTENTIONS = ("MultiheadAttention", "GeometryDecoupledAttention")
 _CROSS_ATTENTIONS = ("CustomMSDeformableAttention",)
 _SPATIAL_ATTENTIONS = ("GeometrySptialCrossAttention", "SpatialCrossAttention")
-# what only ever has one value, and is that of ours
-FIXED: dict[str, dict[str, Any]] = {
-    _THEIRS: {
+# settings that can only have one value in GSMap, by section
+FIXED_VALUES: dict[str, dict[str, Any]] = {
+    _PTS_HEAD: {
         "query_embed_type": "instance_pts", "transform_method": "minmax",
         "gt_shift_pts_pattern": "v2", "with_box_refine": True, "as_two_stage": False,
         "sync_cls_avg_factor": True, "code_size": 2, "dir_interval": 1, "z_cfg": FLAT,
     },
-    f"{_THEIRS}.aux_seg": {"seg_classes": 1, "use_aux_seg": True},
+    f"{_PTS_HEAD}.aux_seg": {"seg_classes": 1, "use_aux_seg": True},
     f"{_ENCODER}.depthnet_cfg": {"use_dcn": False, "with_cp": False},
     f"{_SPATIAL}.attention": {"dilation": 1},
-    **{section: {"z_cfg": FLAT} for section in (f"{_THEIRS}.bbox_coder", _TRANSFORMER, _COSTS)},
+    **{section: {"z_cfg": FLAT} for section in (f"{_PTS_HEAD}.bbox_coder", _TRANSFORMER, _COSTS)},
 }  # fmt: skip
-# parts that do nothing if this weight of theirs is zero
+# weights of parts that have no effect if the weight is zero, by section
 WEIGHTS = {
-    f"{_THEIRS}.loss_bbox": "loss_weight", f"{_THEIRS}.loss_iou": "loss_weight",
+    f"{_PTS_HEAD}.loss_bbox": "loss_weight", f"{_PTS_HEAD}.loss_iou": "loss_weight",
     f"{_COSTS}.reg_cost": "weight", f"{_COSTS}.iou_cost": "weight",
 }  # fmt: skip
-# what has no meaning of its own: ours follows from other settings
-DROPPED = {
+# settings that follow from other settings or have no effect in GSMap, by section
+IGNORED_NAMES = {
     "model": "type video_test_mode",
-    _THEIRS: "type num_query in_channels code_weights num_classes positional_encoding",
-    f"{_THEIRS}.bbox_coder": "type pc_range voxel_size num_classes",
-    f"{_THEIRS}.aux_seg": "feat_down_sample pv_thickness",
-    **dict.fromkeys([f"{_THEIRS}.loss_{name}" for name in ("pts", "dir", "seg", "pv_seg")], "type"),
+    _PTS_HEAD: "type num_query in_channels code_weights num_classes positional_encoding",
+    f"{_PTS_HEAD}.bbox_coder": "type pc_range voxel_size num_classes",
+    f"{_PTS_HEAD}.aux_seg": "feat_down_sample pv_thickness",
+    **dict.fromkeys(
+        [f"{_PTS_HEAD}.loss_{name}" for name in ("pts", "dir", "seg", "pv_seg")], "type"
+    ),
     _TRAINING: "grid_size voxel_size point_cloud_range out_size_factor",
     _COSTS: "type pc_range",
     **dict.fromkeys([f"{_COSTS}.cls_cost", f"{_COSTS}.pts_cost"], "type"),
@@ -102,57 +107,87 @@ DROPPED = {
 
 @dataclass
 class Conversion:
-    """What a config becomes."""
+    """Result of converting an original config.
 
-    base: str  # our config that it is nearest to, below configs
-    settings: dict[str, Any]  # by dotted names of ours
-    steps: dict[str, dict[str, Any]]  # settings of pipeline steps, by their type
-    unplaced: list[str]  # what has no place in ours: dotted name and value
+    Args:
+        base: Path of the GSMap config to modify, relative to ``configs``.
+        settings: Values by dotted name in GSMap.
+        steps: Settings of pipeline steps, by type of the step.
+        unplaced: Settings without a counterpart in GSMap, each as ``name = value``.
+    """
+
+    base: str
+    settings: dict[str, Any]
+    steps: dict[str, dict[str, Any]]
+    unplaced: list[str]
 
 
 def convert_upstream(names: dict[str, Any]) -> Conversion:
-    """Turn the assignments of an original config, which are used up, into settings of ours.
+    """Convert the assignments of an original config to settings of a GSMap config.
+
+    Args:
+        names: Values by top-level name (`read_assignments`). Modified in place.
 
     Raises:
-        ValueError: If the config is of a model, or of a data set with it, that ours is not.
+        ValueError: If the model, one of its parts or the data set is not supported.
     """
-    fields = Fields({name: names[name] for name in RUN if name in names})
+    fields = Fields({name: names[name] for name in TOP_LEVEL_NAMES if name in names})
     for section, kinds in KINDS.items():
-        _check_kind(fields, section, kinds)
-    settings = data_settings(fields) | schedule_settings(fields) | _image_settings(fields)
-    sides = *settings["grid"]["x_range"], *settings["grid"]["y_range"]
-    encoder = _encoder_settings(fields, settings, sides)
-    settings |= fields.move(MOVED)
+        _check_kind(fields, section, kinds=kinds)
+    settings = data_settings(fields)
+    settings |= schedule_settings(fields)
+    settings |= _image_settings(fields)
+    grid = settings["grid"]
+    sides = (*grid["x_range"], *grid["y_range"])
+    encoder = _encoder_settings(fields, settings, sides=sides)
+    settings |= fields.move(MODEL_NAMES)
     _decoder_settings(fields, settings)
     _head_settings(fields, settings)
-    _margin(fields, settings, sides)
+    _margin_settings(fields, settings, sides=sides)
     for section, weight in WEIGHTS.items():
-        if fields.section(section).get(weight) == 0:
-            fields.section(section).clear()
-    for section in {**DROPPED, **FIXED}:
-        fields.drop(section, DROPPED.get(section, ""), **FIXED.get(section, {}))
-    base = _base(encoder, sides[0] == -30.0, settings.pop("with_depth"))
-    return Conversion(base, settings, settings.pop("steps"), fields.left_over())
+        values = fields.section(section)
+        if values.get(weight) == 0:
+            values.clear()
+    for section in {**IGNORED_NAMES, **FIXED_VALUES}:
+        fixed_values = FIXED_VALUES.get(section, {})
+        fields.drop(section, names=IGNORED_NAMES.get(section, ""), **fixed_values)
+    has_depth = settings.pop("with_depth")
+    base = _base_config(encoder, is_argoverse2=sides[0] == -30.0, has_depth=has_depth)
+    return Conversion(
+        base=base,
+        settings=settings,
+        steps=settings.pop("steps"),
+        unplaced=fields.left_over(),
+    )
 
 
 def _check_kind(fields: Fields, section: str, kinds: tuple[str, ...]) -> None:
-    """Refuse a part that ours does not have."""
+    """Raise a ``ValueError`` if the type of a part is not one of ``kinds``."""
     kind = fields.section(section).get("type")
     if kind not in kinds:
-        known = ", ".join(kinds)
-        raise InputError(f"{kind!s:.60} is not supported: {section}.type must be one of {known}.")
+        supported = ", ".join(kinds)
+        raise InputError(
+            f"{kind!s:.60} is not supported: {section}.type must be one of {supported}."
+        )
 
 
 def merge(conversion: Conversion, configs: Path) -> Config:
-    """Return our config, from the folder of our configs, with the conversion's settings."""
+    """Merge the settings of a conversion into its base config.
+
+    Args:
+        conversion: Result of `convert_upstream`.
+        configs: Folder of the GSMap configs.
+    """
     values = Config.fromfile(configs / conversion.base, import_custom_modules=False).to_dict()
     for name, value in conversion.settings.items():
-        *path, last = name.split(".")
+        *sections, key = name.split(".")
         section: Any = values
-        for key in path:
-            at_list = isinstance(section, list)
-            section = section[int(key)] if at_list else section.setdefault(key, {})
-        section[last] = value
+        for section_key in sections:
+            if isinstance(section, list):
+                section = section[int(section_key)]
+            else:
+                section = section.setdefault(section_key, {})
+        section[key] = value
     cfg = Config(values)
     for part in ("train", "val", "test"):
         for step in cfg[f"{part}_dataloader"].dataset.pipeline:
@@ -161,184 +196,280 @@ def merge(conversion: Conversion, configs: Path) -> Config:
 
 
 def python_text(cfg: Config) -> str:
-    """Write a config as Python: each value by its ``repr``.
+    """Format a config as Python source, each value by its ``repr``.
+
+    Names with a leading underscore, such as ``_base_``, are left out.
+
+    Args:
+        cfg: Config.
 
     Raises:
-        ValueError: If a value is more than a number or text, a key is no plain word, a type is the
-            path of a module, or a text is one that mmengine replaces (``{{...}}``).
+        ValueError: If a value is neither a finite number nor a text, a key is not a plain word, a
+            type is the path of a module, or a text has a placeholder of mmengine (``{{...}}``).
     """
-    # the base's own values have done their work
-    values = {name: v for name, v in cfg.to_dict().items() if not name.startswith("_")}
-    _check_plain(values, "")
-    lines = (f"{name} = {pformat(v, width=100, sort_dicts=False)}\n" for name, v in values.items())
-    return "".join(lines)
+    values = {}
+    for name, value in cfg.to_dict().items():
+        if not name.startswith("_"):
+            values[name] = value
+    _check_plain(values, name="")
+    assignments = []
+    for name, value in values.items():
+        text = pformat(value, width=100, sort_dicts=False)
+        assignments.append(f"{name} = {text}\n")
+    return "".join(assignments)
 
 
 def _check_plain(value: Any, name: str) -> None:
-    """Refuse what is not to stand in a config, which is code."""
-    if isinstance(value, (dict, list, tuple)):
-        for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
-            own = f"{name}.{key}".lstrip(".")
-            if isinstance(value, dict) and not (isinstance(key, str) and _KEY.fullmatch(key)):
-                raise InputError(f"{own[:60]!r} is no name of a setting")
-            if key == "type" and not (isinstance(inner, str) and _TYPE.fullmatch(inner)):
-                raise InputError(f"{own} must be the name of a registered class, got {inner!r:.60}")
-            _check_plain(inner, own)
-    elif isinstance(value, str):
+    """Raise a ``ValueError`` for values that are not safe in a config, which is code.
+
+    Args:
+        value: Dict, list, tuple or leaf.
+        name: Dotted name of the value; empty for the config.
+    """
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            inner_name = f"{name}.{key}".lstrip(".")
+            if not isinstance(key, str) or not _KEY.fullmatch(key):
+                raise InputError(f"{inner_name[:60]!r} is no name of a setting")
+            if key == "type":
+                _check_type(inner, name=inner_name)
+            _check_plain(inner, name=inner_name)
+    elif isinstance(value, (list, tuple)):
+        for index, inner in enumerate(value):
+            _check_plain(inner, name=f"{name}.{index}".lstrip("."))
+    else:
+        _check_leaf(value, name=name)
+
+
+def _check_leaf(value: Any, name: str) -> None:
+    """Raise a ``ValueError`` if a value is not None, a finite number or a text of a config."""
+    if isinstance(value, str):
         if "{{" in value:
             raise InputError(f"{name} is {value!r:.60}, which mmengine would replace")
-    elif not (value is None or (isinstance(value, (int, float)) and math.isfinite(value))):
-        raise InputError(f"{name} is {value!r:.60}, neither a finite number nor a text")
+    elif value is not None:
+        is_number = isinstance(value, (int, float)) and math.isfinite(value)
+        if not is_number:
+            raise InputError(f"{name} is {value!r:.60}, neither a finite number nor a text")
 
 
-def _base(encoder: str, av2: bool, with_depth: bool) -> str:
-    """Return our config that has the same encoder and data set."""
-    of_nuscenes = {"SpatialCrossAttention": "bevformer", "PlainLSSTransform": "bevpool"}
-    if encoder in of_nuscenes and av2:
-        raise InputError(
-            f"{encoder.removeprefix('Plain')} of MapTR is not supported on Argoverse 2."
-        )
-    if encoder in of_nuscenes:
-        return f"maptr/maptr_r50_{of_nuscenes[encoder]}_24e.py"
-    if encoder == "LSSTransform":
-        on_av2 = "av2_depth_6e" if with_depth else "av2_6e"
-        return f"maptrv2/maptrv2_r50_{on_av2 if av2 else '24e'}.py"
-    return f"maptr/maptr_r50_{'av2_6e' if av2 else '24e'}.py"
+def _check_type(value: Any, name: str) -> None:
+    """Raise a ``ValueError`` if the type of a part is not the name of a registered class."""
+    if not isinstance(value, str) or not _TYPE.fullmatch(value):
+        raise InputError(f"{name} must be the name of a registered class, got {value!r:.60}")
+
+
+def _base_config(encoder: str, is_argoverse2: bool, has_depth: bool) -> str:
+    """Select the GSMap config with this BEV encoder and data set.
+
+    Args:
+        encoder: Type of the BEV encoder, as `_encoder_settings` returns it.
+        is_argoverse2: Whether the data set is Argoverse 2; otherwise it is nuScenes.
+        has_depth: Whether the samples have depth maps.
+
+    Returns:
+        Path relative to the folder of the configs.
+    """
+    nuscenes_configs = {
+        "SpatialCrossAttention": "maptr/maptr_r50_bevformer_24e.py",
+        "PlainLSSTransform": "maptr/maptr_r50_bevpool_24e.py",
+    }
+    if encoder in nuscenes_configs:
+        if is_argoverse2:
+            raise InputError(
+                f"{encoder.removeprefix('Plain')} of MapTR is not supported on Argoverse 2."
+            )
+        return nuscenes_configs[encoder]
+    if encoder != "LSSTransform":
+        schedule = "av2_6e" if is_argoverse2 else "24e"
+        return f"maptr/maptr_r50_{schedule}.py"
+    if not is_argoverse2:
+        return "maptrv2/maptrv2_r50_24e.py"
+    return f"maptrv2/maptrv2_r50_{'av2_depth_6e' if has_depth else 'av2_6e'}.py"
 
 
 def _image_settings(fields: Fields) -> dict[str, Any]:
-    """Return the settings of backbone and neck."""
+    """Convert the settings of backbone and neck to settings by dotted name in GSMap."""
     settings: dict[str, Any] = {}
-    if not fields.take("model.use_grid_mask", False):
+    if not fields.take("model.use_grid_mask", default=False):
         settings["model.img_augment"] = None
     for part in ("img_backbone", "img_neck"):
-        values = fields.take(f"model.{part}", {})
-        kind = values["type"] if values["type"] == "VoVNet" else f"mmdet.{values['type']}"
-        settings |= {f"model.{part}.{name}": v for name, v in {**values, "type": kind}.items()}
-    checkpoint = fields.take("model.pretrained", {}).get("img")
+        values = fields.take(f"model.{part}", default={})
+        if values["type"] != "VoVNet":  # registered by GSMap
+            values["type"] = f"mmdet.{values['type']}"
+        for name, value in values.items():
+            settings[f"model.{part}.{name}"] = value
+    checkpoint = fields.take("model.pretrained", default={}).get("img")
     if checkpoint is not None:
         settings["model.img_backbone.init_cfg.checkpoint"] = checkpoint
     return settings
 
 
 def _encoder_settings(fields: Fields, settings: dict[str, Any], sides: tuple[float, ...]) -> str:
-    """Add the settings of the BEV encoder and return its kind."""
+    """Convert the settings of the BEV encoder.
+
+    Args:
+        fields: Settings of the original config.
+        settings: Converted settings, to which the settings of the encoder are added.
+        sides: Smallest and largest x, then y, of the map in metres.
+
+    Returns:
+        Type of the encoder or of its spatial attention; ``PlainLSSTransform`` for a depth network
+        without camera parameters.
+    """
     kind: str = fields.take(f"{_ENCODER}.type")
-    rows, cols = fields.take(f"{_THEIRS}.bev_h"), fields.take(f"{_THEIRS}.bev_w")
-    sizes = (sides[1] - sides[0]) / cols, (sides[3] - sides[2]) / rows
+    rows = fields.take(f"{_PTS_HEAD}.bev_h")
+    columns = fields.take(f"{_PTS_HEAD}.bev_w")
+    x_min, x_max, y_min, y_max = sides
+    pixel_x_m = (x_max - x_min) / columns
+    pixel_y_m = (y_max - y_min) / rows
+    is_square = abs(pixel_x_m - pixel_y_m) < 1e-6
     settings[_BEV + "z_range"] = tuple(settings.pop("z_range"))
-    settings[_BEV + "bev_pixel_m"] = sizes[0] if abs(sizes[0] - sizes[1]) < 1e-6 else list(sizes)
+    settings[_BEV + "bev_pixel_m"] = pixel_x_m if is_square else [pixel_x_m, pixel_y_m]
     if kind == "LSSTransform":
-        fields.drop(_ENCODER, "out_channels feat_down_sample", downsample=2)
-        aware = {"depthnet_cfg", "loss_depth_weight"} & fields.section(_ENCODER).keys()
-        if fields.section("model").get("type") == "MapTR" and not aware:
-            kind = "PlainLSSTransform"  # its depth net does not read the cameras' parameters
-        aspp = fields.take(f"{_ENCODER}.depthnet_cfg.aspp_mid_channels", 96)
+        fields.drop(_ENCODER, names="out_channels feat_down_sample", downsample=2)
+        encoder = fields.section(_ENCODER)
+        reads_cameras = "depthnet_cfg" in encoder or "loss_depth_weight" in encoder
+        if fields.section("model").get("type") == "MapTR" and not reads_cameras:
+            kind = "PlainLSSTransform"
+        aspp_channels = fields.take(f"{_ENCODER}.depthnet_cfg.aspp_mid_channels", default=96)
         settings[_BEV + "depth_range"] = tuple(fields.take(f"{_ENCODER}.dbound"))
-        settings[_BEV + "aspp_channels"] = aspp
+        settings[_BEV + "aspp_channels"] = aspp_channels
         return kind
     fields.drop(_ENCODER, num_points_in_pillar=4)
-    settings[_BEV + "num_cams"] = fields.take(f"{_TRANSFORMER}.num_cams", 6)
-    settings |= fields.move(MOVED_OF_PILLARS)
-    _check_kind(fields, _SPATIAL, _SPATIAL_ATTENTIONS)
+    settings[_BEV + "num_cams"] = fields.take(f"{_TRANSFORMER}.num_cams", default=6)
+    settings |= fields.move(PILLAR_NAMES)
+    _check_kind(fields, _SPATIAL, kinds=_SPATIAL_ATTENTIONS)
     kind = fields.take(f"{_SPATIAL}.type")
-    ours, theirs = _BEV + "cross_attn.", _SPATIAL + "."
+    attention = _BEV + "cross_attn."
     if kind == "GeometrySptialCrossAttention":
-        settings[ours + "num_heads"] = fields.take(theirs + "attention.num_heads")
-        settings[ours + "kernel_size"] = tuple(fields.take(theirs + "attention.kernel_size"))
+        kernel_size = fields.take(f"{_SPATIAL}.attention.kernel_size")
+        settings[attention + "num_heads"] = fields.take(f"{_SPATIAL}.attention.num_heads")
+        settings[attention + "kernel_size"] = tuple(kernel_size)
     else:
-        settings[ours + "num_points"] = fields.take(theirs + "deformable_attention.num_points", 8)
+        num_points = fields.take(f"{_SPATIAL}.deformable_attention.num_points", default=8)
+        settings[attention + "num_points"] = num_points
     return kind
 
 
 def _decoder_settings(fields: Fields, settings: dict[str, Any]) -> None:
-    """Add the settings of the decoder's attentions."""
+    """Convert the settings of the decoder's attentions and add them to ``settings``."""
     layer = _DECODER + "layer."
-    decoupled = fields.take(f"{_LAYER}.type") == "DecoupledDetrTransformerDecoderLayer"
-    first, *others, cross = fields.items(f"{_LAYER}.attn_cfgs")
-    _check_kind(fields, first, _SELF_ATTENTIONS)
-    _check_kind(fields, cross, _CROSS_ATTENTIONS)
-    kind, heads = fields.take(first + ".type"), fields.take(first + ".num_heads")
-    settings[layer + "num_heads"] = heads
-    ours = "PointSelfAttention" if kind == "MultiheadAttention" else kind
-    settings[layer + "self_attn.type"] = "DecoupledSelfAttention" if decoupled else ours
-    fields.drop(first, "embed_dims num_ins num_pts")
-    dropout = fields.section(first).get("dropout")
-    for other in others:  # MapTRv2's second attention has the settings of its first
-        fields.drop(other, "type embed_dims", num_heads=heads, dropout=dropout)
-    fields.drop(cross, "type embed_dims num_levels im2col_step")
-    # the deformable attention's own default is not the layer's
-    for part, name, default in (("self_attn", first, 0.0), ("cross_attn", cross, 0.1)):
-        dropout = fields.take(name + ".dropout", default)
-        if dropout != settings[layer + "dropout"]:
-            settings[f"{layer}{part}.dropout"] = dropout
+    layer_kind = fields.take(f"{_LAYER}.type")
+    # MapTRv2 has a second self-attention with the settings of the first
+    self_attention, *other_attentions, cross_attention = fields.items(f"{_LAYER}.attn_cfgs")
+    _check_kind(fields, self_attention, kinds=_SELF_ATTENTIONS)
+    _check_kind(fields, cross_attention, kinds=_CROSS_ATTENTIONS)
+    kind = fields.take(f"{self_attention}.type")
+    num_heads = fields.take(f"{self_attention}.num_heads")
+    settings[layer + "num_heads"] = num_heads
+    if layer_kind == "DecoupledDetrTransformerDecoderLayer":
+        kind = "DecoupledSelfAttention"
+    elif kind == "MultiheadAttention":
+        kind = "PointSelfAttention"
+    settings[layer + "self_attn.type"] = kind
+    fields.drop(self_attention, names="embed_dims num_ins num_pts")
+    dropout = fields.section(self_attention).get("dropout")
+    for attention in other_attentions:
+        fields.drop(attention, names="type embed_dims", num_heads=num_heads, dropout=dropout)
+    fields.drop(cross_attention, names="type embed_dims num_levels im2col_step")
+    # default dropouts of the two attentions in the original code
+    self_dropout = fields.take(f"{self_attention}.dropout", default=0.0)
+    cross_dropout = fields.take(f"{cross_attention}.dropout", default=0.1)
+    if self_dropout != settings[layer + "dropout"]:
+        settings[layer + "self_attn.dropout"] = self_dropout
+    if cross_dropout != settings[layer + "dropout"]:
+        settings[layer + "cross_attn.dropout"] = cross_dropout
 
 
 def _head_settings(fields: Fields, settings: dict[str, Any]) -> None:
-    """Add the settings of queries and losses, and the head that has them."""
-    fields.drop(_THEIRS, num_pts_per_gt_vec=settings[_HEAD + "num_points"])
-    settings[_HEAD + "loss_cls"] |= {"type": f"mmdet.{settings[_HEAD + 'loss_cls']['type']}"}
+    """Convert the settings of queries and losses and add them, with the head, to ``settings``."""
+    fields.drop(_PTS_HEAD, num_pts_per_gt_vec=settings[_HEAD + "num_points"])
+    loss_cls = settings[_HEAD + "loss_cls"]
+    loss_cls["type"] = f"mmdet.{loss_cls['type']}"
 
     def take(name: str, default: Any) -> Any:
-        return fields.take(f"{_THEIRS}.{name}", default)
+        return fields.take(f"{_PTS_HEAD}.{name}", default=default)
 
-    num = take("num_vec_one2one", None) or fields.take(f"{_THEIRS}.num_vec")
-    further = {
+    num_queries = take("num_vec_one2one", default=None) or fields.take(f"{_PTS_HEAD}.num_vec")
+    one2many = {
         "name": "one2many",
-        "num": take("num_vec_one2many", 0),
-        "repeats": take("k_one2many", 6),
-        "weight": take("lambda_one2many", 1.0),
+        "num": take("num_vec_one2many", default=0),
+        "repeats": take("k_one2many", default=6),
+        "weight": take("lambda_one2many", default=1.0),
     }
-    settings[_HEAD + "query_groups"] = [{"num": num}, further] if further["num"] else [{"num": num}]
+    query_groups = [{"num": num_queries}]
+    if one2many["num"]:
+        query_groups.append(one2many)
+    settings[_HEAD + "query_groups"] = query_groups
     _mapvr_settings(fields, settings)
-    if take("use_geo_loss", False):
-        fields.drop(_THEIRS, "intra_loss_weight inter_loss_weight")
-        fields.drop(f"{_THEIRS}.loss_geo", "type num_ins num_pts pc_range", loss_type="l1")
+    if take("use_geo_loss", default=False):
+        fields.drop(_PTS_HEAD, names="intra_loss_weight inter_loss_weight")
+        fields.drop(f"{_PTS_HEAD}.loss_geo", names="type num_ins num_pts pc_range", loss_type="l1")
         settings[_HEAD + "type"] = "GeMapHead"
         settings[_HEAD + "loss_euclidean"] = {
-            "loss_weight": fields.take(f"{_THEIRS}.loss_geo.loss_weight"),
-            "shape_weight": take("loss_geo.intra_loss_weight", 1.0),
-            "relation_weight": take("loss_geo.inter_loss_weight", 1.0),
+            "loss_weight": fields.take(f"{_PTS_HEAD}.loss_geo.loss_weight"),
+            "shape_weight": take("loss_geo.intra_loss_weight", default=1.0),
+            "relation_weight": take("loss_geo.inter_loss_weight", default=1.0),
         }
-    heads: list[dict[str, Any]] = []
-    for flag, kind in (("bev_seg", "BEVMaskHead"), ("pv_seg", "PVMaskHead")):
-        loss = f"loss_{flag.removeprefix('bev_')}"
-        weights = {name: take(f"{loss}.{name}", None) for name in ("loss_weight", "pos_weight")}
-        if take(f"aux_seg.{flag}", False):
-            heads.append({"type": kind, **weights})
-    depth = fields.take(f"{_ENCODER}.loss_depth_weight", None)
-    if depth:
-        heads.append({"type": "DepthSupervision", "loss_weight": depth})
-    if heads:
-        settings[_HEAD + "aux_heads"] = heads
+    aux_heads: list[dict[str, Any]] = []
+    masks = (
+        ("bev_seg", "loss_seg", "BEVMaskHead"),
+        ("pv_seg", "loss_pv_seg", "PVMaskHead"),
+    )
+    for flag, loss, kind in masks:
+        mask_head = {
+            "type": kind,
+            "loss_weight": take(f"{loss}.loss_weight", default=None),
+            "pos_weight": take(f"{loss}.pos_weight", default=None),
+        }
+        if take(f"aux_seg.{flag}", default=False):
+            aux_heads.append(mask_head)
+    depth_weight = fields.take(f"{_ENCODER}.loss_depth_weight", default=None)
+    if depth_weight:
+        aux_heads.append({"type": "DepthSupervision", "loss_weight": depth_weight})
+    if aux_heads:
+        settings[_HEAD + "aux_heads"] = aux_heads
 
 
 def _mapvr_settings(fields: Fields, settings: dict[str, Any]) -> None:
-    """Add the settings of MapVR's rendered masks, where there are any."""
-    if not fields.take(f"{_THEIRS}.loss_rendered_mask.type", None):
+    """Convert the settings of MapVR's rendered masks, if the config has them."""
+    if not fields.take(f"{_PTS_HEAD}.loss_rendered_mask.type", default=None):
         return
-    pts, direction = (settings[f"{_HEAD}losses.{i}.loss_weight"] for i in (0, 1))
-    fields.drop(f"{_COSTS}.rendered_mask_cost", "type")
-    dice = fields.take(f"{_THEIRS}.loss_rendered_mask.weight")
-    settings |= {
-        _HEAD + "type": "MapVRHead",
-        _HEAD + "points_weight": pts,
-        _HEAD + "loss_direction": {"type": "SelfDirectionLoss", "loss_weight": direction},
-        _HEAD + "loss_dice": {"loss_weight": dice},
-        _HEAD + "dice_cost": {"weight": fields.take(f"{_COSTS}.rendered_mask_cost.weight")},
+    points_weight = settings[f"{_HEAD}losses.0.loss_weight"]
+    direction_weight = settings[f"{_HEAD}losses.1.loss_weight"]
+    fields.drop(f"{_COSTS}.rendered_mask_cost", names="type")
+    dice_weight = fields.take(f"{_PTS_HEAD}.loss_rendered_mask.weight")
+    dice_cost_weight = fields.take(f"{_COSTS}.rendered_mask_cost.weight")
+    settings[_HEAD + "type"] = "MapVRHead"
+    settings[_HEAD + "points_weight"] = points_weight
+    settings[_HEAD + "loss_direction"] = {
+        "type": "SelfDirectionLoss",
+        "loss_weight": direction_weight,
     }
-    pts_cost = settings[_HEAD + "match_costs.1.weight"]
-    if pts != pts_cost:  # one weight of ours is for both
-        fields.section(f"{_COSTS}.pts_cost")["weight"] = pts_cost
+    settings[_HEAD + "loss_dice"] = {"loss_weight": dice_weight}
+    settings[_HEAD + "dice_cost"] = {"weight": dice_cost_weight}
+    cost_weight = settings[_HEAD + "match_costs.1.weight"]
+    if points_weight != cost_weight:
+        # GSMap has one weight for loss and cost: the other one is reported as without counterpart
+        fields.section(f"{_COSTS}.pts_cost")["weight"] = cost_weight
 
 
-def _margin(fields: Fields, settings: dict[str, Any], sides: tuple[float, ...]) -> None:
-    """Add how far beyond the map a detection may lie, if it is the same on all sides."""
-    limits = fields.section(f"{_THEIRS}.bbox_coder").get("post_center_range", ())
-    x0, x1, y0, y1 = sides
+def _margin_settings(fields: Fields, settings: dict[str, Any], sides: tuple[float, ...]) -> None:
+    """Convert the range of the predictions to a margin around the map.
+
+    The range remains in ``fields`` if the margins of the four sides differ.
+
+    Args:
+        fields: Settings of the original config.
+        settings: Converted settings, to which the margin is added.
+        sides: Smallest and largest x, then y, of the map in metres.
+    """
+    # smallest x, y, x, y, then largest x, y, x, y of a prediction
+    limits = fields.section(f"{_PTS_HEAD}.bbox_coder").get("post_center_range", ())
     if len(limits) != 8:
         return
-    margins = {x0 - limits[0], y0 - limits[1], limits[4] - x1, limits[5] - y1}
+    x_min, x_max, y_min, y_max = sides
+    margins = {x_min - limits[0], y_min - limits[1], limits[4] - x_max, limits[5] - y_max}
     if len(margins) == 1 and limits[:2] == limits[2:4] and limits[4:6] == limits[6:]:
-        fields.drop(f"{_THEIRS}.bbox_coder", "post_center_range")
+        fields.drop(f"{_PTS_HEAD}.bbox_coder", names="post_center_range")
         settings[_HEAD + "coder.margin_m"] = float(margins.pop())
