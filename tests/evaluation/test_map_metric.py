@@ -57,7 +57,7 @@ def test_figures_through_the_runner_do_not_count_padding():
 def test_a_full_disk_does_not_take_the_figures(monkeypatch):
     shown = []
 
-    def full(*_: object) -> None:
+    def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(map_metric, "write_results", full)

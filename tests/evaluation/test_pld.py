@@ -10,7 +10,7 @@ from test_files import annotated, command, results_of
 
 from gsmap.evaluation.core.evaluator import MapEvaluator
 from gsmap.evaluation.core.results_json import write_results
-from gsmap.evaluation.metrics.pld import PLD, sospa, spaced
+from gsmap.evaluation.metrics.pld import PLD, sample_line, sospa
 from gsmap.structures.elements import MapElements
 
 CONFIG = PLD(CLASSES, (1.0,))
@@ -23,7 +23,7 @@ def aside(metres: float) -> np.ndarray:
 
 
 def of_lines(first: np.ndarray, second: np.ndarray, cutoff_m: float = 1.0) -> tuple:
-    return tuple(sospa(spaced(first), spaced(second), (cutoff_m,))[0])
+    return tuple(sospa(sample_line(first), sample_line(second), (cutoff_m,))[0])
 
 
 def elements(lines: list, labels: list | None = None, scores: list | None = None) -> MapElements:
@@ -43,15 +43,17 @@ def figures(found: list, scores: list, wanted: list, config: PLD = CONFIG) -> di
 
 def test_points_stand_every_half_metre_and_at_the_end():
     line = np.array([[0.0, 0.0], [0.0, 0.7], [0.5, 0.7]])
-    np.testing.assert_allclose(spaced(line), [[0, 0], [0, 0.5], [0.3, 0.7], [0.5, 0.7]])
-    np.testing.assert_array_equal(spaced(LINE), np.stack([np.zeros(7), np.arange(7) / 2], -1))
-    np.testing.assert_array_equal(spaced(LINE[[0, 0]]), [[0, 0], [0, 0]])  # a line of no length
-    assert spaced(LINE[:1]).shape == (0, 2)
+    np.testing.assert_allclose(sample_line(line), [[0, 0], [0, 0.5], [0.3, 0.7], [0.5, 0.7]])
+    np.testing.assert_array_equal(sample_line(LINE), np.stack([np.zeros(7), np.arange(7) / 2], -1))
+    np.testing.assert_array_equal(
+        sample_line(LINE[[0, 0]]), [[0, 0], [0, 0]]
+    )  # a line of no length
+    assert sample_line(LINE[:1]).shape == (0, 2)
 
 
 def test_lines_of_kilometres_have_two_thousand_steps():
     for length_m, count in ((1000.0, 2001), (1001.0, 2001), (100_000.0, 2001), (999.5, 2000)):
-        points = spaced(np.array([[0.0, 0.0], [length_m, 0.0]]))
+        points = sample_line(np.array([[0.0, 0.0], [length_m, 0.0]]))
         assert len(points) in (count, count + 1)  # the end may be there by a rounding
         np.testing.assert_array_equal(points[-1], [length_m, 0])
 

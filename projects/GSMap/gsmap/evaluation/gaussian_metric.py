@@ -1,4 +1,4 @@
-"""How predicted Gaussians live: overlap of their masks with the map, their sizes."""
+"""Health of predicted Gaussians: overlap of their masks with the map, and their sizes."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -22,15 +22,15 @@ Array = npt.NDArray[Any]
 
 SCORE_THRESHOLD = 0.3
 PIXEL_M = 0.3
-LINE_WIDTH_M = 0.75  # in the mask of a ground truth
+LINE_WIDTH_M = 0.75  # of lines in the mask of a ground truth
 
 
 @METRICS.register_module()
 class GaussianMetric(BaseMetric):
     """Soft IoU of the masks of predictions and ground truths, and the sizes of the Gaussians.
 
-    Predictions of a class are assigned to its ground truths by the soft IoU of their masks. Figures
-    are of predictions with a score of 0.3 or more; models without Gaussians have none.
+    Predictions of a class are assigned to its ground truths by the soft IoU of their masks.
+    Predictions with a score of 0.3 or more count. A model without Gaussians has no figures.
     """
 
     default_prefix = "gaussians"
@@ -38,62 +38,95 @@ class GaussianMetric(BaseMetric):
     def process(self, data_batch: Any, data_samples: Sequence[dict[str, Any]]) -> None:
         """Measure the samples of a batch.
 
-        They have ``token``, ``x_range`` and ``y_range`` in metres, ``eval_ann_info`` and
-        ``pred_instances_3d`` (docs/architecture.md), the latter with ``min_scale_m``.
+        Args:
+            data_batch: Not used.
+            data_samples: Samples with ``token``, ``x_range`` and ``y_range`` in metres,
+                ``eval_ann_info`` and ``pred_instances_3d`` (docs/architecture.md), the latter with
+                ``min_scale_m``.
         """
         for sample in data_samples:
-            measured = sample.get("eval_ann_info") and "scales" in sample["pred_instances_3d"]
-            self.results.append((sample["token"], self._measure(sample) if measured else None))
+            has_gaussians = "scales" in sample["pred_instances_3d"]
+            measurement = None
+            if sample.get("eval_ann_info") and has_gaussians:
+                measurement = self._measure(sample)
+            self.results.append((sample["token"], measurement))
 
     def _measure(self, sample: dict[str, Any]) -> tuple[Array, dict[int, tuple[Array, Array]]]:
-        """Return which Gaussians are at their floor; per class soft IoUs, sizes (n, 2)."""
-        predicted, truth = sample["pred_instances_3d"], sample["eval_ann_info"]
-        grid = BEVGrid(sample["x_range"], sample["y_range"]).rasterized(PIXEL_M)
-        chosen = predicted["scores_3d"] >= SCORE_THRESHOLD
-        labels = predicted["labels_3d"][chosen].cpu()
-        means, scales, rotations = (
-            predicted[name][chosen].float().cpu() for name in ("pts", "scales", "rotations")
-        )
-        means = means[..., :2]
-        masks = render_gaussians(means, scales, rotations, grid)
+        """Measure the Gaussians of one sample.
+
+        Returns:
+            Whether each Gaussian is at the lower bound of sizes (n,); and by label the soft IoUs of
+            matched pairs and the sizes in metres, along and across the line (n, 2).
+        """
+        predictions = sample["pred_instances_3d"]
+        truth = sample["eval_ann_info"]
+        extent = BEVGrid(x_range=sample["x_range"], y_range=sample["y_range"])
+        grid = extent.rasterized(PIXEL_M)
+        is_confident = predictions["scores_3d"] >= SCORE_THRESHOLD
+        labels = predictions["labels_3d"][is_confident].cpu()
+        means = predictions["pts"][is_confident].float().cpu()[..., :2]
+        scales = predictions["scales"][is_confident].float().cpu()
+        rotations = predictions["rotations"][is_confident].float().cpu()
+        masks = render_gaussians(means, scales=scales, rotations=rotations, grid=grid)
         extents = extents_along_line(Gaussians(means, scales, rotations))
         figures = {}
         for label in set(truth["labels"].tolist()) | set(labels.tolist()):
-            own = labels == label
-            lines = [truth["polylines"][i] for i in np.flatnonzero(truth["labels"] == label)]
-            iou = self._matched_iou(masks[own], lines, grid)
-            figures[label] = iou, extents[own].flatten(0, 1).numpy()
-        at_floor = (scales < AT_FLOOR * predicted["min_scale_m"]).all(-1)
+            is_class = labels == label
+            gts = np.flatnonzero(truth["labels"] == label)
+            lines = [truth["polylines"][k] for k in gts]
+            iou = self._matched_iou(masks[is_class], lines=lines, grid=grid)
+            sizes = extents[is_class].flatten(start_dim=0, end_dim=1).numpy()
+            figures[label] = (iou, sizes)
+        at_floor = (scales < AT_FLOOR * predictions["min_scale_m"]).all(dim=-1)
         return at_floor.flatten().numpy(), figures
 
     def _matched_iou(self, masks: Tensor, lines: Sequence[Array], grid: BEVGrid) -> Array:
-        """Return the soft IoU of every matched pair of one class. (n,)"""
+        """Compute the soft IoU of every matched pair of one class. (n,)
+
+        Args:
+            masks: Masks of the predictions. (N, H, W)
+            lines: Vertices of each ground truth in metres. K x (P, D)
+            grid: Extent and raster of the masks.
+        """
         if not len(masks) or not lines:
             return np.empty(0)
-        vertices = (torch.from_numpy(line[None, :, :2].astype(np.float32)) for line in lines)
-        truth = torch.cat([draw_polylines(line, grid, LINE_WIDTH_M) for line in vertices])
-        iou = pairwise_soft_iou(masks, truth).numpy()
+        gt_masks = []
+        for line in lines:
+            vertices = torch.from_numpy(line[None, :, :2].astype(np.float32))
+            gt_masks.append(draw_polylines(vertices, grid, width_m=LINE_WIDTH_M))
+        iou = pairwise_soft_iou(masks, torch.cat(gt_masks)).numpy()
         return iou[linear_sum_assignment(-iou)]
 
     def compute_metrics(self, results: list[tuple[str, Any]]) -> dict[str, float]:
-        """Average over all samples and print a table.
+        """Average over all samples and log a table.
 
-        Returns per class ``soft_iou/<name>``, ``sigma_along/<name>`` and ``sigma_across/<name>``
-        (medians in metres), and ``at_floor``, a share; nothing without Gaussians.
+        Args:
+            results: Token and measurement of each sample.
+
+        Returns:
+            ``soft_iou/<name>``, ``sigma_along/<name>`` and ``sigma_across/<name>`` (medians in
+            metres) of each class, and ``at_floor``, the share of Gaussians at the lower bound of
+            sizes; empty without Gaussians.
         """
-        samples = [measured for _, measured in sorted(dict(results).items()) if measured]
+        samples = [sample for _, sample in sorted(dict(results).items()) if sample]
         if not samples:
             return {}
-        floor = np.concatenate([at_floor for at_floor, _ in samples])
-        metrics = {"at_floor": float(floor.mean()) if len(floor) else 0.0}
+        at_floor = np.concatenate([floor for floor, _ in samples])
+        metrics = {"at_floor": float(at_floor.mean()) if len(at_floor) else 0.0}
         rows = [
             f"Gaussians of predictions with a score of {SCORE_THRESHOLD} or more, "
             f"{100 * metrics['at_floor']:.1f} % of them at their smallest size:"
         ]
         for label, name in enumerate(self.dataset_meta["classes"]):
-            of_class = [figures[label] for _, figures in samples if label in figures]
-            iou = np.concatenate([np.empty(0), *(iou for iou, _ in of_class)])
-            size = np.concatenate([np.empty((0, 2)), *(size for _, size in of_class)])
+            ious = [np.empty(0)]
+            sizes = [np.empty((0, 2))]
+            for _, figures in samples:
+                if label in figures:
+                    sample_iou, sample_sizes = figures[label]
+                    ious.append(sample_iou)
+                    sizes.append(sample_sizes)
+            iou = np.concatenate(ious)
+            size = np.concatenate(sizes)
             overlap = "none matched"
             if len(iou):
                 metrics[f"soft_iou/{name}"] = float(iou.mean())
@@ -101,10 +134,11 @@ class GaussianMetric(BaseMetric):
             if not len(size):
                 rows.append(f"  {name}: no confident prediction")
                 continue
-            along, across = np.median(size, 0).tolist()
-            metrics[f"sigma_along/{name}"], metrics[f"sigma_across/{name}"] = along, across
+            along, across = np.median(size, axis=0).tolist()
+            metrics[f"sigma_along/{name}"] = along
+            metrics[f"sigma_across/{name}"] = across
             rows.append(
                 f"  {name}: {overlap}, sigma {along:.2f} m along, {across:.2f} m across (medians)"
             )
-        print_log("\n".join(rows), "current")
+        print_log("\n".join(rows), logger="current")
         return metrics

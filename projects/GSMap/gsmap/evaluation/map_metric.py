@@ -1,8 +1,10 @@
-"""The metric class that the MMEngine runner calls: a thin shell around the evaluator."""
+"""Metric of the MMEngine runner, a thin wrapper around `MapEvaluator`."""
 
+import logging
 import sys
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from itertools import chain
 from typing import Any
 
 from mmdet3d.registry import METRICS
@@ -26,23 +28,23 @@ from gsmap.utils.split_lists import SPLIT_LIST, TRAINED_ON
 class MapMetric(BaseMetric):
     """AP_chamfer and AP_raster of predicted map elements.
 
-    Samples are matched as they come; what is kept and collected from the ranks are matches, never
-    masks. Figures do not depend on the number of ranks, the order of the samples or the padding of
-    the last batch. Classes, range and coordinates per point are those of the data set's metainfo
-    (``classes``, ``x_range``, ``y_range``, ``dim``).
+    Samples are matched as soon as they are predicted; only the matches are stored and collected
+    from the ranks. Figures do not depend on the number of ranks, the order of the samples or the
+    padding of the last batch. The metainfo of the data set defines the classes, the range of the
+    map and the number of coordinates (``classes``, ``x_range``, ``y_range``, ``dim``).
 
     Args:
-        eval: Names of the metrics to compute, as of ``tools/evaluate.py --eval``; may be empty if
-            only ``out_file`` is wanted.
-        thresholds: Thresholds of AP_chamfer in metres.
-        out_file: Where to write the predictions in MapTR's JSON form, or None.
+        eval: Names of the metrics to compute, as for ``tools/evaluate.py --eval``; may be empty if
+            ``out_file`` is given.
+        thresholds: Largest Chamfer distances of a match, in metres.
+        out_file: Path at which predictions are written in MapTR's JSON form, or None.
         **kwargs: ``collect_device``, ``collect_dir`` and ``prefix`` of ``BaseMetric``.
 
     Raises:
-        ValueError: If a metric is unknown or there is nothing to do.
+        ValueError: If a metric is unknown, or neither a metric nor ``out_file`` is given.
     """
 
-    default_prefix = ""  # the keys carry the name of the metric already
+    default_prefix = ""  # the keys already contain the name of the metric
 
     def __init__(
         self,
@@ -61,32 +63,36 @@ class MapMetric(BaseMetric):
         self.out_file = out_file
 
     def _meta(self, key: str) -> Any:
-        """Return an entry of the data set's metainfo."""
+        """Return an entry of the metainfo of the data set."""
         if key not in (self.dataset_meta or {}):
             raise InputError(f"MapMetric needs a data set whose metainfo has {key}.")
         return self.dataset_meta[key]
 
     @cached_property
     def evaluator(self) -> MapEvaluator | None:
-        """Metrics and their rules; None if there is only a file to write."""
+        """Evaluator of the metrics; None if only a file is written."""
         if not self.eval:
             return None
         classes = tuple(self._meta("classes"))
         meta = self.dataset_meta
-        known = "x_range" in meta and "y_range" in meta
+        grid = None
+        if "x_range" in meta and "y_range" in meta:
+            grid = BEVGrid(x_range=meta["x_range"], y_range=meta["y_range"])
         settings = MetricSettings(
-            classes,
-            self.thresholds,
-            dim=meta.get("dim", 2),
-            grid=BEVGrid(meta["x_range"], meta["y_range"]) if known else None,
+            classes=classes, thresholds=self.thresholds, dim=meta.get("dim", 2), grid=grid
         )
         return MapEvaluator.named(self.eval, settings)
 
     def process(self, data_batch: Any, data_samples: Sequence[Mapping[str, Any]]) -> None:
-        """Match one batch and keep its matches.
+        """Match the samples of one batch.
 
-        Samples have ``token``, ``pred_instances_3d`` and, if a metric is asked for,
-        ``eval_ann_info``, as ``datasets/elements.py`` reads them.
+        Args:
+            data_batch: Not used.
+            data_samples: Samples with ``token``, ``pred_instances_3d`` and, unless ``eval`` is
+                empty, ``eval_ann_info``, in the form of ``datasets/elements.py``.
+
+        Raises:
+            ValueError: If predictions are malformed or ground truth is missing.
         """
         for sample in data_samples:
             token = str(sample["token"])
@@ -103,27 +109,37 @@ class MapMetric(BaseMetric):
                         "Use an annotation file with instances, or eval=[] with an out_file."
                     )
                 truth = elements_of_truth(info)
-                record["matches"] = self.evaluator.match(token, predictions, truth)
+                record["matches"] = self.evaluator.match(token, predictions, ground_truth=truth)
             if self.out_file is not None:
                 record["vectors"] = vectors_of(predictions, self._meta("classes"))
             self.results.append(record)
 
     def evaluate(self, size: int) -> dict[str, float]:
-        """Collect the records of all ranks and compute the metrics of ``size`` samples."""
+        """Collect the records of all ranks and compute the metrics of a data set of ``size``."""
         self._size = size
         # MMEngine joins ranks up to the shortest: ranks with whole drives have different lengths
         parts: list[list[dict[str, Any]]] = all_gather_object(self.results)  # type: ignore[has-type]
-        self.results = [record for part in parts for record in part]
-        # MMEngine would cut the list off at `size` by position; repeated samples go by their token
+        self.results = list(chain.from_iterable(parts))
+        # MMEngine would cut the list at `size`; here tokens identify the repeated samples
         return super().evaluate(sys.maxsize)
 
     def compute_metrics(self, results: list[dict[str, Any]]) -> dict[str, float]:
-        """Compute the figures, print the tables and write the file; on the first rank only."""
+        """Compute the figures, log the tables and write the file, on the first rank.
+
+        Args:
+            results: Records of all samples of all ranks; samples may be repeated.
+
+        Returns:
+            Figures by their flat keys.
+        """
         unique = {record["token"]: record for record in reversed(results)}
         records = [unique[token] for token in sorted(unique)]
         if len(records) != self._size:
-            text = f"MapMetric: {len(records)} different samples were scored, the data set has "
-            print_log(f"{text}{self._size}.", "current", level=30)
+            text = (
+                f"MapMetric: {len(records)} different samples were scored, the data set has "
+                f"{self._size}."
+            )
+            print_log(text, logger="current", level=logging.WARNING)
         reports = []
         if self.evaluator is not None:
             reports = self.evaluator.reports(record["matches"] for record in records)
@@ -131,8 +147,11 @@ class MapMetric(BaseMetric):
             MMLogger.get_current_instance().info("\n%s", format_table(report))
         if self.out_file is not None:  # after the figures: a disk may be full
             samples = ((record["token"], record["vectors"]) for record in records)
-            keys = SPLIT_LIST, TRAINED_ON, CHECKPOINT, CALIBRATION
-            about = {key: said for key in keys if (said := self.dataset_meta.get(key))}
-            write_results(self.out_file, samples, {"classes": list(self._meta("classes")), **about})
-            print_log(f"Results of {len(records)} samples written to {self.out_file}", "current")
+            meta = {"classes": list(self._meta("classes"))}
+            for key in (SPLIT_LIST, TRAINED_ON, CHECKPOINT, CALIBRATION):
+                if self.dataset_meta.get(key):
+                    meta[key] = self.dataset_meta[key]
+            write_results(self.out_file, samples=samples, meta=meta)
+            text = f"Results of {len(records)} samples written to {self.out_file}"
+            print_log(text, logger="current")
         return flat_metrics(reports)

@@ -1,4 +1,4 @@
-"""How far off the heights of predictions are that match in the plane."""
+"""Errors of the heights of predictions that match in the plane."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -16,6 +16,7 @@ from gsmap.evaluation.core.metric import (
     register_metric,
 )
 from gsmap.evaluation.core.report import UNDEFINED, MetricReport
+from gsmap.structures.elements import FloatArray, MapElements
 from gsmap.structures.polylines import resample_all
 
 
@@ -24,12 +25,12 @@ from gsmap.structures.polylines import resample_all
 class Heights(Metric):
     """Errors of the heights of predictions that match in the plane, at the loosest threshold.
 
-    Each of the points of a prediction is compared with the nearest of its ground truth's.
+    Each point of a prediction is compared with the nearest point of its ground truth in the plane.
 
     Args:
         classes: Names of the classes; a label is an index into them.
-        thresholds: Of AP_chamfer, in metres.
-        num_points: Points that each line is resampled to.
+        thresholds: Largest Chamfer distances of a match, in metres.
+        num_points: Number of points that each line is resampled to.
     """
 
     name: ClassVar[str] = "heights"
@@ -43,12 +44,13 @@ class Heights(Metric):
 
     @classmethod
     def of(cls, settings: MetricSettings) -> "Heights":
-        """Return the metric by the settings of a command or config."""
-        return cls(settings.classes, settings.thresholds or CHAMFER_THRESHOLDS)
+        """Create the metric from the settings of a command or config."""
+        thresholds = settings.thresholds or CHAMFER_THRESHOLDS
+        return cls(classes=settings.classes, thresholds=thresholds)
 
     @property
     def counts_heights(self) -> bool:
-        """True: both sides need heights."""
+        """Always True: both sides need heights."""
         return True
 
     def match(self, sample: Sample) -> SampleValues:
@@ -58,39 +60,53 @@ class Heights(Metric):
             ValueError: If a side has no heights.
         """
         token, predictions, truth = sample
-        flat = ChamferConfig(self.classes, self.thresholds, self.num_points)
-        matches = match_chamfer(predictions, truth, flat, token)
-        pred, gt = (
-            resample_all(side.with_coordinates(3).points, side.offsets, self.num_points)
-            for side in (predictions, truth)
+        rules = ChamferConfig(
+            classes=self.classes, thresholds=self.thresholds, num_points=self.num_points
         )
-        matched = matches.matched_gt[:, -1]
-        rows = np.flatnonzero(matched >= 0)
-        apart = np.empty((len(rows), 2, self.num_points))
-        for place, row in enumerate(rows.tolist()):
-            line, other = pred[matches.pred_index[row]], gt[matched[row]]
-            distance = np.linalg.norm(line[:, None, :2] - other[None, :, :2], axis=-1)  # (P, P)
+        matches = match_chamfer(predictions, truth, config=rules, token=token)
+        pred_lines = self._resample(predictions)
+        gt_lines = self._resample(truth)
+        matched_gt = matches.matched_gt[:, -1]
+        rows = np.flatnonzero(matched_gt >= 0)
+        errors = np.empty((len(rows), 2, self.num_points))  # height, distance in the plane
+        for index, row in enumerate(rows.tolist()):
+            pred = pred_lines[matches.pred_index[row]]
+            gt = gt_lines[matched_gt[row]]
+            distance = np.linalg.norm(pred[:, None, :2] - gt[None, :, :2], axis=-1)  # (P, P)
             nearest = distance.argmin(axis=1)
-            apart[place] = line[:, 2] - other[nearest, 2], distance.min(axis=1)
-        return SampleValues(token, {"labels": matches.labels[rows], "apart": apart})
+            errors[index, 0] = pred[:, 2] - gt[nearest, 2]
+            errors[index, 1] = distance.min(axis=1)
+        return SampleValues(token, {"labels": matches.labels[rows], "apart": errors})
+
+    def _resample(self, elements: MapElements) -> FloatArray:
+        """Resample the lines of one side in space. (N, P, 3)"""
+        points = elements.with_coordinates(3).points
+        return resample_all(points, elements.offsets, num_points=self.num_points)
 
     def reports(self, table: ValueTable) -> list[MetricReport]:
         """Compute the means over the matches of all samples.
 
-        Figures are, by ``CLASS/NAME``: ``height_error_m``, the mean absolute difference,
-        ``height_bias_m``, its mean with sign (predictions too high: > 0), ``plane_error_m``, the
-        mean distance in the plane, and ``num_matches``; -1 without matches.
+        The keys of figures are ``CLASS/NAME``. ``height_error_m`` is the mean absolute difference
+        of heights, ``height_bias_m`` the mean difference (> 0 if predictions are too high),
+        ``plane_error_m`` the mean distance in the plane, each -1 without matches. ``num_matches``
+        is the number of matches.
+
+        Args:
+            table: Values of all samples.
         """
         labels = np.concatenate(table.column("labels"))
-        apart = np.concatenate(table.column("apart"))
+        errors = np.concatenate(table.column("apart"))  # (matches, 2, P)
         figures: dict[str, float] = {}
         for label, name in enumerate(self.classes):
-            heights, plane = apart[labels == label].transpose(1, 0, 2).reshape(2, -1)
-            for key, values in (
-                ("height_error_m", abs(heights)),
-                ("height_bias_m", heights),
-                ("plane_error_m", plane),
-            ):
-                figures[f"{name}/{key}"] = float(values.mean()) if len(values) else UNDEFINED
-            figures[f"{name}/num_matches"] = float((labels == label).sum())
-        return [MetricReport.of_figures(self.name, figures, table.tokens)]
+            is_class = labels == label
+            heights, distances = errors[is_class].transpose(1, 0, 2).reshape(2, -1)
+            figures[f"{name}/height_error_m"] = _mean(abs(heights))
+            figures[f"{name}/height_bias_m"] = _mean(heights)
+            figures[f"{name}/plane_error_m"] = _mean(distances)
+            figures[f"{name}/num_matches"] = float(is_class.sum())
+        return [MetricReport.of_figures(self.name, figures=figures, tokens=table.tokens)]
+
+
+def _mean(values: FloatArray) -> float:
+    """Compute the mean of values (n,); -1 without values."""
+    return float(values.mean()) if len(values) else UNDEFINED

@@ -1,7 +1,7 @@
-"""SOSPA and PLD: how far apart two lines are when order counts, and two maps with their scores.
+"""SOSPA, a distance of lines that respects the order of points, and PLD, a distance of maps.
 
-Lehocine et al., "Beyond Chamfer Distance", arXiv 2605.22578; the figures are those of its evaluator
-(zenseact/SOSPA). Both are in [0, 1], and smaller is better.
+Lehocine et al., "Beyond Chamfer Distance", arXiv 2605.22578. Figures are equal to the evaluator of
+the paper (zenseact/SOSPA). Both distances are in [0, 1], and smaller is better.
 """
 
 from collections.abc import Sequence
@@ -28,124 +28,176 @@ from gsmap.structures.elements import FloatArray
 from gsmap.structures.polylines import arc_lengths
 from gsmap.utils.errors import InputError
 
-_STEP_M = 0.5  # between the points that are compared
-_MOST_STEPS = 2000  # of a line; the work grows with the square
+_STEP_M = 0.5  # distance of neighbouring points
+_MOST_STEPS = 2000  # of a line; the time grows with the square
 _CLOSED_M = 0.1  # largest gap between the ends of a ring
 _PARTS = ("PLD", "localisation", "cardinality")
 
 
-def spaced(line: FloatArray) -> FloatArray:
-    """Return the points of a line at every half metre, and its end; none of a single point.
+def sample_line(line: FloatArray) -> FloatArray:
+    """Sample a line at every half metre and at its end.
 
-    A line of more than a kilometre has 2,001 points.
+    The step of a line of more than a kilometre is longer, so that the line has 2,001 points.
 
     Args:
         line: Vertices in metres. (n, D)
+
+    Returns:
+        Points in metres; none for a single vertex. (m, D)
     """
     if len(line) < 2:
         return line[:0]
     along = arc_lengths(line)
-    step_m = max(_STEP_M, along[-1] / _MOST_STEPS)
-    at = np.append(np.arange(0.0, max(along[-1], np.finfo(float).tiny), step_m), along[-1])
-    return np.stack([np.interp(at, along, column) for column in line.T], axis=-1)
+    length_m = along[-1]
+    step_m = max(_STEP_M, length_m / _MOST_STEPS)
+    stop = max(length_m, np.finfo(float).tiny)
+    positions = np.append(np.arange(0.0, stop, step=step_m), length_m)
+    return np.stack([np.interp(positions, along, column) for column in line.T], axis=-1)
 
 
 @njit(cache=True)
-def _aligned(distances: FloatArray, gap: float) -> tuple[float, float]:
-    """Return the least cost of pairing points in order, and the distances in it. (m, n)"""
-    cost, apart = gap * np.arange(distances.shape[1] + 1), np.zeros(distances.shape[1] + 1)
+def _align_points(distances: FloatArray, gap_cost: float) -> tuple[float, float]:
+    """Pair the points of two lines in order at the smallest cost, by dynamic programming.
+
+    Args:
+        distances: Distance of every pair of points in metres. (m, n)
+        gap_cost: Cost of a point without partner, in metres.
+
+    Returns:
+        Total cost, and the part of it that the distances of the pairs have.
+    """
+    num_columns = distances.shape[1] + 1
+    cost = gap_cost * np.arange(num_columns)
+    paired = np.zeros(num_columns)
     for row in distances:
-        before, before_apart = cost[0], apart[0]
-        cost[0] += gap
+        diagonal_cost = cost[0]
+        diagonal_paired = paired[0]
+        cost[0] += gap_cost
         for j in range(len(row)):
-            least, least_apart = before + row[j], before_apart + row[j]
-            if cost[j + 1] + gap < least:
-                least, least_apart = cost[j + 1] + gap, apart[j + 1]
-            if cost[j] + gap < least:
-                least, least_apart = cost[j] + gap, apart[j]
-            before, before_apart = cost[j + 1], apart[j + 1]
-            cost[j + 1], apart[j + 1] = least, least_apart
-    return cost[-1], apart[-1]
+            best_cost = diagonal_cost + row[j]
+            best_paired = diagonal_paired + row[j]
+            if cost[j + 1] + gap_cost < best_cost:
+                best_cost = cost[j + 1] + gap_cost
+                best_paired = paired[j + 1]
+            if cost[j] + gap_cost < best_cost:
+                best_cost = cost[j] + gap_cost
+                best_paired = paired[j]
+            diagonal_cost = cost[j + 1]
+            diagonal_paired = paired[j + 1]
+            cost[j + 1] = best_cost
+            paired[j + 1] = best_paired
+    return cost[-1], paired[-1]
 
 
 @njit(cache=True)
-def _best_order(distances: FloatArray, gap: float, turns: int) -> tuple[float, float]:
-    """Return `_aligned` of the best start and direction of the first line. (m, n)"""
-    best, best_apart = np.inf, 0.0
-    for turn in range(turns):
-        turned = np.concatenate((distances[turn:], distances[:turn]))
-        for way in (1, -1):
-            cost, apart = _aligned(turned[::way], gap)
-            if cost < best:
-                best, best_apart = cost, apart
-    return best, best_apart
+def _align_lines(distances: FloatArray, gap_cost: float, num_starts: int) -> tuple[float, float]:
+    """Return `_align_points` for the best start and direction of the first line.
+
+    Args:
+        distances: Distance of every pair of points in metres. (m, n)
+        gap_cost: Cost of a point without partner, in metres.
+        num_starts: Number of points at which the first line may start.
+    """
+    best_cost = np.inf
+    best_paired = 0.0
+    for start in range(num_starts):
+        rolled = np.concatenate((distances[start:], distances[:start]))
+        for direction in (1, -1):
+            cost, paired = _align_points(rolled[::direction], gap_cost=gap_cost)
+            if cost < best_cost:
+                best_cost = cost
+                best_paired = paired
+    return best_cost, best_paired
 
 
 def sospa(first: FloatArray, second: FloatArray, cutoffs_m: Sequence[float]) -> FloatArray:
-    """Return the SOSPA distance of two lines, and the part of it that paired points have.
+    """Compute the SOSPA distance of two lines, and its localisation part.
 
-    Points are paired in order. A pair costs its distance, a point without partner c / 2, and C is
-    the least sum over both directions, and over all starts of the first line if one of both is
+    Points are paired in order. A pair costs its distance, a point without partner c / 2. C is the
+    smallest sum over both directions, and over all starts of the first line if one of the lines is
     closed (ends within 0.1 m). With G = c / 2 (m + n), the sum without any pair, the distance is
-    2 C / (G + C): 0 of equal lines, 1 of lines that have no points within c.
+    2 C / (G + C): 0 for equal lines, 1 for lines without points within c.
 
     Args:
-        first: Points at equal distances (`spaced`) in metres. (m, D)
-        second: Likewise. (n, D)
+        first: Points at equal distances (`sample_line`), in metres. (m, D)
+        second: Points at equal distances (`sample_line`), in metres. (n, D)
         cutoffs_m: Cut-offs c in metres, > 0. (T,)
 
     Returns:
-        Distance and part of the paired points at each cut-off. (T, 2)
+        Distance at each cut-off, and the part of it that the distances of the pairs have. (T, 2)
     """
-    rings = [
-        len(p) > 2 and bool(np.linalg.norm(p[-1] - p[0]) <= _CLOSED_M) for p in (first, second)
-    ]
-    first, second = (p[:-1] if ring else p for p, ring in zip((first, second), rings, strict=True))
-    found = np.tile([1.0, 0.0], (len(cutoffs_m), 1))
+    first_is_closed = _is_closed(first)
+    second_is_closed = _is_closed(second)
+    if first_is_closed:
+        first = first[:-1]
+    if second_is_closed:
+        second = second[:-1]
+    figures = np.tile([1.0, 0.0], reps=(len(cutoffs_m), 1))
     if not (len(first) and len(second)):
-        return found
+        return figures
     distances = cdist(first, second)
+    num_starts = len(first) if first_is_closed or second_is_closed else 1
     for row, cutoff in enumerate(cutoffs_m):
         if distances.min() < cutoff:
-            turns = len(first) if any(rings) else 1
-            sums = np.array(_best_order(distances, cutoff / 2, turns))
-            found[row] = 2 * sums / (cutoff / 2 * sum(distances.shape) + sums[0])
-    return found
+            gap_cost = cutoff / 2
+            sums = np.array(_align_lines(distances, gap_cost=gap_cost, num_starts=num_starts))
+            figures[row] = 2 * sums / (gap_cost * sum(distances.shape) + sums[0])
+    return figures
 
 
-def _paired(
-    found: Sequence[FloatArray],
+def _is_closed(points: FloatArray) -> bool:
+    """Whether the ends of a line are within 0.1 m."""
+    return len(points) > 2 and bool(np.linalg.norm(points[-1] - points[0]) <= _CLOSED_M)
+
+
+def _pair_sums(
+    preds: Sequence[FloatArray],
     scores: FloatArray,
-    wanted: Sequence[FloatArray],
+    gts: Sequence[FloatArray],
     cutoffs_m: Sequence[float],
 ) -> FloatArray:
-    """Return the sums of r (1 - s) and of r times the localisation over the best pairs. (T, 2)"""
-    apart = np.array([[sospa(a, b, cutoffs_m) for b in wanted] for a in found])
-    apart = apart.reshape(len(found), len(wanted), len(cutoffs_m), 2)
+    """Sum r (1 - s), and r times the localisation part, over the best pairs of one class.
+
+    Args:
+        preds: Points of each prediction. n x (m, 2)
+        scores: Score r of each prediction. (n,)
+        gts: Points of each ground truth. k x (m, 2)
+        cutoffs_m: Cut-offs of SOSPA in metres. (T,)
+
+    Returns:
+        Both sums at each cut-off. (T, 2)
+    """
+    distances = np.empty((len(preds), len(gts), len(cutoffs_m), 2))
+    for i, pred in enumerate(preds):
+        for k, gt in enumerate(gts):
+            distances[i, k] = sospa(pred, gt, cutoffs_m=cutoffs_m)
     sums = np.zeros((len(cutoffs_m), 2))
     for row in range(len(cutoffs_m)):
-        gains, errors = (
-            scores[:, None] * (1 - apart[:, :, row, 0]),
-            scores[:, None] * apart[:, :, row, 1],
-        )
+        gains = scores[:, None] * (1 - distances[:, :, row, 0])
+        errors = scores[:, None] * distances[:, :, row, 1]
         pairs = linear_sum_assignment(gains, maximize=True)
-        sums[row] = gains[pairs].sum(), errors[pairs].sum()
+        sums[row, 0] = gains[pairs].sum()
+        sums[row, 1] = errors[pairs].sum()
     return sums
 
 
 @register_metric
 @dataclass(frozen=True)
 class PLD(Metric):
-    """PLD, the distance of predicted maps with scores from the true ones.
+    """PLD, the distance of predicted maps with scores from annotated maps.
 
-    In each sample and class, predictions of score r are paired with ground truths so that the
-    cost is least: r s + (1 - r) / 2 of a pair with SOSPA s, r / 2 of a prediction without partner,
-    1 / 2 of a ground truth without. The sums D of all samples are divided like SOSPA's:
+    In each sample and class, predictions of score r are paired with ground truths at the smallest
+    cost: r s + (1 - r) / 2 for a pair with SOSPA s, r / 2 for a prediction without partner, 1 / 2
+    for a ground truth without partner. Like SOSPA, the sum D over all samples is normalised to
     2 D / (M + D), with M = (sum of scores + number of ground truths) / 2, the sum without pairs.
+    Lines are compared in the plane.
 
     Args:
         classes: Names of the classes; a label is an index into them.
-        cutoffs_m: Cut-offs of SOSPA in metres. Lines are compared in the plane.
+        cutoffs_m: Cut-offs of SOSPA in metres, > 0.
+
+    Raises:
+        ValueError: If a value is out of its range.
     """
 
     name: ClassVar[str] = "pld"
@@ -154,7 +206,7 @@ class PLD(Metric):
     cutoffs_m: tuple[float, ...] = CHAMFER_THRESHOLDS
 
     def __post_init__(self) -> None:
-        cutoffs = tuple(sorted(round(float(c), 6) for c in self.cutoffs_m))
+        cutoffs = tuple(sorted(round(float(cutoff), ndigits=6) for cutoff in self.cutoffs_m))
         object.__setattr__(self, "classes", checked_classes(self.classes))
         object.__setattr__(self, "cutoffs_m", cutoffs)
         if not (cutoffs and 0 < cutoffs[0] <= cutoffs[-1] < np.inf):
@@ -162,40 +214,52 @@ class PLD(Metric):
 
     @classmethod
     def of(cls, settings: MetricSettings) -> "PLD":
-        """Return the metric by the settings of a command or config."""
-        return cls(settings.classes, settings.thresholds or CHAMFER_THRESHOLDS)
+        """Create the metric from the settings of a command or config."""
+        cutoffs_m = settings.thresholds or CHAMFER_THRESHOLDS
+        return cls(classes=settings.classes, cutoffs_m=cutoffs_m)
 
     def match(self, sample: Sample) -> SampleValues:
         """Pair the elements of one sample.
 
-        Predictions of less than two points are left out; ground truths of less than two have no
-        partner.
+        Predictions of fewer than two points are left out. Ground truths of fewer than two points
+        have no partner.
         """
         token, predictions, truth = sample
-        check_pair(predictions, truth, self.classes, token)
-        kept = predictions.select(predictions.num_points >= 2)
-        sides = [[spaced(line[:, :2]) for line in side.polylines] for side in (kept, truth)]
+        check_pair(predictions, truth, classes=self.classes, token=token)
+        predictions = predictions.select(predictions.num_points >= 2)
+        pred_lines = [sample_line(line[:, :2]) for line in predictions.polylines]
+        gt_lines = [sample_line(line[:, :2]) for line in truth.polylines]
         sums = np.zeros((len(self.classes), len(self.cutoffs_m), 2))
         masses = np.zeros((len(self.classes), 1))
         for label in range(len(self.classes)):
-            found, wanted = (np.flatnonzero(s.labels == label).tolist() for s in (kept, truth))
-            scores = kept.confidence[found]
-            masses[label] = (scores.sum() + len(wanted)) / 2
-            lines = [sides[0][i] for i in found], scores, [sides[1][i] for i in wanted]
-            sums[label] = _paired(*lines, self.cutoffs_m)
+            preds = np.flatnonzero(predictions.labels == label).tolist()
+            gts = np.flatnonzero(truth.labels == label).tolist()
+            scores = predictions.confidence[preds]
+            masses[label] = (scores.sum() + len(gts)) / 2
+            sums[label] = _pair_sums(
+                preds=[pred_lines[i] for i in preds],
+                scores=scores,
+                gts=[gt_lines[k] for k in gts],
+                cutoffs_m=self.cutoffs_m,
+            )
         return SampleValues(token, {"sums": sums, "masses": masses})
 
     def reports(self, table: ValueTable) -> list[MetricReport]:
         """Compute PLD from the sums of all samples.
 
-        Figures are ``CLASS/PLD@CUTOFF``; ``localisation``, its part that distances of paired points
-        have, and ``cardinality``, the rest, for points, lines and scores too many or too few;
-        without cut-off the mean over them, without class the mean over the classes. A class that
-        occurs nowhere has 0.
+        The keys of figures are ``CLASS/PLD@CUTOFF``. ``localisation`` in place of ``PLD`` is the
+        part that the distances of paired points have; ``cardinality`` is the rest, for points,
+        lines and scores that are too many or too few. Figures without cut-off are means over the
+        cut-offs; figures without class are means over the classes. A class that occurs in no sample
+        has 0.
+
+        Args:
+            table: Values of all samples.
         """
         sums = np.sum(table.column("sums"), axis=0)
         masses = np.sum(table.column("masses"), axis=0)
-        gains, errors = sums[..., 0], sums[..., 1]
+        gains = sums[..., 0]
+        errors = sums[..., 1]
         whole = np.maximum(2 * masses - gains, np.finfo(float).tiny)
         pld = 2 * (masses - gains) / whole  # D = M - gains
         localisation = 2 * errors / whole
@@ -206,4 +270,4 @@ class PLD(Metric):
                     figures[f"{name}/{part}@{cutoff}"] = float(value)
                 figures[f"{name}/{part}"] = float(row.mean())
             figures[part] = float(values.mean())
-        return [MetricReport.of_figures(self.name, figures, table.tokens)]
+        return [MetricReport.of_figures(self.name, figures=figures, tokens=table.tokens)]

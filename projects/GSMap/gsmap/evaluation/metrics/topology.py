@@ -1,7 +1,7 @@
-"""What AP hardly sees: elements in pieces, elements joined, lines that fold back."""
+"""Topological errors that AP hardly penalises: broken, joined and folded lines."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -21,10 +21,10 @@ from gsmap.structures.elements import BoolArray, FloatArray, MapElements
 from gsmap.structures.polylines import arc_lengths, resample
 from gsmap.utils.errors import InputError
 
-_POINTS = 128  # that an element is looked at, at equal distances
-_FOLD_CHORD_M = 2.0  # before and after a fold
+_POINTS = 128  # points of an element, at equal distances
+_FOLD_CHORD_M = 2.0  # length of the chords before and after a fold
 _COUNTS = ("breaks", "false_joints", "folds", "num_gts", "num_preds")
-_FOLD_COS = -0.5  # of the angle between both chords: 120 degrees
+_FOLD_COS = -0.5  # cosine of the smallest angle between both chords, 120 degrees
 
 
 @register_metric
@@ -35,9 +35,10 @@ class Topology(Metric):
     Args:
         classes: Names of the classes; a label is an index into them.
         area_labels: Labels of classes whose elements enclose an area.
-        min_score: Smallest score of a prediction that counts.
-        tolerance_m: Within which a line covers a point of another.
-        min_piece_m: Shortest piece that counts; more than a line covers of one that it crosses.
+        min_score: Smallest score of a prediction that counts, in [0, 1].
+        tolerance_m: Largest distance in metres at which a line covers a point of another line.
+        min_piece_m: Length in metres of the shortest piece that counts, > 2 ``tolerance_m``, so
+            that a line that crosses another does not cover a piece of it.
 
     Raises:
         ValueError: If a value is out of its range.
@@ -62,108 +63,123 @@ class Topology(Metric):
 
     @classmethod
     def of(cls, settings: MetricSettings) -> "Topology":
-        """Return the metric by the settings of a command or config."""
-        own = {} if settings.min_score is None else {"min_score": settings.min_score}
-        return cls(settings.classes, settings.areas, **own)
+        """Create the metric from the settings of a command or config."""
+        metric = cls(classes=settings.classes, area_labels=settings.areas)
+        if settings.min_score is None:
+            return metric
+        return replace(metric, min_score=settings.min_score)
 
     def match(self, sample: Sample) -> SampleValues:
-        """Count in one sample."""
+        """Count the errors of one sample."""
         token, predictions, truth = sample
         check_pair(predictions, truth, self.classes, token)
         counts = np.zeros((len(self.classes), len(_COUNTS)))
         for label in range(len(self.classes)):
-            chosen = (predictions.labels == label) & (predictions.confidence >= self.min_score)
-            found = _lines(predictions, chosen)
-            wanted = _lines(truth, truth.labels == label)
+            is_confident = predictions.confidence >= self.min_score
+            preds = _lines(predictions, chosen=(predictions.labels == label) & is_confident)
+            gts = _lines(truth, chosen=truth.labels == label)
             is_area = label in self.area_labels
             counts[label] = (
-                _excess_pieces(wanted, found, self),
-                _excess_pieces(found, wanted, self),
-                sum(count_folds(line, is_area) for line in found),
-                len(wanted),
-                len(found),
+                _count_excess_pieces(gts, lines=preds, config=self),
+                _count_excess_pieces(preds, lines=gts, config=self),
+                sum(count_folds(line, is_area=is_area) for line in preds),
+                len(gts),
+                len(preds),
             )
         return SampleValues(token, {"counts": counts})
 
     def reports(self, table: ValueTable) -> list[MetricReport]:
         """Add up the counts of all samples.
 
-        Figures are, by ``CLASS/NAME``: ``breaks``, pieces beyond the first that ground truths are
-        found in; ``false_joints``, ground truths beyond the first that a prediction runs along;
-        ``folds``; ``num_gts`` and ``num_preds``.
+        The keys of figures are ``CLASS/NAME``. ``breaks`` are the pieces of a ground truth beyond
+        the first that predictions cover. ``false_joints`` are the ground truths beyond the first
+        that a prediction follows. ``folds`` are counted as in `count_folds`. ``num_gts`` and
+        ``num_preds`` are the numbers of ground truths and predictions.
+
+        Args:
+            table: Values of all samples.
         """
-        totals = np.sum(table.column("counts"), axis=0)
-        figures = {
-            f"{name}/{key}": total
-            for name, of_class in zip(self.classes, totals, strict=True)
-            for key, total in zip(_COUNTS, of_class, strict=True)
-        }
-        return [MetricReport.of_figures(self.name, figures, table.tokens)]
+        totals = np.sum(table.column("counts"), axis=0)  # (C, 5)
+        figures = {}
+        for label, name in enumerate(self.classes):
+            for column, key in enumerate(_COUNTS):
+                figures[f"{name}/{key}"] = totals[label, column]
+        return [MetricReport.of_figures(self.name, figures=figures, tokens=table.tokens)]
 
 
 def count_pieces(covered: BoolArray, step_m: float, min_piece_m: float) -> int:
-    """Return of how many lines an element is made up: each adds a piece that no other covers.
+    """Count the lines that cover an element, where each line adds a piece of its points.
+
+    Lines are chosen greedily, the longest new piece first.
 
     Args:
-        covered: Which points of the element, at equal distances, each line covers. (M, P)
-        step_m: Distance of the points in metres.
-        min_piece_m: Shortest piece that counts.
+        covered: Whether each of M lines covers each point of the element, at equal distances.
+            (M, P)
+        step_m: Distance of neighbouring points in metres.
+        min_piece_m: Length in metres of the shortest piece that counts.
     """
-    free, pieces = np.ones(covered.shape[1], bool), 0
+    is_free = np.ones(covered.shape[1], dtype=bool)
+    num_pieces = 0
     while len(covered):
-        gains = (covered & free).sum(axis=1)
+        gains = (covered & is_free).sum(axis=1)
         best = int(gains.argmax())
         if not gains[best] * step_m >= min_piece_m:
             break
-        free &= ~covered[best]
-        pieces += 1
-    return pieces
+        is_free &= ~covered[best]
+        num_pieces += 1
+    return num_pieces
 
 
-def _excess_pieces(
+def _count_excess_pieces(
     elements: Sequence[FloatArray], lines: Sequence[FloatArray], config: Topology
 ) -> int:
-    """Return how many pieces beyond the first the elements are made up of."""
+    """Count the pieces beyond the first of each element that lines cover."""
     if not lines:
         return 0
-    drawn, excess = shapely.linestrings([*map(_flat, lines)]), 0
+    curves = shapely.linestrings([_resample_flat(line) for line in lines])
+    num_excess = 0
     for element in elements:
-        points = shapely.points(resample(element, _POINTS)[:, :2])
-        covered = shapely.distance(points[None], drawn[:, None]) <= config.tolerance_m  # (M, P)
+        points = shapely.points(_resample_flat(element))
+        covered = shapely.distance(points[None], curves[:, None]) <= config.tolerance_m  # (M, P)
         step_m = arc_lengths(element)[-1] / (_POINTS - 1)
-        excess += max(count_pieces(covered, step_m, config.min_piece_m) - 1, 0)
-    return excess
+        num_pieces = count_pieces(covered, step_m=step_m, min_piece_m=config.min_piece_m)
+        num_excess += max(num_pieces - 1, 0)
+    return num_excess
 
 
-def _flat(line: FloatArray) -> FloatArray:
-    """Return a line's course in the plane. (P, 2)"""
+def _resample_flat(line: FloatArray) -> FloatArray:
+    """Resample a line and project it to the plane. (P, 2)"""
     return resample(line, _POINTS)[:, :2]
 
 
 def count_folds(line: FloatArray, is_area: bool) -> int:
-    """Return how often a line turns back on itself; of an area 1 if its outline crosses itself.
+    """Count the folds of a line; of an area, 1 if its outline crosses itself.
 
-    A line turns back where its courses over 2 m before and after differ by more than 120 degrees.
+    A line folds where its directions over 2 m before and after a point differ by more than 120
+    degrees.
 
     Args:
         line: Vertices in metres. (n, 2 or 3)
-        is_area: Whether it encloses an area.
+        is_area: Whether the line encloses an area.
     """
     if is_area:
         ring = shapely.LineString(np.concatenate([line[:, :2], line[:1, :2]]))
         return int(not ring.is_simple)
-    points, length = _flat(line), arc_lengths(line)[-1]
+    points = _resample_flat(line)
+    length = arc_lengths(line)[-1]
     if not 2 * _FOLD_CHORD_M <= length < np.inf:
         return 0
     span = max(round(_FOLD_CHORD_M / length * (_POINTS - 1)), 1)
     chords = points[span:] - points[:-span]
-    before, after = chords[:-span], chords[span:]
-    sizes = np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
-    turned = (before * after).sum(axis=1) < _FOLD_COS * sizes
-    return int(turned[:1].sum() + (turned[1:] & ~turned[:-1]).sum())
+    before = chords[:-span]
+    after = chords[span:]
+    lengths = np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
+    is_fold = (before * after).sum(axis=1) < _FOLD_COS * lengths
+    starts_fold = is_fold[1:] & ~is_fold[:-1]
+    return int(is_fold[:1].sum() + starts_fold.sum())
 
 
 def _lines(elements: MapElements, chosen: BoolArray) -> list[FloatArray]:
-    """Return the chosen elements of two points or more."""
+    """Return the vertices of the chosen elements of two points or more."""
     lines = elements.polylines
     return [lines[i] for i in np.flatnonzero(chosen & (elements.num_points >= 2)).tolist()]
