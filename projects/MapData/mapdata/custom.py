@@ -1,4 +1,4 @@
-"""Annotation files of your own data, from plain records: any cameras, ground truth or not."""
+"""Annotation files of custom data, from plain records with any cameras."""
 
 import hashlib
 import logging
@@ -44,7 +44,7 @@ _LOST = (
     "%d of %d records lose all of their elements (the first is %r), as none lies in x_range and "
     "y_range: points must be in metres of the frame, not of the world, and not in millimetres."
 )
-_MEETING_M = 0.1  # ends of lines that are so near are one place
+_MEETING_M = 0.1  # ends of lines within this distance are one place
 _GLOBAL = "global_instances"
 _KEYS = sorted([*(field.name for field in fields(MapSample)), _GLOBAL])
 Record = TypeVar("Record")
@@ -61,22 +61,22 @@ def from_records(
 ) -> int:
     """Write an annotation file from plain records.
 
-    A record is a mapping. All but the first two keys may be left out:
+    A record is a mapping. All keys but the first two are optional:
 
     - ``token``: unique name;
     - ``cameras``: mappings with ``name``, ``path`` (relative to ``data_root``), ``intrinsics``
-      (3, 3) in pixels, ``cam_from_frame`` (4, 4), and, unless the image is to be asked, ``width``
-      and ``height``. With ``distortion`` (OpenCV's coefficients, and ``distortion_model`` as in
+      (3, 3) in pixels, ``cam_from_frame`` (4, 4), and, to avoid opening the image, ``width`` and
+      ``height``. With ``distortion`` (OpenCV's coefficients, and ``distortion_model`` as in
       docs/inference.md) the image is rectified into ``rectified/`` of the data root;
-    - ``instances`` (absent: no ground truth is known): mappings with ``label`` (name or index) and
-      ``points`` (n, 2 or 3) in metres, a ring's last equal to its first. What lies outside the
-      range of ``meta`` is cut off; rings stay rings;
-    - ``global_instances``: instead, the same in the global frame, such as a whole map. Position and
-      yaw of ``global_from_frame`` place them, or with heights all of it;
+    - ``instances`` (without it, no ground truth is known): mappings with ``label`` (name or index)
+      and ``points`` (n, 2 or 3) in metres, with equal first and last points of rings. Elements are
+      clipped to the range of ``meta``; rings stay rings;
+    - ``global_instances``: such elements in the global frame instead, such as a whole map. Position
+      and yaw of ``global_from_frame`` place them; with heights the whole pose does;
     - ``lidar``: mapping with ``path``, ``frame_from_lidar`` (4, 4) and ``sweeps``, mappings with
       ``path``, ``timestamp_ns``, ``frame_from_lidar``;
-    - ``ego_from_frame`` (4, 4): where the frame ``lidar`` stands on the vehicle, whose z = 0 is the
-      road; absent: not known, and one warning says what that means;
+    - ``ego_from_frame`` (4, 4): pose of the frame ``lidar`` on the vehicle, whose z = 0 is the
+      road. Without it, the pose is not known, and a warning describes the consequences;
     - ``scene``, ``map_name``, ``timestamp_ns``, ``global_from_frame``, ``can_bus``.
 
     Args:
@@ -84,19 +84,18 @@ def from_records(
         records: The records.
         meta: Frame, classes and range of the data.
         data_root: Folder that image and LiDAR paths are relative to.
-        shard: Which part of the records to take, such as ``Shard.parse("3/16")``.
-        join: Join lines of a class whose ends meet, for maps that come in pieces (`join_lines`).
-        calibration: Calibration file of the vehicle as `infer` reads it beside a folder of images.
-            It defines intrinsics, distortion, place and, if it names ``poses``,
-            ``global_from_frame`` at the record's ``timestamp_ns``. Cameras of records have ``name``
-            and ``path`` then, and ``timestamp_ns`` where that of the image differs.
+        shard: Part of the records to take, such as ``Shard.parse("3/16")``.
+        join: Whether to join lines of a class whose ends meet, for maps in pieces (`join_lines`).
+        calibration: Calibration file of the vehicle, in the format that `infer` reads in a folder
+            of images. It defines intrinsics, distortion, mounting and, if it names ``poses``,
+            ``global_from_frame`` at the record's ``timestamp_ns``. Cameras of records then have
+            ``name`` and ``path``, and ``timestamp_ns`` if the image has another time.
 
     Returns:
-        How many samples were written.
+        Number of samples.
 
     Raises:
-        FileNotFoundError: If an image is missing whose size is not given, or there is no such
-            calibration file.
+        FileNotFoundError: If an image without a given size is missing, or the calibration file.
         ValueError: If a record or the calibration file is malformed; the message names the token or
             that file. No annotation file is left then.
     """
@@ -105,168 +104,212 @@ def from_records(
     source = ""
     if shard.count:
         records = list(records)
-        tokens = "\n".join(str(r.get("token") if isinstance(r, Mapping) else r) for r in records)
+        names = [
+            record.get("token") if isinstance(record, Mapping) else record for record in records
+        ]
+        tokens = "\n".join(map(str, names))
         source = hashlib.sha256(tokens.encode()).hexdigest()
         records = shard.part(records)
     if calibration is not None:
-        records = calibrated_records(list(records), Path(calibration), meta, Path(data_root))
-    samples = _samples(records, meta, Path(data_root), join)
-    return write_annotations(path, meta, samples, shard, source)
+        records = calibrated_records(
+            list(records), Path(calibration), meta=meta, root=Path(data_root)
+        )
+    samples = _samples(records, meta, root=Path(data_root), join=join)
+    return write_annotations(path, meta, samples, shard=shard, source=source)
 
 
 def _samples(
     records: Iterable[Mapping[str, Any]], meta: AnnotationMeta, root: Path, join: bool
 ) -> Iterator[MapSample]:
-    warned, lost, samples = False, [], 0
+    """Yield the samples of records, clipped to the range, and warn of implausible records."""
+    has_warned = False
+    empty_tokens = []
+    count = 0
     for number, record in enumerate(records):
         name = record.get("token", number) if isinstance(record, Mapping) else number
         with naming(f"record {name!r}", "correct it"):
             unknown = set(record) - set(_KEYS)
             if unknown:
                 raise InputError(f"unknown keys {sorted(unknown)}; known are {_KEYS}.")
-            sample = _sample(record, meta, root)
+            sample = _create_sample(record, meta, root)
             check_samples([sample], meta)
-            samples += 1
-            given = len(sample.instances or ())
+            count += 1
+            had_elements = bool(sample.instances)
             if sample.instances is not None:
-                whole = join_lines(sample.instances) if join else sample.instances
-                sample.instances = [
-                    MapInstance(item.label, piece)
-                    for item in whole
-                    for piece in _clipped(np.asarray(item.points, np.float64), meta)
-                ]
-        if given and not sample.instances:
-            lost.append(sample.token)
-        if sample.ego_from_frame is None and meta.frame == "lidar" and not warned:
-            warned = True
+                sample.instances = _clip_elements(sample.instances, meta, join)
+        if had_elements and not sample.instances:
+            empty_tokens.append(sample.token)
+        if sample.ego_from_frame is None and meta.frame == "lidar" and not has_warned:
+            has_warned = True
             height_m = -frame_view(meta.frame, meta.ground_z_m).ground[2]
             _LOGGER.warning(_UNMOUNTED, sample.token, height_m)
         yield sample
-    if lost:
-        _LOGGER.warning(_LOST, len(lost), samples, lost[0])
+    if empty_tokens:
+        _LOGGER.warning(_LOST, len(empty_tokens), count, empty_tokens[0])
+
+
+def _clip_elements(
+    elements: Sequence[MapInstance], meta: AnnotationMeta, join: bool
+) -> list[MapInstance]:
+    """Clip elements to the range of an annotation file, after joining lines if asked for."""
+    if join:
+        elements = join_lines(elements)
+    pieces = []
+    for element in elements:
+        points = np.asarray(element.points, np.float64)
+        for piece in _clip(points, meta):
+            pieces.append(MapInstance(element.label, piece))
+    return pieces
 
 
 def join_lines(instances: Sequence[MapInstance]) -> list[MapInstance]:
-    """Join lines of one class whose ends meet, as where a map is cut into tiles.
+    """Join lines of one class whose ends meet, such as lines of a map in tiles.
 
-    Ends within 0.1 m of each other in the plane meet. Lines are joined where two of them do; where
-    three or more meet, as at a fork, they stay apart. A line may be turned round. Rings stay.
+    Ends within 0.1 m of each other in the plane meet. Lines are joined at places where two ends
+    meet, not at places where three or more meet, such as forks. Lines may be reversed. Rings are
+    not changed.
 
     Args:
-        instances: Elements in metres.
+        instances: Map elements, in metres.
 
     Returns:
-        The rings as they are, then the joined lines of each class.
+        The rings, then the joined lines of each class.
     """
-    rings = [item for item in instances if is_closed(np.asarray(item.points))]
-    joined = list(rings)
-    for label in sorted({item.label for item in instances}):
-        lines = [
-            np.array(item.points, np.float64)
-            for item in instances
-            if item.label == label and not is_closed(np.asarray(item.points))
-        ]
-        _let_ends_meet(lines)
-        if lines:
-            parts = shapely.get_parts(shapely.line_merge(shapely.MultiLineString(lines)))
-            pieces = vertices_of(parts, lines[0].shape[1])
-            joined += [MapInstance(label, piece) for piece in pieces]
+    joined = []
+    lines_of: dict[int, list[np.ndarray]] = {}  # lines by label
+    for instance in instances:
+        if is_closed(np.asarray(instance.points)):
+            joined.append(instance)
+        else:
+            line = np.array(instance.points, np.float64)
+            lines_of.setdefault(instance.label, []).append(line)
+    for label in sorted(lines_of):
+        lines = lines_of[label]
+        _snap_ends(lines)
+        parts = shapely.get_parts(shapely.line_merge(shapely.MultiLineString(lines)))
+        for points in vertices_of(parts, dim=lines[0].shape[1]):
+            joined.append(MapInstance(label, points))
     return joined
 
 
-def _let_ends_meet(lines: Sequence[Points]) -> None:
-    """Move ends of lines that are near each other to one place, in place. each (n, dim)"""
+def _snap_ends(lines: Sequence[Points]) -> None:
+    """Move ends of lines that meet to one place, in place. each (n, dim)"""
     places: list[np.ndarray] = []
     for line in lines:
         for end in (0, -1):
-            near = (p for p in places if np.linalg.norm(p[:2] - line[end, :2]) <= _MEETING_M)
-            place = next(near, None)
+            other_end = line[-1 - end]
+            place = _nearby_place(places, line[end])
             if place is None:
                 places.append(line[end].copy())
-            elif not (line[-1 - end] == place).all():  # a line as short as that stays one
+            elif not (other_end == place).all():  # else a short line would become a point
                 line[end] = place
 
 
-def _sample(record: Mapping[str, Any], meta: AnnotationMeta, root: Path) -> MapSample:
-    """Return a record as a sample; what it holds is still to be checked."""
+def _nearby_place(places: Sequence[np.ndarray], point: np.ndarray) -> np.ndarray | None:
+    """First place that meets a point in the plane. (dim,)"""
+    for place in places:
+        if np.linalg.norm(place[:2] - point[:2]) <= _MEETING_M:
+            return place
+    return None
+
+
+def _create_sample(record: Mapping[str, Any], meta: AnnotationMeta, root: Path) -> MapSample:
+    """Create the sample of a record, whose values are not yet checked."""
     token = record["token"]
     if record.get(_GLOBAL) is not None:
-        record = _in_frame(record, meta)
-    given = {name: value for name, value in record.items() if value is not None}
-    given["cameras"] = [_camera(camera, token, root) for camera in record["cameras"]]
-    if "lidar" in given:
-        lidar = given["lidar"]
-        sweeps = [_record(SweepRecord, sweep) for sweep in lidar.get("sweeps", [])]
-        matrix = lidar.get("frame_from_lidar")
-        matrix = np.eye(4) if matrix is None else matrix
-        given["lidar"] = LidarRecord(lidar["path"], matrix, sweeps)
-    if "instances" in given:
-        given["instances"] = [
-            MapInstance(_label(instance["label"], meta), instance["points"])
-            for instance in given["instances"]
-        ]
-    absent = {"scene": "", "map_name": "", "timestamp_ns": 0, "global_from_frame": np.eye(4)}
-    return MapSample(**{**absent, **given})
+        record = _transform_elements(record, meta)
+    values: dict[str, Any] = {
+        "scene": "", "map_name": "", "timestamp_ns": 0, "global_from_frame": np.eye(4)
+    }  # fmt: skip
+    for name, value in record.items():
+        if value is not None:
+            values[name] = value
+    values["cameras"] = [_create_camera(camera, token, root) for camera in record["cameras"]]
+    if "lidar" in values:
+        lidar = values["lidar"]
+        frame_from_lidar = lidar.get("frame_from_lidar")
+        values["lidar"] = LidarRecord(
+            path=lidar["path"],
+            frame_from_lidar=np.eye(4) if frame_from_lidar is None else frame_from_lidar,
+            sweeps=[_create_record(SweepRecord, sweep) for sweep in lidar.get("sweeps", [])],
+        )
+    if "instances" in values:
+        elements = []
+        for instance in values["instances"]:
+            label = _class_index(instance["label"], meta)
+            elements.append(MapInstance(label, instance["points"]))
+        values["instances"] = elements
+    return MapSample(**values)
 
 
-def _in_frame(record: Mapping[str, Any], meta: AnnotationMeta) -> dict[str, Any]:
-    """Return a record whose elements are moved from the global frame to its own."""
+def _transform_elements(record: Mapping[str, Any], meta: AnnotationMeta) -> dict[str, Any]:
+    """Replace the global elements of a record by elements in its frame."""
     if record.get("instances") is not None:
         raise InputError(f"give instances, in the frame, or {_GLOBAL}, not both.")
     if record.get("global_from_frame") is None:
         raise InputError(f"{_GLOBAL} need global_from_frame, the pose of the frame. (4, 4)")
     pose = np.array(record["global_from_frame"], np.float64)
-    if meta.dim == 2:  # as of published data sets: roll, pitch and height have no effect
+    if meta.dim == 2:  # as in published data sets: roll, pitch and height have no effect
         yaw = np.arctan2(pose[1, 0], pose[0, 0])
-        turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+        cos = np.cos(yaw)
+        sin = np.sin(yaw)
+        rotation = np.array([[cos, -sin], [sin, cos]])
     else:
-        turn = pose[:3, :3]
+        rotation = pose[:3, :3]
     instances = []
     for item in record[_GLOBAL]:
         points = np.array(item["points"], np.float64)[:, : meta.dim]
-        apart = points - pose[: points.shape[1], 3]
-        instances.append({**item, "points": apart @ turn})
-    moved = {name: value for name, value in record.items() if name != _GLOBAL}
-    return {**moved, "instances": instances}
+        offsets = points - pose[: points.shape[1], 3]
+        instances.append({**item, "points": offsets @ rotation})
+    local_record = {name: value for name, value in record.items() if name != _GLOBAL}
+    local_record["instances"] = instances
+    return local_record
 
 
-def _record(kind: type[Record], values: Mapping[str, Any]) -> Record:
-    """Return a mapping as a record of its kind; other keys are left alone."""
-    return kind(**{field.name: values[field.name] for field in fields(kind)})  # type: ignore[arg-type]
+def _create_record(kind: type[Record], values: Mapping[str, Any]) -> Record:
+    """Create a record from a mapping; keys that are not fields are ignored."""
+    arguments = {field.name: values[field.name] for field in fields(kind)}  # type: ignore[arg-type]
+    return kind(**arguments)
 
 
-def _camera(camera: Mapping[str, Any], token: str, root: Path) -> CameraRecord:
+def _create_camera(camera: Mapping[str, Any], token: str, root: Path) -> CameraRecord:
+    """Create the record of a camera; the size comes from the image if it is not given."""
+    values = dict(camera)
     if camera.get("width") is None or camera.get("height") is None:
         where = f"sample {token!r}, camera {camera['name']!r}"
-        width, height = image_size(root / camera["path"], where)
-        camera = {**camera, "width": width, "height": height}
+        values["width"], values["height"] = image_size(root / camera["path"], where)
     if np.any(camera.get("distortion", ())):
-        camera = {**camera, "path": _rectified(camera, root)}
-    return _record(CameraRecord, camera)
+        values["path"] = _rectify_image(values, root)
+    return _create_record(CameraRecord, values)
 
 
-def _rectified(camera: Mapping[str, Any], root: Path) -> str:
-    """Write a camera's image without its distortion and return its path below the data root."""
-    rig = RigCamera(
-        str(camera["name"]),
-        np.array(camera["intrinsics"], np.float64),
-        np.eye(4),
-        (int(camera["width"]), int(camera["height"])),
-        np.array(camera["distortion"], np.float64),
-        str(camera.get("distortion_model", "")),
+def _rectify_image(camera: Mapping[str, Any], root: Path) -> str:
+    """Write a camera's image without its distortion, and return its path below the data root."""
+    rig_camera = RigCamera(
+        name=str(camera["name"]),
+        intrinsics=np.array(camera["intrinsics"], np.float64),
+        cam_from_ground=np.eye(4),
+        size_px=(int(camera["width"]), int(camera["height"])),
+        distortion=np.array(camera["distortion"], np.float64),
+        model=str(camera.get("distortion_model", "")),
     )
-    calibration = repr((rig.intrinsics.tolist(), rig.distortion.tolist(), rig.model))
-    digest = hashlib.sha256(calibration.encode()).hexdigest()[:12]
-    path = f"rectified/{file_name(rig.name)}-{digest}/{file_name(camera['path'])}.jpg"
-    if not (root / path).is_file():
-        image = read_image(str(root / camera["path"]), f"camera {rig.name!r}", rig.size_px)
-        (root / path).parent.mkdir(parents=True, exist_ok=True)
-        rig.write_image(root / path, image)
+    calibration = (
+        rig_camera.intrinsics.tolist(), rig_camera.distortion.tolist(), rig_camera.model
+    )  # fmt: skip
+    digest = hashlib.sha256(repr(calibration).encode()).hexdigest()[:12]
+    folder = f"rectified/{file_name(rig_camera.name)}-{digest}"
+    path = f"{folder}/{file_name(camera['path'])}.jpg"
+    target = root / path
+    if not target.is_file():
+        where = f"camera {rig_camera.name!r}"
+        image = read_image(str(root / camera["path"]), where, size=rig_camera.size_px)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        rig_camera.write_image(target, image)
     return path
 
 
-def _label(label: Any, meta: AnnotationMeta) -> int:
-    """Return a class's index, given by its name or itself."""
+def _class_index(label: Any, meta: AnnotationMeta) -> int:
+    """Index of a class that is given by its name or its index."""
     if not isinstance(label, str):
         return int(label)
     if label not in meta.classes:
@@ -274,8 +317,8 @@ def _label(label: Any, meta: AnnotationMeta) -> int:
     return meta.classes.index(label)
 
 
-def _clipped(points: Points, meta: AnnotationMeta) -> list[Points]:
-    """Return what of an element lies in the range; rings stay rings. each (n, dim)."""
+def _clip(points: Points, meta: AnnotationMeta) -> list[Points]:
+    """Clip an element to the range of an annotation file; rings stay rings. each (n, dim)"""
     low, high = np.array([meta.x_range, meta.y_range]).T
     if ((points[:, :2] >= low) & (points[:, :2] <= high)).all():
         return [points]
@@ -284,6 +327,7 @@ def _clipped(points: Points, meta: AnnotationMeta) -> list[Points]:
     polygon = shapely.Polygon(points)
     if not polygon.is_valid:
         raise InputError("a ring that leaves the range crosses itself and cannot be cut: mend it.")
-    parts = shapely.get_parts(shapely.intersection(polygon, shapely.box(*low, *high)))
-    areas = parts[(shapely.get_type_id(parts) == POLYGON) & ~shapely.is_empty(parts)]
-    return vertices_of(shapely.get_exterior_ring(areas), meta.dim)
+    box = shapely.box(low[0], low[1], high[0], high[1])
+    parts = shapely.get_parts(shapely.intersection(polygon, box))
+    is_area = (shapely.get_type_id(parts) == POLYGON) & ~shapely.is_empty(parts)
+    return vertices_of(shapely.get_exterior_ring(parts[is_area]), dim=meta.dim)
