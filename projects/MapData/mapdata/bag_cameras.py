@@ -82,9 +82,10 @@ def is_same_calibration(info: Any, other: Any) -> bool:
     """Whether two camera infos are equal in size, K, P and distortion."""
     if (info.width, info.height) != (other.width, other.height):
         return False
-    return all(
-        np.array_equal(_field(info, name), _field(other, name), equal_nan=True) for name in "kpd"
-    )
+    for name in ("k", "p", "d"):
+        if not np.array_equal(_field(info, name), _field(other, name), equal_nan=True):
+            return False
+    return True
 
 
 def _is_pinhole(matrix: np.ndarray) -> bool:
@@ -95,7 +96,7 @@ def _is_pinhole(matrix: np.ndarray) -> bool:
 def _field(info: Any, name: str) -> np.ndarray:
     """Array of a camera info; ROS 1 writes its name in capitals."""
     values = getattr(info, name) if hasattr(info, name) else getattr(info, name.upper())
-    return np.asarray(values, np.float64)
+    return np.asarray(values, dtype=np.float64)
 
 
 def _matrix(info: Any, name: str) -> np.ndarray:
@@ -158,7 +159,7 @@ def build_camera(
     offset_px, binning, size_px = _window(info, full_px)
     image_sizes = images.sizes_px
     if size_px in image_sizes or not image_sizes or min(full_px) < 1:
-        matrix = _crop(matrix, offset_px, binning)
+        matrix = _crop(matrix, offset_px=offset_px, binning=binning)
     elif full_px in image_sizes:
         size_px = full_px
         notes.append(

@@ -78,11 +78,11 @@ class BagContent:
             recorded_ns: Time of recording, used if a stamp is 0.
         """
         if kind in _TRANSFORMS:
-            self._add_transforms(message, topic, recorded_ns)
+            self._add_transforms(message, topic=topic, recorded_ns=recorded_ns)
         elif kind == _ODOMETRY:
-            self._add_odometry(message, topic, recorded_ns)
+            self._add_odometry(message, topic=topic, recorded_ns=recorded_ns)
         else:
-            self._add_image(message, topic, recorded_ns)
+            self._add_image(message, topic=topic, recorded_ns=recorded_ns)
 
     def _add_transforms(self, message: Any, topic: str, recorded_ns: int) -> None:
         is_static = is_static_topic(topic)
@@ -91,7 +91,9 @@ class BagContent:
             child = item.child_frame_id.lstrip("/")
             parent = item.header.frame_id.lstrip("/")
             stamp = stamp_ns(item.header)
-            self.tree.add(topic, child, parent, time_ns=stamp or recorded_ns, pose=pose)
+            self.tree.add(
+                topic, child=child, parent=parent, time_ns=stamp or recorded_ns, pose=pose
+            )
             if not stamp and not is_static:
                 self.unstamped[topic] += 1
 
@@ -101,7 +103,9 @@ class BagContent:
         parent = message.header.frame_id.lstrip("/")
         child = message.child_frame_id.lstrip("/")
         key = (topic, parent, child)
-        odometry = self.odometries.setdefault(key, Odometry(topic, parent, child))
+        odometry = self.odometries.setdefault(
+            key, Odometry(topic=topic, parent=parent, child=child)
+        )
         odometry.poses.append(pose)
         odometry.times_ns.append(stamp or recorded_ns)
         if not stamp:
@@ -110,7 +114,7 @@ class BagContent:
     def _add_image(self, message: Any, topic: str, recorded_ns: int) -> None:
         stamp = stamp_ns(message.header)
         images = self.images[topic]
-        images.add(message, stamp or recorded_ns)
+        images.add(message, time_ns=stamp or recorded_ns)
         if not stamp:
             images.unstamped += 1
 
@@ -195,7 +199,7 @@ def read_content(bag: Bag, topics: Mapping[str, tuple[str, str]]) -> BagContent:
     for image_topic, info_topic in topics.values():
         if info_topic:
             image_topics_of[info_topic].append(image_topic)
-    connections = _readable_connections(bag, topics, content)
+    connections = _readable_connections(bag, topics=topics, content=content)
     known_infos: dict[str, bytes] = {}
     for connection, recorded_ns, raw in read_messages(bag, connections):
         topic = connection.topic
@@ -223,7 +227,11 @@ def _readable_connections(
     bag: Bag, topics: Mapping[str, tuple[str, str]], content: BagContent
 ) -> list[Any]:
     """Connections of cameras, transforms and odometry; unreadable topics are noted in content."""
-    camera_topics = {topic for pair in topics.values() for topic in pair if topic}
+    camera_topics = set()
+    for image_topic, info_topic in topics.values():
+        camera_topics.add(image_topic)
+        if info_topic:
+            camera_topics.add(info_topic)
     readable = []
     for connection in bag.connections:
         is_pose = connection.msgtype in _TRANSFORMS or connection.msgtype == _ODOMETRY

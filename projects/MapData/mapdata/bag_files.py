@@ -16,7 +16,7 @@ Bag = RosBag | McapBag
 SUFFIXES = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"
 _MOST_BYTES = 300_000  # of metadata; YAML takes some milliseconds for a thousand bytes
-_ALIAS = re.compile(r"(^|[\s\[{,:-])\*\w", re.MULTILINE)
+_ALIAS = re.compile(r"(^|[\s\[{,:-])\*\w", flags=re.MULTILINE)
 _PACKED = (".zstd", ".zst", ".lz4", ".gz", ".bz2", ".xz", ".zip", ".tar")
 _STARTS = {".mcap": MAGIC, ".db3": b"SQLite format 3\0", ".bag": b"#ROSBAG V2.0"}
 
@@ -58,7 +58,7 @@ def bag_at(path: Path) -> Bag:
     """
     if not path.is_dir():
         heed_input(path)
-        return _bag_of([path], _notes_on([path]))
+        return _bag_of([path], notes=_notes_on([path]))
     parts = parts_in(path)
     if not (path / _METADATA).is_file():
         _check_parts(parts)
@@ -68,7 +68,7 @@ def bag_at(path: Path) -> Bag:
             notes.append(
                 f"{path.name} has no {_METADATA}: {names} are read as the parts of one recording"
             )
-        return _bag_of(parts, notes + _notes_on(parts))
+        return _bag_of(parts, notes=notes + _notes_on(parts))
     listed_parts = _listed_parts(path)
     notes = _notes_on(listed_parts)
     unlisted = [part.name for part in parts if part not in listed_parts]
@@ -78,15 +78,15 @@ def bag_at(path: Path) -> Bag:
             "them: `ros2 bag reindex` lists them"
         )
     if listed_parts and _needs_mcap_reader(listed_parts):
-        return McapBag(listed_parts, notes)
-    return RosBag([path], notes)
+        return McapBag(listed_parts, notes=notes)
+    return RosBag([path], notes=notes)
 
 
 def _bag_of(parts: Sequence[Path], notes: list[str]) -> Bag:
     """Create the bag of some files; there must be at least one."""
     if _needs_mcap_reader(parts):
-        return McapBag(parts, notes)
-    return RosBag(parts, notes)
+        return McapBag(parts, notes=notes)
+    return RosBag(parts, notes=notes)
 
 
 def _needs_mcap_reader(parts: Sequence[Path]) -> bool:
@@ -123,8 +123,11 @@ def _read_metadata(file: Path) -> str:
 
 def _check_parts(parts: Sequence[Path]) -> None:
     """Raise a ``ValueError`` unless files are one file, or the numbered parts of one recording."""
-    patterns = {re.sub(r"\d+", "0", part.name) for part in parts}
-    numbers = {_part_number(part) for part in parts}
+    patterns = set()
+    numbers = set()
+    for part in parts:
+        patterns.add(re.sub(r"\d+", repl="0", string=part.name))
+        numbers.add(_part_number(part))
     if len(parts) > 1 and (len(patterns) > 1 or len(numbers) < len(parts)):
         names = ", ".join(part.name for part in parts)
         raise InputError(f"it holds several bags ({names}): name one of them")
@@ -203,7 +206,7 @@ def _damage_of(path: Path) -> str | None:
             " keeps what is readable"
         )
     if path.suffix == ".bag":
-        index = re.search(rb"index_pos=(.{8})", start, re.DOTALL)
+        index = re.search(rb"index_pos=(.{8})", start, flags=re.DOTALL)
         position = struct.unpack("<Q", index[1])[0] if index else 0
         if not 0 < position <= size:
             return (

@@ -48,7 +48,7 @@ def image_size(message: Any) -> tuple[int, int] | None:
     """Width and height of a message's image in pixels; None if the image is damaged."""
     if hasattr(message, "encoding"):
         return int(message.width), int(message.height)
-    content = np.asarray(message.data, np.uint8).tobytes()
+    content = np.asarray(message.data, dtype=np.uint8).tobytes()
     try:
         with Image.open(BytesIO(content), formats=FORMATS) as picture:
             return picture.size
@@ -76,8 +76,8 @@ def write_image(message: Any, camera: RigCamera, target: Path, where: str) -> No
     trouble = trouble_with(message)
     if trouble:
         raise InputError(trouble)
-    content = np.asarray(message.data, np.uint8).tobytes()
-    image = decode_image(content, "its message", where, camera.size_px)
+    content = np.asarray(message.data, dtype=np.uint8).tobytes()
+    image = decode_image(content, path="its message", where=where, size=camera.size_px)
     is_jpeg = content.startswith(b"\xff\xd8")
     if camera.is_distorted or not is_jpeg:
         camera.write_image(target, image)
@@ -96,7 +96,7 @@ def _raw_image(message: Any, size_px: tuple[int, int]) -> np.ndarray:
         raise InputError(f"it has {(width, height)} pixels, and its camera info says {size_px}")
     encoding = message.encoding
     channels = _CHANNELS.get(encoding, 1)
-    rows = np.asarray(message.data, np.uint8).reshape(height, message.step)
+    rows = np.asarray(message.data, dtype=np.uint8).reshape(height, message.step)
     image = rows[:, : width * channels].reshape(height, width, channels)
     code = _TO_BGR[encoding]
     if code is None:

@@ -143,7 +143,9 @@ class FrameTree:
         sources = self.edges.setdefault(child, {})
         key = (topic, parent)
         if key not in sources:
-            sources[key] = Transforms(topic, child, parent, is_static=is_static_topic(topic))
+            sources[key] = Transforms(
+                topic=topic, child=child, parent=parent, is_static=is_static_topic(topic)
+            )
         sources[key].add(time_ns, pose)
 
     @property
@@ -250,8 +252,8 @@ class FrameTree:
         common = next((name for name in frame_chain if name in vehicle_chain), None)
         if common is None:
             return None
-        common_from_vehicle = self._pose_below(common, vehicle_chain, frame)
-        common_from_frame = self._pose_below(common, frame_chain, frame)
+        common_from_vehicle = self._pose_below(common, names=vehicle_chain, frame=frame)
+        common_from_frame = self._pose_below(common, names=frame_chain, frame=frame)
         return invert_rigid(common_from_vehicle) @ common_from_frame
 
     def _pose_below(self, ancestor: str, names: Sequence[str], frame: str) -> np.ndarray:
@@ -307,7 +309,7 @@ class FrameTree:
         self.notes += jumps
         if jumps:
             return None
-        return PoseChain(steps, ground, span_ns=(start_ns, end_ns))
+        return PoseChain(steps, ground=ground, span_ns=(start_ns, end_ns))
 
 
 def _jump_notes(track: PoseTrack, source: str) -> list[str]:
@@ -377,4 +379,4 @@ def odometry_poses(
     if jumps:
         return None, notes + jumps
     span_ns = (min(best.times_ns), max(best.times_ns))
-    return PoseChain([track], child_from_vehicle @ ground, span_ns), notes
+    return PoseChain([track], ground=child_from_vehicle @ ground, span_ns=span_ns), notes

@@ -108,8 +108,13 @@ def camera_topics(kinds: Mapping[str, str], listing: str) -> dict[str, tuple[str
         ValueError: If there is no camera, or the camera info of a camera is ambiguous.
     """
     infos = sorted(topic for topic, kind in kinds.items() if kind == INFO)
-    candidates = {topic: _candidate_infos(topic, infos) for topic in kinds}
-    cameras = image_topics({t: kind for t, kind in kinds.items() if candidates[t]})
+    candidates = {}
+    kinds_with_info = {}
+    for topic, kind in kinds.items():
+        candidates[topic] = _candidate_infos(topic, infos)
+        if candidates[topic]:
+            kinds_with_info[topic] = kind
+    cameras = image_topics(kinds_with_info)
     if not cameras:
         raise InputError(
             "it has no camera with images (sensor_msgs Image or CompressedImage) and a CameraInfo: "

@@ -57,7 +57,7 @@ def read_bag(path: Path, options: InputOptions) -> Source:
             bag = bag_at(path)
             try:
                 bag.open()
-                return _read_samples(bag, path, options)
+                return _read_samples(bag, path, options=options)
             finally:
                 bag.close()
         except ValueError as error:
@@ -74,11 +74,11 @@ def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
     calibration = options.calibration
     notes = list(bag.notes)
     ground = rigid(np.eye(3), (0, 0, options.vehicle_ground_z_m or 0.0))
-    check_topics(kinds, options.topics, listing, needs_info=calibration is None)
+    check_topics(kinds, options.topics, listing=listing, needs_info=calibration is None)
     if calibration is None:
         topics = options.topics or camera_topics(kinds, listing)
         content = read_content(bag, topics)
-        vehicle = _choose_vehicle(content, options.vehicle_frame)
+        vehicle = _choose_vehicle(content, wanted=options.vehicle_frame)
         rig, rig_notes = _build_rig(
             topics, content, vehicle=vehicle, ground=ground, by_hand=bool(options.topics)
         )
@@ -94,9 +94,9 @@ def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
             topics[camera.name] = (topic, "")
         content = read_content(bag, topics)
         for name, pair in topics.items():
-            _require_messages(name, pair, content)
+            _require_messages(name, pair, content=content)
         has_frames = bool(content.tree.frames)
-        vehicle = _choose_vehicle(content, options.vehicle_frame) if has_frames else ""
+        vehicle = _choose_vehicle(content, wanted=options.vehicle_frame) if has_frames else ""
         rig = {topics[camera.name][0]: camera for camera, _ in calibrated_cameras}
         content.digest.update(calibration.read_bytes())
     content.digest.update(rectify_as_trained(list(rig.values()), options.trained))
@@ -105,7 +105,7 @@ def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
     for topic, camera in rig.items():
         times_ns[camera.name] = np.unique(content.images[topic].times_ns)
     first = next((name for name in times_ns if "front" in name.lower()), next(iter(times_ns)))
-    pose_at, pose_notes = _poses(content, vehicle, ground)
+    pose_at, pose_notes = _poses(content, vehicle=vehicle, ground=ground)
     count_without_poses = len(thin_out(times_ns[first], options.rate_hz))
     wanted_ns = thin_out(_near_poses(times_ns[first], pose_at), options.rate_hz).tolist()
     frames = []
@@ -114,18 +114,32 @@ def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
         images_of_frame = {}
         for name, time_ns in image_times.items():
             images_of_frame[name] = (f"{file_name(name)}/{time_ns}.jpg", time_ns)
-        frames.append(RigFrame(f"{path.stem}_{frame_ns}", frame_ns, images=images_of_frame))
+        frames.append(
+            RigFrame(token=f"{path.stem}_{frame_ns}", time_ns=frame_ns, images=images_of_frame)
+        )
     samples = rig_samples(path.stem, list(rig.values()), frames=frames, pose_at=pose_at)
 
     notes += content.notes() + content.tree.notes + pose_notes
-    notes += _usage_notes(len(samples), count_without_poses, times_ns[first], pose_at, first)
-    notes += _absence_notes(frames, times_ns, first)
+    notes += _usage_notes(
+        len(samples),
+        count_without_poses,
+        times_ns=times_ns[first],
+        pose_at=pose_at,
+        camera=first,
+    )
+    notes += _absence_notes(frames, times_ns, first=first)
     digest = content.digest.hexdigest()[:16]
     root = options.frames_dir / f"{file_name(path.stem)}-{digest}"
     sample_times_ns = {sample.timestamp_ns for sample in samples}
     sample_frames = [frame for frame in frames if frame.time_ns in sample_times_ns]
     notes += _write_images(bag, rig, frames=sample_frames, frames_dir=root)
-    return Source(samples, "ego", root, has_poses=pose_at is not None, notes=tuple(notes))
+    return Source(
+        samples=samples,
+        frame="ego",
+        data_root=root,
+        has_poses=pose_at is not None,
+        notes=tuple(notes),
+    )
 
 
 def _topic_of(name: str, place: str, images: Mapping[str, str], kinds: Mapping[str, str]) -> str:
@@ -189,7 +203,9 @@ def _build_rig(
         try:
             if trouble and is_any_usable and not by_hand:
                 raise InputError(f"camera {name!r}: {trouble}")
-            rig[topic], camera_notes = _build_camera(name, pair, content, vehicle, ground)
+            rig[topic], camera_notes = _build_camera(
+                name, pair, content=content, vehicle=vehicle, ground=ground
+            )
             notes += camera_notes
         except ValueError as error:
             errors[name] = error
@@ -205,7 +221,7 @@ def _build_camera(
     name: str, topics: tuple[str, str], content: BagContent, vehicle: str, ground: np.ndarray
 ) -> tuple[RigCamera, list[str]]:
     """Build a camera from its camera info and its mounting, with notes on assumptions."""
-    _require_messages(name, topics, content)
+    _require_messages(name, topics, content=content)
     images = content.images[topics[0]]
     info = content.infos[topics[0]]
     frame = images.frame_id or info.header.frame_id.lstrip("/")

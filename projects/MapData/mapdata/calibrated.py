@@ -50,19 +50,19 @@ def calibrated_records(
                 _require_keys(camera, file)
                 images.setdefault(str(camera["name"]), []).append(root / camera["path"])
                 time_of[Path(camera["path"]).stem] = _time_of(camera, record)
-    rig, poses = read_vehicle(file, images, time_of)
+    rig, poses = read_vehicle(file, images=images, time_of=time_of)
     camera_of = {camera.name: camera for camera in rig}
     pose_at = None if poses is None else cache(poses.at)
     for number, record in enumerate(records):
         with naming(f"record {_name_of(record, number)!r}", "correct it"):
-            frame = _rig_frame(record, camera_of, file)
+            frame = _rig_frame(record, camera_of=camera_of, file=file)
             if pose_at is not None and record.get(_POSE) is not None:
                 raise InputError(f"{_POSE} is given, and {file} has poses, too: leave out one.")
             scene = str(record.get("scene") or "")
             samples = rig_samples(scene, rig, frames=[frame], pose_at=pose_at)
             if not samples:
                 raise InputError(f"{file} has no pose near timestamp_ns {frame.time_ns}.")
-            sample = _in_frame(samples[0], record, meta)
+            sample = _in_frame(samples[0], record=record, meta=meta)
             completed = {**record, "ego_from_frame": sample.ego_from_frame}
             if pose_at is not None:
                 completed[_POSE] = sample.global_from_frame
@@ -119,9 +119,9 @@ def _in_frame(sample: MapSample, record: Mapping[str, Any], meta: AnnotationMeta
     ground_z_m = meta.ground_z_m
     ego_from_frame = record.get("ego_from_frame")
     if ego_from_frame is None:
-        mount = Mount(meta.frame, ground_z_m)
+        mount = Mount(meta.frame, ground_z_m=ground_z_m)
     else:
         sample_with_mount = replace(sample, ego_from_frame=np.asarray(ego_from_frame, np.float64))
-        ground = ground_from_frame(sample_with_mount, meta.frame, ground_z_m)
-        mount = Mount(meta.frame, ground_z_m, ground)
+        ground = ground_from_frame(sample_with_mount, meta.frame, ground_z_m=ground_z_m)
+        mount = Mount(meta.frame, ground_z_m=ground_z_m, ground_from_frame=ground)
     return change_frame(sample, "ego", mount)

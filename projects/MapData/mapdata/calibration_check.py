@@ -61,15 +61,17 @@ def calibration_figure(
     Returns:
         The figure, with different colours for lines ahead, to the left, to the right and behind.
     """
-    frame_from_ground = invert_rigid(ground_from_frame(sample, frame, ground_z_m))
+    frame_from_ground = invert_rigid(ground_from_frame(sample, frame, ground_z_m=ground_z_m))
     lines = _ground_lines(frame_from_ground)
-    wedges = [("cameras", _wedge(camera, frame_from_ground)) for camera in sample.cameras]
+    wedges = []
+    for camera in sample.cameras:
+        wedges.append(("cameras", _wedge(camera, frame_from_ground)))
     x_range, y_range = RANGES[frame]
     return compose_figure(
         cameras=camera_views(sample.cameras, data_root, sample.token, grey=True),
         panels=[BEVPanel("From above", _elements([*lines, *wedges]))],
-        grid=BEVGrid(x_range, y_range),
-        view=frame_view(frame, ground_z_m).with_mounting(sample.ego_from_frame),
+        grid=BEVGrid(x_range=x_range, y_range=y_range),
+        view=frame_view(frame, ground_z_m=ground_z_m).with_mounting(sample.ego_from_frame),
         style=MapStyle(classes=_LINES),
         camera_elements=_elements(lines),
         title=f"ground plane of {sample.token}",
@@ -79,8 +81,11 @@ def calibration_figure(
 
 def _elements(lines: Sequence[tuple[str, np.ndarray]]) -> MapElements:
     """Lines as map elements, whose labels are positions in ``_LINES``."""
-    polylines = [points for _, points in lines]
-    labels = [_LINES.index(name) for name, _ in lines]
+    polylines = []
+    labels = []
+    for name, points in lines:
+        polylines.append(points)
+        labels.append(_LINES.index(name))
     return MapElements.from_polylines(polylines, labels)
 
 

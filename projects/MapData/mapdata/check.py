@@ -134,4 +134,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> str:
     """Run the command ``check`` and return its report."""
-    return check_files(arguments.annotations, arguments.data_root, arguments.workers)
+    return check_files(arguments.annotations, root=arguments.data_root, workers=arguments.workers)

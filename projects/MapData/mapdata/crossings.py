@@ -21,7 +21,7 @@ def long_edges(polygons: np.ndarray) -> np.ndarray:
         lengths = np.linalg.norm(np.diff(ring, axis=0), axis=1)
         for start in np.argsort(lengths, kind="stable")[-2:]:
             edges.append(ring[start : start + 2])
-    return shapely.linestrings(np.array(edges)) if edges else np.empty(0, object)
+    return shapely.linestrings(np.array(edges)) if edges else np.empty(0, dtype=object)
 
 
 def open_outlines(pieces: np.ndarray, owner: np.ndarray, patch: LocalPatch) -> np.ndarray:
@@ -111,7 +111,7 @@ def _long_side(geometry: shapely.Geometry) -> np.ndarray:
     edges = np.diff(hull, axis=0)
     edge_lengths = np.hypot(edges[:, 0], edges[:, 1])
     along = edges / edge_lengths[:, None]  # a side of the rectangle lies on the hull
-    across = np.stack([-along[:, 1], along[:, 0]], -1)
+    across = np.stack([-along[:, 1], along[:, 0]], axis=-1)
     length = np.ptp(hull @ along.T, axis=0)
     width = np.ptp(hull @ across.T, axis=0)
     best = (length * width).argmin()

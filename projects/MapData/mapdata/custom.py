@@ -104,11 +104,10 @@ def from_records(
     source = ""
     if shard.count:
         records = list(records)
-        names = [
-            record.get("token") if isinstance(record, Mapping) else record for record in records
-        ]
-        tokens = "\n".join(map(str, names))
-        source = hashlib.sha256(tokens.encode()).hexdigest()
+        tokens = []
+        for record in records:
+            tokens.append(str(record.get("token") if isinstance(record, Mapping) else record))
+        source = hashlib.sha256("\n".join(tokens).encode()).hexdigest()
         records = shard.part(records)
     if calibration is not None:
         records = calibrated_records(
@@ -131,12 +130,12 @@ def _samples(
             unknown = set(record) - set(_KEYS)
             if unknown:
                 raise InputError(f"unknown keys {sorted(unknown)}; known are {_KEYS}.")
-            sample = _create_sample(record, meta, root)
+            sample = _create_sample(record, meta=meta, root=root)
             check_samples([sample], meta)
             count += 1
             had_elements = bool(sample.instances)
             if sample.instances is not None:
-                sample.instances = _clip_elements(sample.instances, meta, join)
+                sample.instances = _clip_elements(sample.instances, meta=meta, join=join)
         if had_elements and not sample.instances:
             empty_tokens.append(sample.token)
         if sample.ego_from_frame is None and meta.frame == "lidar" and not has_warned:
@@ -158,7 +157,7 @@ def _clip_elements(
     for element in elements:
         points = np.asarray(element.points, np.float64)
         for piece in _clip(points, meta):
-            pieces.append(MapInstance(element.label, piece))
+            pieces.append(MapInstance(label=element.label, points=piece))
     return pieces
 
 
@@ -188,7 +187,7 @@ def join_lines(instances: Sequence[MapInstance]) -> list[MapInstance]:
         _snap_ends(lines)
         parts = shapely.get_parts(shapely.line_merge(shapely.MultiLineString(lines)))
         for points in vertices_of(parts, dim=lines[0].shape[1]):
-            joined.append(MapInstance(label, points))
+            joined.append(MapInstance(label=label, points=points))
     return joined
 
 
@@ -224,7 +223,9 @@ def _create_sample(record: Mapping[str, Any], meta: AnnotationMeta, root: Path) 
     for name, value in record.items():
         if value is not None:
             values[name] = value
-    values["cameras"] = [_create_camera(camera, token, root) for camera in record["cameras"]]
+    values["cameras"] = [
+        _create_camera(camera, token=token, root=root) for camera in record["cameras"]
+    ]
     if "lidar" in values:
         lidar = values["lidar"]
         frame_from_lidar = lidar.get("frame_from_lidar")
@@ -237,7 +238,7 @@ def _create_sample(record: Mapping[str, Any], meta: AnnotationMeta, root: Path) 
         elements = []
         for instance in values["instances"]:
             label = _class_index(instance["label"], meta)
-            elements.append(MapInstance(label, instance["points"]))
+            elements.append(MapInstance(label=label, points=instance["points"]))
         values["instances"] = elements
     return MapSample(**values)
 
@@ -279,7 +280,7 @@ def _create_camera(camera: Mapping[str, Any], token: str, root: Path) -> CameraR
         where = f"sample {token!r}, camera {camera['name']!r}"
         values["width"], values["height"] = image_size(root / camera["path"], where)
     if np.any(camera.get("distortion", ())):
-        values["path"] = _rectify_image(values, root)
+        values["path"] = _rectify_image(values, root=root)
     return _create_record(CameraRecord, values)
 
 
@@ -287,10 +288,10 @@ def _rectify_image(camera: Mapping[str, Any], root: Path) -> str:
     """Write a camera's image without its distortion, and return its path below the data root."""
     rig_camera = RigCamera(
         name=str(camera["name"]),
-        intrinsics=np.array(camera["intrinsics"], np.float64),
+        intrinsics=np.array(camera["intrinsics"], dtype=np.float64),
         cam_from_ground=np.eye(4),
         size_px=(int(camera["width"]), int(camera["height"])),
-        distortion=np.array(camera["distortion"], np.float64),
+        distortion=np.array(camera["distortion"], dtype=np.float64),
         model=str(camera.get("distortion_model", "")),
     )
     calibration = (
@@ -323,11 +324,11 @@ def _clip(points: Points, meta: AnnotationMeta) -> list[Points]:
     if ((points[:, :2] >= low) & (points[:, :2] <= high)).all():
         return [points]
     if not is_closed(points):
-        return list(clip_to_box(points, meta.x_range, meta.y_range))
+        return list(clip_to_box(points, x_range=meta.x_range, y_range=meta.y_range))
     polygon = shapely.Polygon(points)
     if not polygon.is_valid:
         raise InputError("a ring that leaves the range crosses itself and cannot be cut: mend it.")
-    box = shapely.box(low[0], low[1], high[0], high[1])
+    box = shapely.box(xmin=low[0], ymin=low[1], xmax=high[0], ymax=high[1])
     parts = shapely.get_parts(shapely.intersection(polygon, box))
     is_area = (shapely.get_type_id(parts) == POLYGON) & ~shapely.is_empty(parts)
     return vertices_of(shapely.get_exterior_ring(parts[is_area]), dim=meta.dim)

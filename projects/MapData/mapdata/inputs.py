@@ -59,10 +59,10 @@ def open_input(path: str | Path, options: InputOptions | None = None) -> Source:
         return open_annotations(path, options.data_root)
     if path.suffix == ".pkl":
         root = options.data_root or path.parent
-        samples = read_info_file(path, root, options.allow_missing_cameras)
-        return Source(samples, "lidar", root)
+        samples = read_info_file(path, root, allow_missing_cameras=options.allow_missing_cameras)
+        return Source(samples, frame="lidar", data_root=root)
     if path.suffix in (".yaml", ".yml", ".json"):
-        return read_image_folder(path, options.frames_dir, options.trained)
+        return read_image_folder(path, frames_dir=options.frames_dir, trained=options.trained)
     advice = suffix_advice(path)
     if advice:
         raise InputError(f"{path} cannot be used: {advice}.")
@@ -73,15 +73,15 @@ def _open_folder(folder: Path, options: InputOptions) -> Source:
     """Read the samples of a folder, with the reader for its content."""
     if versions_in(folder):
         samples, notes = read_nuscenes(folder, options.version)
-        return Source(samples, "lidar", folder, notes=notes)
+        return Source(samples, frame="lidar", data_root=folder, notes=notes)
     logs = logs_in(folder)
     if logs:
         root = folder.parent if logs == [folder] else folder
-        samples, left_out = read_logs(logs, root, options.rate_hz)
+        samples, left_out = read_logs(logs, root, rate_hz=options.rate_hz)
         log_notes = []
         for reason, count in left_out.items():
             log_notes.append(f"{len(samples)} samples used, left out: {count} for {reason}")
-        return Source(samples, "ego", root, notes=tuple(log_notes))
+        return Source(samples, frame="ego", data_root=root, notes=tuple(log_notes))
     files = [folder / name for name in NAMES if (folder / name).is_file()]
     if not files:
         for pattern in _FILES:

@@ -69,7 +69,7 @@ class LanePaths:
         self._points, nodes, uses = np.unique(
             rounded, axis=0, return_inverse=True, return_counts=True
         )  # (nodes, 3)
-        ends = np.cumsum([len(line) for line in polylines], dtype=np.int64)
+        ends = np.cumsum(list(map(len, polylines)), dtype=np.int64)
         lanes = [lane.tolist() for lane in np.split(nodes, ends)[:-1]]
         self._edges = [_fold_points(lane, uses) for lane in lanes]
         self._links: list[list[tuple[int, int, tuple[int, Edge]]]] = []
@@ -115,9 +115,13 @@ class LanePaths:
                         f"the lanes of one frame allow more than {MAX_PATHS} paths: the lane graph "
                         "is damaged."
                     )
-        nodes = np.array([node for path in paths for node in path], dtype=np.int64)
-        indices = np.repeat(np.arange(len(paths)), [len(path) for path in paths])
-        lines = shapely.linestrings(self._points[nodes], indices=indices)
+        nodes: list[int] = []
+        path_of_node: list[int] = []
+        for number, path in enumerate(paths):
+            nodes += path
+            path_of_node += [number] * len(path)
+        points = self._points[np.array(nodes, dtype=np.int64)]
+        lines = shapely.linestrings(points, indices=np.array(path_of_node, dtype=np.int64))
         self._last_key = key
         self._last_lines = shapely.simplify(lines, SIMPLIFY_TOLERANCE_M)
         return self._last_lines

@@ -60,7 +60,9 @@ class LocalPatch:
         """The rectangle in the frame of the patch, enlarged by ``margin_m`` on every side."""
         x0, x1 = self.x_range
         y0, y1 = self.y_range
-        return shapely.box(x0 - margin_m, y0 - margin_m, x1 + margin_m, y1 + margin_m)
+        return shapely.box(
+            xmin=x0 - margin_m, ymin=y0 - margin_m, xmax=x1 + margin_m, ymax=y1 + margin_m
+        )
 
     # Products are written out below: a matrix product may round equal points differently in
     # different rows, and equal points must stay equal for lines to join.
@@ -68,7 +70,7 @@ class LocalPatch:
         """Transform points from the map to the patch's frame, in the plane. (n, 2+) -> (n, 2)"""
         x, y = (points[:, :2] - self.global_from_frame[:2, 3]).T
         r = self.rotation
-        return np.stack([r[0, 0] * x + r[1, 0] * y, r[0, 1] * x + r[1, 1] * y], -1)
+        return np.stack([r[0, 0] * x + r[1, 0] * y, r[0, 1] * x + r[1, 1] * y], axis=-1)
 
     def to_local(self, geometries: np.ndarray) -> np.ndarray:
         """Transform geometries from the map to the patch's frame, in the plane. (n,)"""
@@ -86,7 +88,7 @@ class LocalPatch:
             x, y, z = (points - translation).T
             z = np.where(np.isnan(z), 0.0, z)
             columns = [row[0] * x + row[1] * y + row[2] * z for row in rotation]
-            return np.stack(columns, -1)
+            return np.stack(columns, axis=-1)
 
         return shapely.transform(geometries, transform_points, include_z=True)
 
@@ -190,7 +192,7 @@ class OutlineIndex:
                 for chunk in run[1:]:
                     parts.append(self._chunks[chunk][1:])  # chunks share a point
                 points = patch.points_to_local(np.concatenate(parts))
-                pieces += clip_to_box(points, x_range, y_range)
+                pieces += clip_to_box(points, x_range=x_range, y_range=y_range)
         return pieces
 
     def _runs(self, chunks: np.ndarray) -> list[np.ndarray]:

@@ -49,6 +49,13 @@ class Places:
         """Rows of the samples on each map, ascending, by its name."""
         return {str(name): np.flatnonzero(self.maps == name) for name in np.unique(self.maps)}
 
+    def positions_by_map(self) -> dict[str, np.ndarray]:
+        """(x, y) of the samples on each map in metres, by its name. each (n, 2)"""
+        positions = {}
+        for name, rows in self.by_map().items():
+            positions[name] = self.positions[rows]
+        return positions
+
     def select(self, rows: np.ndarray) -> "Places":
         """Select samples by their rows, or by a mask. (m,) or (n,) bool"""
         return Places(
@@ -159,9 +166,8 @@ def sample_overlap(train: Places, val: Places) -> tuple[np.ndarray, np.ndarray]:
     nearest = np.full(len(val.tokens), -1)
     train_rows = train.by_map()
     val_rows = val.by_map()
-    train_positions = {name: train.positions[rows] for name, rows in train_rows.items()}
-    val_positions = {name: val.positions[rows] for name, rows in val_rows.items()}
-    for name, (distances, rows) in nearest_by_map(train_positions, val_positions).items():
+    by_map = nearest_by_map(train.positions_by_map(), val.positions_by_map())
+    for name, (distances, rows) in by_map.items():
         distance[val_rows[name]] = distances
         if name in train_rows:
             nearest[val_rows[name]] = train_rows[name][rows]

@@ -69,7 +69,7 @@ class RosTypes:
             ValueError: If the definition cannot be parsed, or is too large.
         """
         with library_errors():
-            store = self._store_with(msgtype, definition, is_idl)
+            store = self._store_with(msgtype, definition, is_idl=is_idl)
             if msgtype not in store.fielddefs:
                 raise InputError(f"the bag does not define its type {msgtype!r}")
         deserialize = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
@@ -211,7 +211,7 @@ class RosBag:
 
     def messages(self, connections: Iterable[Any]) -> Iterator[tuple[Any, int, bytes]]:
         """Yield connection, time in nanoseconds and content of messages, in order of time."""
-        selected_ids = {id(connection) for connection in connections}
+        selected_ids = set(map(id, connections))
         streams = []
         for reader in self._readers:
             selected = [item for item in reader.connections if id(item) in selected_ids]

@@ -20,7 +20,7 @@ def _near_scenes(scenes: np.ndarray, positions: np.ndarray, distance_m: float) -
     Returns (S, S) bool.
     """
     count = scenes.max() + 1
-    near = np.zeros((count, count), bool)
+    near = np.zeros((count, count), dtype=bool)
     tree = cKDTree(positions)
     for scene in range(count):
         neighbours = tree.query_ball_point(positions[scenes == scene], distance_m)
@@ -38,8 +38,8 @@ def _select_scenes(
         Mask of the selected scenes (S,), and mask of scenes that are not near a selected one (S,).
     """
     rank = rng.permutation(len(near))
-    selected = np.zeros(len(near), bool)
-    covered = np.zeros(len(near), bool)
+    selected = np.zeros(len(near), dtype=bool)
+    covered = np.zeros(len(near), dtype=bool)
     scene = int(rank.argmin())
     while True:
         selected[scene] = True
@@ -85,7 +85,7 @@ def split_scenes(
             parts["train"] += names.tolist()
             continue
         near = _near_scenes(scenes, places.positions[rows], distance_m=min_distance_m)
-        selected, far = _select_scenes(near, count, rng)
+        selected, far = _select_scenes(near, count=count, rng=rng)
         parts["train"] += names[far].tolist()
         parts["val"] += names[selected].tolist()
     if not parts["train"] or not parts["val"]:

@@ -66,14 +66,14 @@ def write_vectors(annotations: Sequence[Path], target: Path) -> int:
     head = {**common, "split": splits, "versions": meta.versions}
     with atomic_write(target) as out:
         out.write(f'{{"meta": {json.dumps(head)}, "{_GROUND_TRUTH}": [')
-        separator = "\n"
+        count = 0
         for file in files:
             for record in _records(file):
-                out.write(separator)
+                out.write(",\n" if count else "\n")
                 json.dump(record, out)
-                separator = ",\n"
+                count += 1
         out.write("\n]}\n")
-    return sum(len(file) for file in files)
+    return count
 
 
 def _records(file: AnnotationFile) -> Iterator[dict[str, Any]]:

@@ -46,12 +46,12 @@ def read_rig(file: Path, ground: np.ndarray) -> tuple[list[tuple[RigCamera, str]
         ValueError: If the file is malformed; the message names the camera.
     """
     rig = []
-    with naming(file, "see docs/inference.md"):
+    with naming(file, remedy="see docs/inference.md"):
         content = read_calibration(file)
         if "ground_z_m" in content:
             ground = ground_pose(content)
         for name, camera in cameras_of(content):
-            with naming(f"{file}, camera {name!r}", "see docs/inference.md"):
+            with naming(f"{file}, camera {name!r}", remedy="see docs/inference.md"):
                 check_camera_keys(camera)
                 if "size_px" not in camera:
                     raise InputError("beside a bag it needs size_px: [width, height]")
@@ -78,16 +78,16 @@ def read_vehicle(
         ValueError: If the file is malformed; the message names the camera.
     """
     rig = []
-    with naming(file, "see docs/inference.md"):
+    with naming(file, remedy="see docs/inference.md"):
         content = read_calibration(file)
         ground = ground_pose(content)
         for name, camera in cameras_of(content):
             if name not in images:
                 continue
-            with naming(f"{file}, camera {name!r}", "see docs/inference.md"):
+            with naming(f"{file}, camera {name!r}", remedy="see docs/inference.md"):
                 check_camera_keys(camera)
                 rig.append(create_camera(name, camera, ground=ground, images=images[name]))
-        poses = read_named_poses(content, file.parent, time_of=time_of, ground=ground)
+        poses = read_named_poses(content, folder=file.parent, time_of=time_of, ground=ground)
         return rig, poses
 
 
@@ -147,7 +147,7 @@ def read_calibration(file: Path) -> dict[str, Any]:
         ValueError: If the file is malformed or too large, or has unknown keys.
     """
     content = _read_values(file)
-    _check_keys(content, _KEYS, "a calibration file")
+    _check_keys(content, known_keys=_KEYS, noun="a calibration file")
     if not isinstance(content.get("cameras"), dict) or not content["cameras"]:
         raise InputError("`cameras` must map names to cameras, at least one")
     return dict(content)
@@ -161,7 +161,7 @@ def cameras_of(content: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 def check_camera_keys(camera: Any) -> None:
     """Raise a ``ValueError`` if the entry of a camera is no mapping, or has unknown keys."""
-    _check_keys(camera, _CAMERA_KEYS, "a camera")
+    _check_keys(camera, known_keys=_CAMERA_KEYS, noun="a camera")
 
 
 def _check_keys(value: Any, known_keys: set[str], noun: str) -> None:
@@ -174,7 +174,7 @@ def _check_keys(value: Any, known_keys: set[str], noun: str) -> None:
 
 def ground_pose(content: Mapping[str, Any]) -> np.ndarray:
     """Pose of the road in the vehicle's frame, from ``ground_z_m`` of a calibration. (4, 4)"""
-    return rigid(np.eye(3), (0, 0, float(content.get("ground_z_m", 0.0))))
+    return rigid(rotation=np.eye(3), translation=(0, 0, float(content.get("ground_z_m", 0.0))))
 
 
 def read_named_poses(
@@ -194,7 +194,7 @@ def read_named_poses(
     if not content.get("poses"):
         return None
     path = path_below(folder, str(content["poses"]), noun="poses")
-    return read_poses(path, time_of, ground)
+    return read_poses(path, time_of=time_of, ground=ground)
 
 
 def path_below(folder: Path, name: str, noun: str) -> Path:
@@ -233,19 +233,19 @@ def create_camera(
     Raises:
         ValueError: If a value is malformed.
     """
-    intrinsics = np.array(camera["intrinsics"], np.float64)
+    intrinsics = np.array(camera["intrinsics"], dtype=np.float64)
     if intrinsics.shape == (4,):
         fx, fy, cx, cy = intrinsics
         intrinsics = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     if intrinsics.shape != (3, 3):
         raise InputError(f"intrinsics must be [fx, fy, cx, cy] or 3 x 3, got {intrinsics.shape}")
-    width, height = camera.get("size_px") or _size_of(images, f"camera {name!r}")
+    width, height = camera.get("size_px") or _size_of(images, where=f"camera {name!r}")
     return RigCamera(
         name=name,
         intrinsics=intrinsics,
         cam_from_ground=invert_rigid(_vehicle_from_camera(camera)) @ ground,
         size_px=(int(width), int(height)),
-        distortion=np.array(camera.get("distortion", ()), np.float64),
+        distortion=np.array(camera.get("distortion", ()), dtype=np.float64),
         model=str(camera.get("distortion_model", "")),
     )
 
@@ -267,7 +267,7 @@ def _vehicle_from_camera(camera: Mapping[str, Any]) -> np.ndarray:
             f"quaternion_wxyz or yaw_pitch_roll_deg; got {sorted(keys) or 'none of them'}"
         )
     if "vehicle_from_camera" in camera:
-        pose = np.array(camera["vehicle_from_camera"], np.float64)
+        pose = np.array(camera["vehicle_from_camera"], dtype=np.float64)
         if pose.shape == (4, 4) and np.linalg.det(pose[:3, :3]) < 0:
             raise InputError(
                 "vehicle_from_camera mirrors (its rotation's determinant is below 0): two axes are "
@@ -281,4 +281,4 @@ def _vehicle_from_camera(camera: Mapping[str, Any]) -> np.ndarray:
     else:
         turn = Rotation.from_euler("ZYX", camera["yaw_pitch_roll_deg"], degrees=True)
         rotation = turn.as_matrix() @ _AHEAD
-    return rigid(rotation, camera["position_m"])
+    return rigid(rotation, translation=camera["position_m"])

@@ -63,16 +63,16 @@ def read_image_folder(
         ValueError: If the file is malformed; the message names the camera.
     """
     folder = file.parent
-    with naming(file, "see docs/inference.md"):
+    with naming(file, remedy="see docs/inference.md"):
         content = read_calibration(file)
         ground = ground_pose(content)
         rig = []
         images = {}
         notes = []
         for name, camera in cameras_of(content):
-            with naming(f"{file}, camera {name!r}", "see docs/inference.md"):
+            with naming(f"{file}, camera {name!r}", remedy="see docs/inference.md"):
                 check_camera_keys(camera)
-                images[name], image_notes = _find_images(folder, name, camera)
+                images[name], image_notes = _find_images(folder, name=name, camera=camera)
                 notes += image_notes
                 rig.append(create_camera(name, camera, ground=ground, images=images[name]))
         rate_hz, tolerance_ns = _read_timing(content)
@@ -80,22 +80,28 @@ def read_image_folder(
             images, rate_hz, tolerance_ns=tolerance_ns, folder=folder
         )
         notes += frame_notes
-        notes += _usage_notes(frames, images, tolerance_ns)
-        poses = read_named_poses(content, folder, time_of=time_of, ground=ground)
+        notes += _usage_notes(frames, images=images, tolerance_ns=tolerance_ns)
+        poses = read_named_poses(content, folder=folder, time_of=time_of, ground=ground)
         pose_at = None if poses is None else cache(poses.at)  # images of one time share a pose
         if poses is not None and pose_at is not None:
-            frames, pose_notes = _frames_with_poses(frames, poses, pose_at)
+            frames, pose_notes = _frames_with_poses(frames, poses=poses, pose_at=pose_at)
             notes += pose_notes
         target = rectify_as_trained(rig, trained or {})
         scene = folder.resolve().name
         samples = rig_samples(scene, rig, frames=frames, pose_at=pose_at)
         root = folder
         if any(camera.is_distorted for camera in rig):
-            digest = _digest(file, frames, target)
+            digest = _digest(file, frames=frames, target=target)
             root = frames_dir / f"{file_name(scene)}-{digest}"
             for sample in samples:
-                notes += _rectify_images(sample, rig, root=folder, target=root)
-        return Source(samples, "ego", root, has_poses=poses is not None, notes=tuple(notes))
+                notes += _rectify_images(sample, rig=rig, root=folder, target=root)
+        return Source(
+            samples=samples,
+            frame="ego",
+            data_root=root,
+            has_poses=poses is not None,
+            notes=tuple(notes),
+        )
 
 
 def _read_timing(content: Mapping[str, Any]) -> tuple[float | None, int]:
@@ -179,19 +185,24 @@ def _group_images(
     stems = {path.stem for paths in images.values() for path in paths}
     time_of = times_of_names(stems)
     if time_of is not None:
-        return _group_by_times(images, rate_hz, tolerance_ns, time_of=time_of, folder=folder)
+        return _group_by_times(
+            images, rate_hz, tolerance_ns=tolerance_ns, time_of=time_of, folder=folder
+        )
     if all(len(paths) == 1 for paths in images.values()):
         single_images = {}
         time_of = {}
         for name, (path,) in images.items():
             single_images[name] = (path.relative_to(folder).as_posix(), 0)
             time_of[path.stem] = 0
-        return [RigFrame(f"{scene}_0", time_ns=0, images=single_images)], time_of, []
+        return [RigFrame(token=f"{scene}_0", time_ns=0, images=single_images)], time_of, []
 
     rate = rate_hz or _RATE_HZ
     first_images = next(iter(images.values()))
-    time_of = {path.stem: round(i * 1e9 / rate) for i, path in enumerate(first_images)}
-    images_by_stem: dict[str, dict[str, tuple[str, int]]] = {stem: {} for stem in time_of}
+    time_of = {}
+    images_by_stem: dict[str, dict[str, tuple[str, int]]] = {}
+    for i, path in enumerate(first_images):
+        time_of[path.stem] = round(i * 1e9 / rate)
+        images_by_stem[path.stem] = {}
     for name, paths in images.items():
         for path in paths:
             if path.stem in time_of:
@@ -199,7 +210,9 @@ def _group_images(
                 images_by_stem[path.stem][name] = (relative_path, time_of[path.stem])
     frames = []
     for stem, time_ns in time_of.items():
-        frames.append(RigFrame(f"{scene}_{stem}", time_ns, images=images_by_stem[stem]))
+        frames.append(
+            RigFrame(token=f"{scene}_{stem}", time_ns=time_ns, images=images_by_stem[stem])
+        )
     origin = "rate_hz" if rate_hz else "assumed, as there is no rate_hz"
     note = f"the names of the images hold no Unix times: {rate:g} a second ({origin})"
     return frames, time_of, [note]
@@ -218,16 +231,16 @@ def _group_by_times(
     times_ns = {}
     for name, paths in images.items():
         path_at[name] = {time_of[path.stem]: path.relative_to(folder).as_posix() for path in paths}
-        times_ns[name] = np.array(sorted(path_at[name]), np.int64)
+        times_ns[name] = np.array(sorted(path_at[name]), dtype=np.int64)
     frame_times = next(iter(times_ns.values())).tolist()
-    _check_rate(frame_times, rate_hz)
+    _check_rate(frame_times, rate_hz=rate_hz)
     frames = []
     nearest = nearest_images(times_ns, frame_times, tolerance_ns=tolerance_ns)
     for frame_ns, image_times in zip(frame_times, nearest, strict=True):
         frame_images = {}
         for name, time_ns in image_times.items():
             frame_images[name] = (path_at[name][time_ns], time_ns)
-        frames.append(RigFrame(f"{scene}_{frame_ns}", frame_ns, images=frame_images))
+        frames.append(RigFrame(token=f"{scene}_{frame_ns}", time_ns=frame_ns, images=frame_images))
     note = f"the names of the images are taken as Unix times, {span_of(frame_times)}"
     return frames, time_of, [note]
 
@@ -309,7 +322,7 @@ def _rectify_images(
         if (target / record.path).is_file():
             continue
         try:
-            image = read_image(str(source), f"camera {record.name!r}", camera.size_px)
+            image = read_image(str(source), where=f"camera {record.name!r}", size=camera.size_px)
             camera.write_image(target / record.path, image)
         except BrokenSampleError as error:
             notes.append(str(error))

@@ -34,7 +34,7 @@ def times_of_names(stems: Collection[str]) -> dict[str, int] | None:
     are_dates = True
     for stem in stems:
         match = _TIME.search(stem)
-        time_ns = _time_ns(match[1], match[2]) if match else None
+        time_ns = _time_ns(whole=match[1], fraction=match[2]) if match else None
         if match is None or time_ns is None:
             return None
         times[stem] = time_ns

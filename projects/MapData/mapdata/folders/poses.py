@@ -48,10 +48,10 @@ def read_poses(path: Path, time_of: Mapping[str, int], ground: np.ndarray) -> Po
     times_ns = []
     values = []
     unknown_frames = []
-    with naming(path, "see docs/inference.md"):
+    with naming(path, remedy="see docs/inference.md"):
         for number, row in _rows(read_text(path)):
             try:
-                time_ns = _time_of(row, time_of)
+                time_ns = _time_of(row, time_of=time_of)
                 if time_ns is None:
                     unknown_frames.append(row[_FRAME])
                     continue
@@ -66,14 +66,14 @@ def read_poses(path: Path, time_of: Mapping[str, int], ground: np.ndarray) -> Po
             )
         if not times_ns:
             raise InputError("it holds no pose")
-        rows = np.array(values, np.float64)
+        rows = np.array(values, dtype=np.float64)
         positions = rows[:, :3]
         quaternions_xyzw = rows[:, [4, 5, 6, 3]]
         rotations = Rotation.from_quat(quaternions_xyzw).as_matrix()
         poses = []
         for rotation, position in zip(rotations, positions, strict=True):
-            poses.append(rigid(rotation, position) @ ground)
-        return PoseTrack(times_ns, poses)
+            poses.append(rigid(rotation, translation=position) @ ground)
+        return PoseTrack(times_ns=times_ns, poses=poses)
 
 
 def _rows(text: str) -> Iterator[tuple[int, dict[str, str]]]:

@@ -192,8 +192,8 @@ class PoseTrack:
         gap_ns: int = 1_000_000_000,
         holds: bool = False,
     ) -> None:
-        times = np.array(list(times_ns), np.int64)
-        matrices = np.array(list(poses), np.float64)
+        times = np.array(list(times_ns), dtype=np.int64)
+        matrices = np.array(list(poses), dtype=np.float64)
         if not len(times) or not np.isfinite(matrices).all():
             raise InputError("poses must be finite, at least one.")
         self.times_ns, first = np.unique(times, return_index=True)
@@ -258,7 +258,7 @@ def nearest_images(
     for wanted in wanted_ns:
         nearest = {}
         for name, times in times_ns.items():
-            time = closest_ns(times, wanted, tolerance_ns)
+            time = closest_ns(times, wanted, tolerance_ns=tolerance_ns)
             if time is not None:
                 nearest[name] = time
         frames.append(nearest)
@@ -310,8 +310,8 @@ def rig_samples(
             )
             cameras.append(record)
         sample = sample_in_vehicle(
-            frame.token,
-            scene,
+            token=frame.token,
+            scene=scene,
             timestamp_ns=frame.time_ns,
             cameras=cameras,
             global_from_ground=pose,
