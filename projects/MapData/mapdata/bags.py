@@ -211,8 +211,8 @@ def _build_rig(
             errors[name] = error
     if errors and (by_hand or not rig):
         raise next(iter(errors.values()))
-    for name, error in errors.items():
-        reason = str(error).rstrip(".")
+    for name, camera_error in errors.items():
+        reason = str(camera_error).rstrip(".")
         notes.append(f"{topics[name][0]} is left out: {reason}; {_CHOOSE}")
     return rig, notes
 

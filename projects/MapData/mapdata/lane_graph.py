@@ -74,7 +74,7 @@ class LanePaths:
         self._edges = [_fold_points(lane, uses) for lane in lanes]
         self._links: list[list[tuple[int, int, tuple[int, Edge]]]] = []
         for lane_links in links:
-            link_edges = []
+            link_edges: list[tuple[int, int, tuple[int, Edge]]] = []
             for before, after in lane_links:
                 end = lanes[before][-1]
                 start = lanes[after][0]
@@ -101,7 +101,7 @@ class LanePaths:
         if key == self._last_key:
             return self._last_lines
         graph = self._subgraph(key)
-        targets = set()
+        targets: set[int] = set()
         for edges in graph.values():
             targets.update(end for _, end in edges)
         paths: list[list[int]] = []
@@ -132,13 +132,14 @@ class LanePaths:
         graph: dict[int, dict[Edge, None]] = {}  # inner dicts: ordered sets
         for lane in lanes:
             edges = list(self._edges[lane])
-            for before, after, edge in self._links[lane]:
+            for before, after, link in self._links[lane]:
                 if before in members and after in members:
-                    edges.append(edge)
+                    edges.append(link)
             for start, edge in edges:
+                _, end = edge
                 graph.setdefault(start, {})[edge] = None
-                graph.setdefault(edge[1], {})
-        return {node: list(edges) for node, edges in graph.items()}
+                graph.setdefault(end, {})
+        return {node: list(edges_of_node) for node, edges_of_node in graph.items()}
 
 
 def _fold_points(nodes: Sequence[int], uses: np.ndarray) -> list[tuple[int, Edge]]:
