@@ -17,6 +17,7 @@ ROOTS = {
     "benchmarks": REPO / "benchmarks",
     "tools": REPO / "tools",
     "comparison": REPO / "tools/comparison",
+    "scoring": REPO / "tools/scoring",
 }
 OPENMMLAB = {"mmengine", "mmcv", "mmdet", "mmdet3d"}
 
@@ -41,6 +42,7 @@ ALLOWED = {
         "checkpoints", "datasets", "engine", "evaluation", "mapdata", "structures", "utils",
         "visualization",
     },
+    "scoring": {"datasets", "evaluation", "structures", "utils", "visualization"},
 }  # fmt: skip
 # folder of models that is no method -> the folders of models that it may import; "" is detector.py
 COMMON = {

@@ -37,7 +37,7 @@ To go on in this environment:
 
 @dataclass(frozen=True)
 class Budget:
-    """How much of everything a run makes.
+    """Size of the data and length of the trainings.
 
     Attributes:
         train_scenes: Scenes of MiniCity to train on.
@@ -68,11 +68,11 @@ class Training:
     """A model that the demo trains.
 
     Attributes:
-        model: Its name in ``MODELS``.
-        start: What its row in the table says of its start.
-        work: Folder of its checkpoints; those of its tests begin with the same name.
-        epochs: How long it trains.
-        options: What differs from its config.
+        model: Name of the model in ``MODELS``.
+        start: Start of the training, as the table names it.
+        work: Folder of the checkpoints. The folders of the tests begin with its name.
+        epochs: Number of epochs.
+        options: Overrides of the config.
     """
 
     model: str
@@ -83,26 +83,41 @@ class Training:
 
     @property
     def title(self) -> str:
-        """Name of its row in the table."""
+        """Name of the row in the table."""
         return f"{self.model} {self.start}"
 
-    def tested(self, how: str) -> Path:
-        """Return the folder of one of its tests."""
-        return self.work.with_name(f"{self.work.name}_{how}")
+    def test_folder(self, name: str) -> Path:
+        """Folder of one of the tests: ``test`` or ``shuffled``."""
+        return self.work.with_name(f"{self.work.name}_{name}")
 
 
 def trainings(
     names: Iterable[str], from_scratch: bool, folder: Path, budget: Budget
 ) -> list[Training]:
-    """Return what is trained, in order."""
-    found = []
+    """Trainings in their order.
+
+    Args:
+        names: Names of the models in ``MODELS``.
+        from_scratch: Whether to train each model from random weights as well.
+        folder: Folder of all outputs.
+        budget: Lengths of the trainings.
+    """
+    runs = []
     for name in names:
         work = folder / f"{name.lower()}_tuned"
         options = (f"load_from={MODELS['MapTR']}", "optim_wrapper.optimizer.lr=3e-4")
-        found.append(Training(name, "trained on from MapTR", work, budget.tuning_epochs, options))
+        tuned = Training(
+            name,
+            start="trained on from MapTR",
+            work=work,
+            epochs=budget.tuning_epochs,
+            options=options,
+        )
+        runs.append(tuned)
         if from_scratch:
-            found.append(Training(name, "from scratch", folder / name.lower(), budget.epochs))
-    return found
+            work = folder / name.lower()
+            runs.append(Training(name, start="from scratch", work=work, epochs=budget.epochs))
+    return runs
 
 
 @dataclass(frozen=True)
@@ -110,9 +125,9 @@ class Step:
     """One command of the demo.
 
     Attributes:
-        title: What it does.
+        title: Action of the command, for the console.
         command: The script and its arguments.
-        products: What it must have made.
+        products: Files that exist when the command has succeeded.
     """
 
     title: str
@@ -120,12 +135,16 @@ class Step:
     products: list[Path]
 
     def stamp(self, folder: Path) -> Path:
-        """Return the file that says that this very command has succeeded."""
+        """File that marks the success of this command with these arguments."""
         digest = hashlib.sha256(shlex.join(self.command).encode()).hexdigest()[:12]
         return folder / ".done" / f"{self.title.replace(' ', '-')}-{digest}"
 
     def run(self, folder: Path, position: str) -> None:
-        """Run the command unless it is done; stop the demo if it fails."""
+        """Run the command, unless an earlier run has succeeded.
+
+        Raises:
+            WorkError: If the command fails, or one of its products is missing.
+        """
         stamp = self.stamp(folder)
         if stamp.exists() and all(product.exists() for product in self.products):
             print(f"{position} {self.title}: done before, skipped", flush=True)
@@ -133,7 +152,7 @@ class Step:
         shell = self.command[0].endswith(".sh")
         command = self.command if shell else [sys.executable, *self.command]
         print(f"{position} {self.title}: {shlex.join(command)}", flush=True)
-        started = time.monotonic()
+        start_s = time.monotonic()
         environment = {**os.environ, "PYTHON": sys.executable}
         status = subprocess.run(
             command,
@@ -144,14 +163,15 @@ class Step:
         ).returncode
         missing = [str(product) for product in self.products if not product.exists()]
         if status or missing:
-            reason = f"made no {', '.join(missing)}" if not status else f"ended with {status}"
+            reason = f"ended with {status}" if status else f"made no {', '.join(missing)}"
             raise WorkError(f"{position} {self.title} {reason}; run the command above to see why.")
-        write_text(stamp, f"{time.monotonic() - started:.0f} s\n")
-        print(f"{position} {self.title}: {time.monotonic() - started:.0f} s", flush=True)
+        duration_s = time.monotonic() - start_s
+        write_text(stamp, f"{duration_s:.0f} s\n")
+        print(f"{position} {self.title}: {duration_s:.0f} s", flush=True)
 
 
-def processes() -> int:
-    """Return how many processes train together: one per GPU, or per core without a GPU.
+def process_count() -> int:
+    """Number of processes that train together: one per GPU, or per core without a GPU.
 
     On a CPU a process of one thread per core uses the cores better than threads of one process.
     """
@@ -161,79 +181,119 @@ def processes() -> int:
 
 
 def data_root(folder: Path, budget: Budget, split: str) -> Path:
-    """Return where a split's towns are."""
+    """Folder with the towns of a split.
+
+    Args:
+        folder: Folder of all outputs.
+        budget: Numbers of scenes and samples.
+        split: ``train`` or ``val``.
+    """
     scenes = budget.val_scenes if split == "val" else budget.train_scenes
     return folder / f"minicity-{split}-{scenes}x{budget.samples}"
 
 
 def annotations(folder: Path, budget: Budget, split: str) -> Path:
-    """Return a split's annotation file."""
+    """Annotation file of a split.
+
+    Args:
+        folder: Folder of all outputs.
+        budget: Numbers of scenes and samples.
+        split: ``train`` or ``val``.
+    """
     return data_root(folder, budget, split) / f"gsmap_minicity_{split}.arrow"
 
 
 def data_steps(folder: Path, budget: Budget, split: str) -> Iterable[Step]:
-    """Yield what makes the towns of one split.
+    """Yield the steps that generate and convert the towns of one split.
 
-    A data set has at least one scene of either split; the other one's is not used.
+    A data set needs at least one scene of each split, so one unused scene of the other split is
+    generated as well.
+
+    Args:
+        folder: Folder of all outputs.
+        budget: Numbers of scenes and samples.
+        split: ``train`` or ``val``.
     """
     root = data_root(folder, budget, split)
-    scenes = (budget.val_scenes if split == "val" else budget.train_scenes) + 1
-    size = f"--scenes {scenes} --val-scenes {budget.val_scenes if split == 'val' else 1}"
-    size += f" --samples-per-scene {budget.samples} --seed 0 --image-size {budget.image_size}"
-    yield Step(
-        f"generate the towns of {split}",
-        ["tools/create_data.py", "minicity", "--root", str(root), *size.split()],
-        [root / "minicity.json"],
-    )
-    yield Step(
-        f"convert the towns of {split}",
-        ["tools/create_data.py", "nuscenes", "--root", str(root), "--dataset", "minicity"],
-        [annotations(folder, budget, split)],
-    )
+    if split == "val":
+        val_scenes = budget.val_scenes
+        scenes = budget.val_scenes + 1
+    else:
+        val_scenes = 1
+        scenes = budget.train_scenes + 1
+    generate = ["tools/create_data.py", "minicity", "--root", str(root)]
+    generate += ["--scenes", str(scenes), "--val-scenes", str(val_scenes)]
+    generate += ["--samples-per-scene", str(budget.samples), "--seed", "0"]
+    generate += ["--image-size", budget.image_size]
+    convert = ["tools/create_data.py", "nuscenes", "--root", str(root), "--dataset", "minicity"]
+    yield Step(f"generate the towns of {split}", generate, [root / "minicity.json"])
+    yield Step(f"convert the towns of {split}", convert, [annotations(folder, budget, split)])
 
 
 def prior_step(folder: Path, budget: Budget) -> Step:
-    """Return what scores a map that is the same everywhere."""
-    truth, train = (str(annotations(folder, budget, split)) for split in ("val", "train"))
+    """Step that scores the best map for all samples alike."""
+    truth = annotations(folder, budget, "val")
+    train = annotations(folder, budget, "train")
     metrics = folder / "prior.json"
-    return Step(
-        "score the best fixed map (prior)",
-        ["tools/evaluate.py", truth, "--prior", train, "--out", str(metrics)],
-        [metrics],
-    )
+    command = ["tools/evaluate.py", str(truth), "--prior", str(train), "--out", str(metrics)]
+    return Step("score the best fixed map (prior)", command, [metrics])
 
 
-def test_step(title: str, model: list[str], work: Path, root: Path, *extra: str) -> Step:
-    """Return what tests a model on the towns of ``root`` into ``work/metrics.json``."""
+def test_step(title: str, model: list[str], work: Path, root: Path, options: list[str]) -> Step:
+    """Step that tests a model and writes ``work/metrics.json``.
+
+    Args:
+        title: Action of the step, for the console.
+        model: Name of a model that ships, or config and checkpoint.
+        work: Work folder of the test.
+        root: Folder with the towns.
+        options: Further options of ``tools/test.py``.
+    """
     metrics = work / "metrics.json"
     command = ["tools/test.py", *model, "--work-dir", str(work), "--metrics-out", str(metrics)]
-    return Step(title, [*command, *extra, "--data-root", str(root)], [metrics])
+    command += [*options, "--data-root", str(root)]
+    return Step(title, command, [metrics])
 
 
-def drawing(work: Path) -> list[str]:
-    """Return the options that draw every tenth sample and write what was found."""
+def drawing_options(work: Path) -> list[str]:
+    """Options that draw every tenth sample and write the predictions."""
     pictures = ["--show-dir", str(work / "pictures"), "--show-interval", "10"]
     return [*pictures, "--out", str(work / "results.json")]
 
 
 def shipped_steps(name: str, folder: Path, budget: Budget) -> Iterable[Step]:
-    """Yield what tests and draws a model that ships, and its report page."""
-    work, root = folder / f"shipped_{name.lower()}", data_root(folder, budget, "val")
+    """Yield the steps that test and draw a model that ships, and write its report page.
+
+    Args:
+        name: Name of the model in ``MODELS``.
+        folder: Folder of all outputs.
+        budget: Numbers of scenes and samples.
+    """
+    work = folder / f"shipped_{name.lower()}"
+    root = data_root(folder, budget, "val")
     title = f"test and draw the {name} that ships"
-    yield test_step(title, [MODELS[name]], work, root, *drawing(work))
-    truth, page = str(annotations(folder, budget, "val")), work / "report.html"
-    yield Step(
-        f"write the report page of the {name} that ships",
-        ["tools/report.py", str(work / "results.json"), "--ann", truth, "--out", str(page)],
-        [page],
-    )
+    yield test_step(title, [MODELS[name]], work, root, options=drawing_options(work))
+    truth = annotations(folder, budget, "val")
+    page = work / "report.html"
+    command = ["tools/report.py", str(work / "results.json")]
+    command += ["--ann", str(truth), "--out", str(page)]
+    yield Step(f"write the report page of the {name} that ships", command, [page])
 
 
 def training_steps(training: Training, folder: Path, budget: Budget) -> Iterable[Step]:
-    """Yield what trains, tests and draws a model."""
-    config, work, title = MODELS[training.model], training.work, training.title
+    """Yield the steps that train, test and draw a model.
+
+    Args:
+        training: The training.
+        folder: Folder of all outputs.
+        budget: Numbers of scenes and samples.
+    """
+    config = MODELS[training.model]
+    work = training.work
+    title = training.title
     checkpoint = work / f"epoch_{training.epochs}.pth"
-    train, val = (data_root(folder, budget, split) for split in ("train", "val"))
+    train = data_root(folder, budget, "train")
+    val = data_root(folder, budget, "val")
     options = [
         f"train_dataloader.dataset.data_root={train}",
         f"train_cfg.max_epochs={training.epochs}",
@@ -241,35 +301,44 @@ def training_steps(training: Training, folder: Path, budget: Budget) -> Iterable
         "randomness.seed=0",
         *training.options,
     ]
-    command = ["tools/dist_train.sh", config, str(processes()), "--work-dir", str(work), "--resume"]
-    yield Step(
-        f"train {title}",
-        [*command, "--data-root", str(val), "--cfg-options", *options],
-        [checkpoint],
-    )
+    command = ["tools/dist_train.sh", config, str(process_count())]
+    command += ["--work-dir", str(work), "--resume"]
+    command += ["--data-root", str(val), "--cfg-options", *options]
+    yield Step(f"train {title}", command, [checkpoint])
     curves = work / "curves.png"
-    yield Step(
-        f"draw losses and validations of {title}",
-        ["tools/analyze_run.py", str(work), "--out", str(curves)],
-        [curves],
+    command = ["tools/analyze_run.py", str(work), "--out", str(curves)]
+    yield Step(f"draw losses and validations of {title}", command, [curves])
+    model = [config, str(checkpoint)]
+    test = training.test_folder("test")
+    yield test_step(f"test and draw {title}", model, test, val, options=drawing_options(test))
+    yield test_step(
+        f"test {title} on images of other samples",
+        model,
+        training.test_folder("shuffled"),
+        val,
+        options=["--shuffle-images", "0"],
     )
-    model, tested = [config, str(checkpoint)], training.tested("test")
-    yield test_step(f"test and draw {title}", model, tested, val, *drawing(tested))
-    title, shuffled = f"test {title} on images of other samples", training.tested("shuffled")
-    yield test_step(title, model, shuffled, val, "--shuffle-images", "0")
 
 
 def table(folder: Path, shipped: Iterable[str], trained: Iterable[Training]) -> str:
-    """Return the figures of all models as a Markdown table."""
+    """Figures of all models as a Markdown table.
+
+    Args:
+        folder: Folder of all outputs.
+        shipped: Names of the models that ship.
+        trained: The trainings of the demo.
+    """
     rows = {"same map everywhere (prior)": folder / "prior.json"}
     for name in shipped:
         rows[f"{name} that ships"] = folder / f"shipped_{name.lower()}/metrics.json"
     for training in trained:
-        rows[training.title] = training.tested("test") / "metrics.json"
+        rows[training.title] = training.test_folder("test") / "metrics.json"
         others = f"{training.title}, images of other samples"
-        rows[others] = training.tested("shuffled") / "metrics.json"
-    keys = [[f"{metric}/{c}/AP" for c in CLASSES] for metric in ("chamfer", "raster")]
-    keys = [*keys[0], "chamfer/mAP", *keys[1], "raster/mAP"]
+        rows[others] = training.test_folder("shuffled") / "metrics.json"
+    keys = []
+    for metric in ("chamfer", "raster"):
+        keys += [f"{metric}/{name}/AP" for name in CLASSES]
+        keys.append(f"{metric}/mAP")
     head = ["model", *(key.replace("/AP", "").replace("/", " ") for key in keys)]
     lines = []
     for name, path in rows.items():
@@ -280,8 +349,8 @@ def table(folder: Path, shipped: Iterable[str], trained: Iterable[Training]) -> 
 
 
 def first_picture(folder: Path) -> Path:
-    """Return one of the pictures that a test drew."""
-    return sorted((folder / "pictures").iterdir())[0]
+    """First picture of a test, by name."""
+    return min((folder / "pictures").iterdir())
 
 
 def main() -> None:
@@ -289,14 +358,15 @@ def main() -> None:
     parser.add_argument("--dir", default="demo", help="folder of all outputs")
     parser.add_argument("--budget", choices=BUDGETS, default="demo", help="how long to train")
     parser.add_argument(
-        "--models", nargs="+", choices=MODELS, default=["GSMap"], help="what to train, in order"
+        "--models", nargs="+", choices=MODELS, default=["GSMap"], help="models to train, in order"
     )
     parser.add_argument(
         "--from-scratch", action="store_true", help="also train each model from nothing"
     )
     args = parser.parse_args()
-    budget, folder = BUDGETS[args.budget], Path(args.dir).resolve() / args.budget
-    started = time.monotonic()
+    budget = BUDGETS[args.budget]
+    folder = Path(args.dir).resolve() / args.budget
+    start_s = time.monotonic()
     runs = trainings(args.models, args.from_scratch, folder, budget)
     shipped = list(data_steps(folder, budget, "val"))
     for name in args.models:
@@ -309,18 +379,18 @@ def main() -> None:
     for number, step in enumerate([*shipped, *trained], 1):
         step.run(folder, f"[{number}/{len(shipped) + len(trained)}]")
         if number == len(shipped):
-            minutes = (time.monotonic() - started) / 60
+            minutes = (time.monotonic() - start_s) / 60
             for name in args.models:
                 work = folder / f"shipped_{name.lower()}"
-                print(f"\n{minutes:.1f} min: what the {name} that ships sees:")
+                print(f"\n{minutes:.1f} min: predictions of the {name} that ships:")
                 print(f"{first_picture(work)}\n{work / 'report.html'}\n", flush=True)
     summary = table(folder, dict.fromkeys([*args.models, "MapTR"]), runs)
     print(f"\nAP in percent on MiniCity's validation towns\n\n{summary}\n")
     write_text(folder / "summary.md", summary + "\n")
     for training in runs:
-        print(f"{training.title}: {first_picture(training.tested('test'))}")
+        print(f"{training.title}: {first_picture(training.test_folder('test'))}")
         print(f"its losses and validations: {training.work / 'curves.png'}")
-    print(f"{(time.monotonic() - started) / 60:.1f} minutes. Figures: {folder / 'summary.md'}")
+    print(f"{(time.monotonic() - start_s) / 60:.1f} minutes. Figures: {folder / 'summary.md'}")
     root = data_root(folder, budget, "val")
     print(NEXT.format(activate=Path(sys.prefix, "bin/activate"), root=root))
 

@@ -1,0 +1,1 @@
+"""Options and analyses of ``tools/evaluate.py``."""

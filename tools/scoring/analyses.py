@@ -1,0 +1,191 @@
+"""Analyses of ``tools/evaluate.py``: intervals, groups, drives and Gaussians.
+
+Modules that only one analysis needs are imported in its function, so that a plain evaluation starts
+quickly.
+"""
+
+import argparse
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.evaluation.analysis import DISTANCE
+from gsmap.evaluation.core.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
+from gsmap.evaluation.core.evaluator import MapEvaluator
+from gsmap.evaluation.core.file_evaluation import (
+    Evaluation,
+    SamplePairs,
+    match_samples,
+    scenes_of,
+)
+from gsmap.evaluation.core.metric import MetricSettings
+from gsmap.evaluation.core.report import MetricReport
+from gsmap.structures.grid import BEVGrid
+from gsmap.utils.errors import InputError
+from gsmap.utils.model_facts import law_of
+from gsmap.utils.words import markdown_table
+
+if TYPE_CHECKING:
+    from gsmap.evaluation.analysis.bootstrap import Resamples
+    from gsmap.evaluation.analysis.groups import Groups
+
+DEFAULT_RESAMPLES = 1000
+
+
+def consistency_report(args: argparse.Namespace) -> MetricReport:
+    """Score the drives of a result file; with ``--tracks``, write its tracks."""
+    from gsmap.evaluation.analysis.consistency import ConsistencyConfig
+    from gsmap.evaluation.analysis.drive_files import evaluate_drives
+
+    if args.ground_truth.suffix.lower() == ".json":
+        raise InputError(
+            f"--consistency needs poses, which {args.ground_truth} has not: give the "
+            "annotation file (.arrow)."
+        )
+    annotations = AnnotationFile(args.ground_truth)
+    meta = annotations.meta
+    classes = tuple(args.classes or meta.classes)
+    polygon_labels = tuple(
+        label for label, name in enumerate(classes) if name in args.polygon_classes
+    )
+    config = ConsistencyConfig(
+        classes,
+        BEVGrid(meta.x_range, meta.y_range),
+        polygon_labels,
+        tuple(args.thresholds or CHAMFER_THRESHOLDS),
+    )
+    figures = evaluate_drives(args.results, annotations, config, args.tracks)
+    return MetricReport("consistency", {}, figures, {})
+
+
+def uncertainty_report(args: argparse.Namespace, settings: MetricSettings) -> MetricReport:
+    """Print the scores of predicted Gaussians; with ``--reliability``, draw their curves."""
+    from gsmap.evaluation.analysis import calibration
+
+    classes = settings.classes
+    rules = ChamferConfig.of(settings) if "chamfer" in args.eval else ChamferConfig(classes)
+    pairs = SamplePairs(
+        args.results,
+        args.ground_truth,
+        classes,
+        allow_mismatch=args.allow_mismatch,
+        shard=args.shard,
+        allow_other_split=args.allow_other_split,
+        gaussians=True,
+    )
+    vertices = calibration.matched_vertices(pairs, rules)
+    law = args.law or law_of(pairs.about)
+    if args.reliability:
+        from gsmap.visualization.figure import save_figure
+        from gsmap.visualization.plots import plot_uncertainty
+
+        figure = plot_uncertainty(vertices, classes, law)
+        print(f"reliability: {save_figure(figure, args.reliability)}")
+    report = calibration.uncertainty_report(vertices, classes, args.polygon_classes, law)
+    print(calibration.format_uncertainty(report.metrics, law) + "\n")
+    return report
+
+
+def read_resamples(args: argparse.Namespace) -> "Resamples | None":
+    """Read the scenes of the samples; None if no option needs intervals."""
+    if args.bootstrap is None and not args.against:
+        return None
+    from gsmap.evaluation.analysis.bootstrap import Resamples
+
+    count = DEFAULT_RESAMPLES if args.bootstrap is None else args.bootstrap
+    return Resamples(scenes_of(args.ground_truth), count, args.seed)
+
+
+def interval_report(
+    evaluation: Evaluation,
+    others: Evaluation | None,
+    resamples: "Resamples",
+    args: argparse.Namespace,
+) -> MetricReport:
+    """Print the interval of every AP, and of its difference from another result file.
+
+    Args:
+        evaluation: Reports and notes of the result file. The notes of ``others`` are added to its
+            notes.
+        others: Reports and notes of the file of ``--against``, if it is given.
+        resamples: The resamples of the scenes.
+        args: The options of the command.
+
+    Returns:
+        The ends of the intervals; those of differences have the prefix ``minus_other/``.
+    """
+    from gsmap.evaluation.analysis.bootstrap import (
+        ap_differences,
+        ap_intervals,
+        format_intervals,
+    )
+
+    reports, notes = evaluation
+    source = f"of {resamples.count} resamples of the scenes, seed {resamples.seed}"
+    figures = {}
+    intervals = ap_intervals(reports, resamples)
+    print(format_intervals(intervals, f"AP with intervals of 95 % {source}") + "\n")
+    for key, interval in intervals.items():
+        for part, value in vars(interval).items():
+            if part != "value":  # the report of the metric has it
+                figures[f"{key}/{part}"] = value
+    if others is not None:
+        other_reports, other_notes = others
+        ranked = [report for report in other_reports if report.detections]
+        notes.extend(f"{args.against}: {note}" for note in other_notes)
+        differences = ap_differences(reports, ranked, resamples)
+        title = f"{args.results} minus {args.against}, {source}"
+        print(format_intervals(differences, title, signed=True) + "\n")
+        for key, interval in differences.items():
+            for part, value in vars(interval).items():
+                figures[f"minus_other/{key}/{part}"] = value
+    return MetricReport("intervals", {}, figures, {})
+
+
+def read_groups(args: argparse.Namespace) -> "Groups | None":
+    """Read the groups of samples; None without ``--by``, and for ``--by distance``."""
+    if args.by in (None, DISTANCE):
+        return None
+    from gsmap.evaluation.analysis import groups
+
+    return groups.read_groups(args.ground_truth, args.by)
+
+
+def group_report(
+    reports: Sequence[MetricReport],
+    groups: "Groups | None",
+    args: argparse.Namespace,
+    evaluator: MapEvaluator,
+) -> MetricReport:
+    """Print the AP of each group of samples, or of each band of distances from the vehicle.
+
+    Args:
+        reports: Reports of metrics with an AP.
+        groups: Groups of the samples; None cuts the map into bands of distances.
+        args: The options of the command.
+        evaluator: The metrics and their rules.
+    """
+    from gsmap.evaluation.analysis import groups as grouping
+
+    if groups is None:
+        from gsmap.evaluation.analysis.distances import cut_by_distance, distance_groups
+
+        ranking = [metric for metric in evaluator.metrics if metric.ranks]
+        evaluator = MapEvaluator(*ranking, ground_truth_points=evaluator.ground_truth_points)
+        classes = evaluator.classes
+        pairs = SamplePairs(
+            args.results,
+            args.ground_truth,
+            classes,
+            allow_mismatch=args.allow_mismatch,
+            shard=args.shard,
+            allow_other_split=True,  # the first reading of the files has checked it
+        )
+        areas = [label for label, name in enumerate(classes) if name in args.polygon_classes]
+        pieces = cut_by_distance(pairs, areas)
+        reports = evaluator.reports(match_samples(pieces, evaluator, args.workers))
+        groups = distance_groups(reports[0].tokens)
+    aps = grouping.ap_by_group(reports, groups)
+    headers, rows = grouping.group_table(reports, groups, aps)
+    print(markdown_table(headers, rows) + "\n")
+    return grouping.group_report(aps)

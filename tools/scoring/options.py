@@ -1,0 +1,261 @@
+"""Command-line options of ``tools/evaluate.py``."""
+
+import argparse
+from pathlib import Path
+
+from gsmap.evaluation.analysis import DISTANCE
+from gsmap.evaluation.core.evaluator import METRIC_NAMES
+from gsmap.evaluation.core.metric import metric_files
+from gsmap.structures.classes import AREA_CLASSES
+from gsmap.utils.cli import CommandParser, output_file
+from gsmap.utils.model_facts import LAW_NAMES
+from gsmap.utils.shards import add_shard_options
+
+
+def parse_args(description: str | None, argv: list[str] | None = None) -> argparse.Namespace:
+    """Read the options of the command and check their combinations.
+
+    Args:
+        description: Text above the options in the help.
+        argv: The words of the command line; None reads those of the process.
+
+    Returns:
+        The options. ``eval`` is the list of metric names, without repetitions.
+    """
+    parser = CommandParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add_inputs(parser)
+    add_metrics(parser)
+    add_rules(parser)
+    add_analysis(parser)
+    add_outputs(parser)
+    add_shard_options(parser)
+    args = parser.parse_args(argv)
+    check_combinations(parser, args)
+    args.eval = metric_names(args)
+    return args
+
+
+def add_inputs(parser: argparse.ArgumentParser) -> None:
+    """Add the input files and the conditions that they must meet."""
+    parser.add_argument("results", type=Path, nargs="?", help="results in MapTR's JSON form")
+    parser.add_argument(
+        "ground_truth", type=Path, help="annotation file (*.arrow), or JSON with a list of GTs"
+    )
+    group = parser.add_argument_group("inputs")
+    group.add_argument(
+        "--prior",
+        type=Path,
+        metavar="TRAIN",
+        help="score the best fixed set of elements, fitted on this ground truth",
+    )
+    group.add_argument("--prior-elements", type=int, default=50, help="elements in that set")
+    group.add_argument("--classes", nargs="+", help="default: the annotation file's, or MapTR's")
+    group.add_argument(
+        "--allow-mismatch",
+        action="store_true",
+        help="samples without results count as empty, results without ground truth are left out",
+    )
+    group.add_argument(
+        "--allow-other-split",
+        action="store_true",
+        help="the model may be trained on another split, which may hold places of this one",
+    )
+    group.add_argument("--workers", type=int, default=1, help="number of processes")
+
+
+def add_metrics(parser: argparse.ArgumentParser) -> None:
+    """Add the selection of metrics."""
+    group = parser.add_argument_group("metrics")
+    group.add_argument(
+        "--eval",
+        nargs="+",
+        default=list(METRIC_NAMES),
+        metavar="METRIC",
+        help=f"names of metrics: {', '.join(metric_files())}; chamfer_hard: AP_chamfer at 0.2, "
+        "0.5 and 1.0 m, too. Those of methods, and their variants, are not comparable with others",
+    )
+    group.add_argument(
+        "--custom-imports",
+        nargs="+",
+        default=[],
+        metavar="MODULE",
+        help="modules with metrics of one's own, which --eval then knows",
+    )
+    group.add_argument(
+        "--topology",
+        action="store_true",
+        help="--eval topology beside the others: elements in pieces, elements joined and lines "
+        "that fold back; with --dim 3 also --eval heights",
+    )
+    group.add_argument(
+        "--pld",
+        action="store_true",
+        help="--eval pld beside the others: distance of whole maps, in which the order of points "
+        "and all scores count",
+    )
+
+
+def add_rules(parser: argparse.ArgumentParser) -> None:
+    """Add the rules of the metrics."""
+    group = parser.add_argument_group("rules of metrics")
+    group.add_argument(
+        "--thresholds", nargs="+", type=float, help="of AP_chamfer, in metres (0.5 1.0 1.5)"
+    )
+    group.add_argument("--hard", action="store_true", help="AP_chamfer at 0.2, 0.5 and 1.0 m")
+    group.add_argument(
+        "--dim",
+        type=int,
+        default=2,
+        choices=(2, 3),
+        help="coordinates of AP_chamfer; 3 needs heights in results and ground truth",
+    )
+    group.add_argument(
+        "--polygon-classes",
+        nargs="*",
+        default=list(AREA_CLASSES),
+        help="classes that AP_raster fills",
+    )
+    group.add_argument(
+        "--range",
+        nargs=4,
+        type=float,
+        metavar=("X0", "Y0", "X1", "Y1"),
+        help="canvas of AP_raster in metres: the annotation file's, or nuScenes' -15 -30 15 30; "
+        "Argoverse 2: -30 -15 30 15",
+    )
+    group.add_argument(
+        "--gt-points", type=int, help="resample ground truth to that many points first (raw)"
+    )
+    group.add_argument(
+        "--keep-pred-points",
+        action="store_true",
+        help="AP_chamfer: compare predictions at their own points, not at 100",
+    )
+    group.add_argument(
+        "--keep-gt-points",
+        action="store_true",
+        help="AP_chamfer: compare ground truth at its own vertices, not at 100 points",
+    )
+    group.add_argument(
+        "--min-score",
+        type=float,
+        help="of predictions that topology counts (0.4), and metrics of AP per sample (0: all)",
+    )
+
+
+def add_analysis(parser: argparse.ArgumentParser) -> None:
+    """Add analyses of the metrics, of drives and of Gaussians."""
+    group = parser.add_argument_group("analysis")
+    group.add_argument(
+        "--bootstrap",
+        type=int,
+        nargs="?",
+        const=1000,
+        metavar="N",
+        help="intervals of 95 %% of every AP, of N resamples of the scenes (1000)",
+    )
+    group.add_argument("--seed", type=int, default=0, help="of the resamples")
+    group.add_argument(
+        "--against",
+        type=Path,
+        metavar="OTHER",
+        help="second result file: what the first has more in every AP, with its interval",
+    )
+    group.add_argument(
+        "--by",
+        metavar="map|scene|distance|FILE",
+        help="AP of each map or scene alone, of the map cut at 10 and 20 m from the vehicle, or "
+        "of scenes by night and weather (FILE: scene.json of nuScenes' tables, or JSON with a word "
+        "for each scene or each sample)",
+    )
+    group.add_argument(
+        "--consistency",
+        action="store_true",
+        help="C-mAP of MapTracker and jitter over drives; needs an annotation file with poses",
+    )
+    group.add_argument(
+        "--tracks",
+        type=output_file,
+        help="with --consistency: write the results again, each element with its track_id",
+    )
+    group.add_argument(
+        "--uncertainty",
+        action="store_true",
+        help="whether Gaussians say how far off matched vertices are: likelihood, coverage, ranks",
+    )
+    group.add_argument(
+        "--law",
+        choices=LAW_NAMES,
+        help="with --uncertainty: distribution of the errors (that of the model's calibration, as "
+        "the results say, or normal)",
+    )
+    group.add_argument(
+        "--reliability", type=output_file, help="with --uncertainty: draw its curves"
+    )
+
+
+def add_outputs(parser: argparse.ArgumentParser) -> None:
+    """Add the output files."""
+    group = parser.add_argument_group("outputs")
+    group.add_argument("--out", type=output_file, help="write all figures as flat JSON")
+    group.add_argument("--pr-curves", type=output_file, help="draw PR curves and calibration")
+
+
+def check_combinations(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
+    """Refuse options that exclude each other, or that need another option."""
+    if args.results and args.results.suffix == ".arrow":
+        parser.error(f"{args.results} holds ground truth: name the result file before it")
+    if (args.results is None) == (args.prior is None):
+        parser.error("name either a result file or --prior")
+    if args.hard and args.thresholds:
+        parser.error("--hard and --thresholds exclude each other")
+    if args.tracks and not args.consistency:
+        parser.error("--tracks needs --consistency")
+    if args.reliability and not args.uncertainty:
+        parser.error("--reliability needs --uncertainty")
+    if args.law and not args.uncertainty:
+        parser.error("--law needs --uncertainty")
+    if args.prior:
+        check_prior(parser, args)
+    if args.by == DISTANCE and args.dim == 3:
+        parser.error("--by distance is in the plane: leave out --dim 3")
+    if args.shard.count:
+        check_shard(parser, args)
+
+
+def check_prior(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
+    """Refuse options that need a result file, which ``--prior`` replaces."""
+    if args.against:
+        parser.error("--against compares two result files: leave out --prior")
+    if args.by == DISTANCE:
+        parser.error("--by distance cuts a result file: leave out --prior")
+    if args.shard.count:
+        parser.error("--prior is fitted on all samples: leave out --shard")
+    if args.consistency:
+        parser.error("--consistency needs a result file: leave out --prior")
+    if args.uncertainty:
+        parser.error("--uncertainty needs a result file: leave out --prior")
+
+
+def check_shard(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
+    """Refuse options that need all samples, of which ``--shard`` matches a part."""
+    if not args.out:
+        parser.error("--shard needs --out")
+    for name in ("pr_curves", "bootstrap", "against", "by", "consistency", "uncertainty"):
+        if getattr(args, name) not in (None, False):
+            option = "--" + name.replace("_", "-")
+            parser.error(f"{option} needs all samples: leave out --shard")
+
+
+def metric_names(args: argparse.Namespace) -> list[str]:
+    """Names of the metrics that ``--eval``, ``--pld`` and ``--topology`` select, once each."""
+    names = list(args.eval)
+    if args.pld:
+        names.append("pld")
+    if args.topology:
+        names.append("topology")
+        if args.dim == 3:
+            names.append("heights")
+    return list(dict.fromkeys(names))
