@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Draw the samples that training sees: images after augmentation, with their ground truth.
+"""Draw training samples: augmented images with their ground truth.
 
 Example: ``python tools/browse_dataset.py CONFIG --split train --num 20 --show-dir pictures``.
 ``--web dataset.html`` writes an interactive page with the original image files instead.

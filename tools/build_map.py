@@ -15,7 +15,6 @@ import json
 import math
 import time
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -114,17 +113,26 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
 
 
 def check_formats(args: argparse.Namespace, ann: AnnotationFile) -> None:
-    """Raise an error, before anything is written, if a format lacks its package or an origin."""
+    """Check, before the first file is written, that each format has its package and an origin.
+
+    Raises:
+        ImportError: If a package is missing.
+        ValueError: If an option is out of range, or the place of the global frame is unknown.
+    """
     if not 0 < args.speed_limit < math.inf:
         raise InputError(f"--speed-limit must be > 0, got {args.speed_limit}.")
     for key in EXTRAS.keys() & set(args.formats):
         import_extra(*EXTRAS[key])
-    origins = {name: origin_of(args, ann, name) for name in set(ann.column("map_name"))}
+    origins = {name: find_origin(args, ann, name) for name in set(ann.column("map_name"))}
     if args.crs and args.origin:
         raise InputError("--crs and --origin both say where the poses lie: give one of them.")
     if any(isinstance(origin, MapOrigin) for origin in origins.values()):
-        require_near(np.array([sample.global_from_frame[:2, 3] for sample in ann]), str(args.ann))
-    unknown = sorted(name for name, origin in origins.items() if origin is None)
+        positions = np.array([sample.global_from_frame[:2, 3] for sample in ann])
+        require_near(positions, str(args.ann))
+    unknown = []
+    for name, origin in sorted(origins.items()):
+        if origin is None:
+            unknown.append(name)
     if "osm" in args.formats and unknown:
         raise InputError(
             f"Lanelet2 needs longitude and latitude, and the origin of map {unknown[0]!r} is not "
@@ -135,103 +143,161 @@ def check_formats(args: argparse.Namespace, ann: AnnotationFile) -> None:
         import_extra("pyproj", "maps")
 
 
-def origin_of(
+def find_origin(
     args: argparse.Namespace, ann: AnnotationFile, map_name: str
 ) -> MapOrigin | MapGrid | None:
-    """Return where the global frame lies, if that is known."""
+    """Place of the global frame on the earth, or None if it is unknown.
+
+    Args:
+        args: The options of the command; ``--crs`` and ``--origin`` come first.
+        ann: The samples.
+        map_name: Name of their map, which has a known origin in nuScenes and Argoverse 2.
+    """
     if args.crs:
         return MapGrid(args.crs)
-    return MapOrigin(*args.origin) if args.origin else known_origin(ann.meta, map_name)
+    if args.origin:
+        latitude, longitude = args.origin
+        return MapOrigin(latitude, longitude)
+    return known_origin(ann.meta, map_name)
 
 
 def write_map(
     stem: Path, args: argparse.Namespace, ann: AnnotationFile, drive: Drive, elements: MapElements
 ) -> list[str]:
-    """Write a map in all formats; return the files."""
+    """Write a map in all formats.
+
+    Args:
+        stem: Path of the files, without a suffix.
+        args: The options of the command.
+        ann: The samples.
+        drive: The drive of the map.
+        elements: The map, in the global frame.
+
+    Returns:
+        The files.
+    """
     classes = drive.classes
-    origin = origin_of(args, ann, drive.frames[0].sample.map_name)
-    style, root = MapStyle(classes), args.data_root or args.ann.parent
+    origin = find_origin(args, ann, drive.frames[0].sample.map_name)
+    style = MapStyle(classes)
+    root = args.data_root or args.ann.parent
     colours = [style.colour(label) for label in range(len(classes))]
     replay = Replay(drive, elements, ann.meta.frame, colours, root, ann.meta.ground_z_m)
-    writers = {
-        "geojson": partial(write_geojson, classes=classes, origin=None),
-        "osm": lambda path, _: write_lanelet2(
-            path,
-            elements,
-            classes=classes,
-            origin=origin,
-            lanes=lanes,
-            speed_limit_kmh=args.speed_limit,
-        ),
-        "rrd": lambda path, _: write_rerun(path, replay),
-        "mcap": lambda path, _: write_mcap(path, replay),
-        "mp4": lambda path, _: write_video(path, replay),
-    }
-    for key in {"png", "svg"} & set(args.formats):
-        writers[key] = lambda path, _: draw(path, drive, elements, ann, style)
-    lanes = None
-    if "osm" in args.formats:
-        lanes = lane_graph_of(drive, elements)
-        print(f"{counted(len(lanes.lanelets), 'lanelet')} of centre lines: {stem}.osm")
     paths = []
-    for key in args.formats:
-        paths.append(f"{stem}.{key}")
-        writers[key](paths[-1], elements)
+    for suffix in args.formats:
+        path = f"{stem}.{suffix}"
+        paths.append(path)
+        if suffix == "geojson":
+            write_geojson(path, elements, classes, origin=None)
+        elif suffix == "osm":
+            lanes = lane_graph_of(drive, elements)
+            print(f"{counted(len(lanes.lanelets), 'lanelet')} of centre lines: {path}")
+            write_lanelet2(
+                path,
+                elements,
+                classes=classes,
+                origin=origin,
+                lanes=lanes,
+                speed_limit_kmh=args.speed_limit,
+            )
+        elif suffix == "rrd":
+            write_rerun(path, replay)
+        elif suffix == "mcap":
+            write_mcap(path, replay)
+        elif suffix == "mp4":
+            write_video(path, replay)
+        else:  # png, svg
+            draw(path, drive, elements, ann, style)
     if "geojson" in args.formats and origin is not None:
-        paths.append(f"{stem}{_LON_LAT}.geojson")
-        write_geojson(paths[-1], elements, classes, origin)
+        path = f"{stem}{_LON_LAT}.geojson"
+        paths.append(path)
+        write_geojson(path, elements, classes, origin)
     return paths
 
 
 def draw(
     path: str, drive: Drive, merged: MapElements, ann: AnnotationFile, style: MapStyle
 ) -> None:
-    """Draw the baseline, the merged and, where it is known, the true map."""
+    """Draw the baseline, the merged map and, with ground truth, the true map.
+
+    Args:
+        path: Picture to write.
+        drive: The drive.
+        merged: Its merged map, in the global frame.
+        ann: The samples.
+        style: Colours and titles of the classes.
+    """
     maps = {"suppressed (baseline)": suppress(drive), "merged": merged}
     if has_truth(ann):
-        annotated = {s.token: elements_of_instances(s.instances or []) for s in ann}
-        maps["true"] = true_map(read_drive(ann, drive.scene, annotated))
+        maps["true"] = true_map(read_drive(ann, drive.scene, read_truth(ann)))
     track = np.array([frame.sample.global_from_frame[:2, 3] for frame in drive.frames])
     save_figure(plot_maps(maps, track, style), path)
 
 
 def plot_maps(maps: Mapping[str, MapElements], track: np.ndarray, style: MapStyle) -> Figure:
-    """Draw maps of one drive side by side (long ones one below the other), with the way driven.
+    """Draw maps of one drive side by side, or wide maps below each other, with the driven track.
 
-    ``maps`` are in the global frame, by their titles; ``track`` holds the vehicle's positions in
-    metres. (n, 2)
+    Args:
+        maps: Maps in the global frame, by title.
+        track: Positions of the vehicle in the global frame, in metres. (n, 2)
+        style: Colours and titles of the classes.
     """
-    points = np.concatenate([track, *(elements.points[:, :2] for elements in maps.values())])
-    low, high = points.min(axis=0) - 5, points.max(axis=0) + 5
+    vertices = [elements.points[:, :2] for elements in maps.values()]
+    points = np.concatenate([track, *vertices])
+    low = points.min(axis=0) - 5
+    high = points.max(axis=0) + 5
     width, height = high - low
     rows = len(maps) if width > 2.5 * height else 1
     figure, axes = panel_grid(rows, len(maps) // rows)
-    across = WIDTH_IN * rows / len(maps) - 0.5  # without the labels
-    figure.set_figheight(0.4 + rows * (across * min(height / width, 2) + 0.5))
+    panel_width = WIDTH_IN * rows / len(maps) - 0.5  # inches, without the labels
+    panel_height = panel_width * min(height / width, 2)
+    figure.set_figheight(0.4 + rows * (panel_height + 0.5))
     for ax, (title, elements) in zip(axes.ravel(), maps.items(), strict=True):
         lines = [line[:, :2] - low for line in elements.polylines]
         draw_lines(ax, lines, elements.labels, style, style.colours(elements.labels), 0.8)
-        ax.plot(*(track - low).T, ".", color=style.ink, markersize=1.2)
+        x, y = (track - low).T
+        ax.plot(x, y, ".", color=style.ink, markersize=1.2)
         ax.set(xlim=(0, width), ylim=(0, height), aspect="equal")
         finish_panel(ax, title)
         for axis in (ax.xaxis, ax.yaxis):
             axis.set_major_formatter("{x:g} m")
-    labels = sorted({int(label) for elements in maps.values() for label in elements.labels})
-    lines = [Line2D([], [], color=style.colour(i), lw=2, label=style.title(i)) for i in labels]
-    figure.legend(handles=lines, loc="outside upper right", ncols=4, fontsize=8, frameon=False)
+    labels = np.unique(np.concatenate([elements.labels for elements in maps.values()]))
+    handles = []
+    for label in labels.astype(int).tolist():
+        line = Line2D([], [], color=style.colour(label), lw=2, label=style.title(label))
+        handles.append(line)
+    figure.legend(handles=handles, loc="outside upper right", ncols=4, fontsize=8, frameon=False)
     return figure
 
 
 def has_truth(ann: AnnotationFile) -> bool:
+    """Whether all samples have ground truth."""
     return bool((ann.instance_counts() >= 0).all())
 
 
+def read_truth(ann: AnnotationFile) -> dict[str, MapElements]:
+    """Ground truth of all samples, by token."""
+    return {sample.token: elements_of_instances(sample.instances or []) for sample in ann}
+
+
 def score(drives: list[Drive], merged: list[MapElements], ann: AnnotationFile, out: Path) -> None:
-    """Compare the merged maps and the plain baseline with the true maps."""
-    instances = {s.token: elements_of_instances(s.instances or []) for s in ann}
-    truths = [true_map(read_drive(ann, drive.scene, instances)) for drive in drives]
-    maps = {"merged": merged, "suppressed": [suppress(drive) for drive in drives]}
-    figures = {way: map_figures(found, truths, drives) for way, found in maps.items()}
+    """Score the merged maps and the baseline; write ``scores.json``.
+
+    Args:
+        drives: The drives.
+        merged: The merged map of each drive.
+        ann: The samples, with ground truth.
+        out: Folder of the figures.
+    """
+    instances = read_truth(ann)
+    truths = []
+    baseline = []
+    for drive in drives:
+        truths.append(true_map(read_drive(ann, drive.scene, instances)))
+        baseline.append(suppress(drive))
+    figures = {
+        "merged": map_figures(merged, truths, drives),
+        "suppressed": map_figures(baseline, truths, drives),
+    }
     print(f"\n{figures_table(figures)}\n")
     write_text(out / "scores.json", json.dumps(figures, indent=1) + "\n")
     print(f"figures: {out / 'scores.json'}")
@@ -256,21 +322,25 @@ def main(argv: list[str] | None = None) -> str:
             f"the samples of {args.ann} have no poses, so there is no map of the drive: --formats "
             "mp4 shows the single frames."
         )
-    drives, merged, spent_s = [], [], 0.0
+    drives = []
+    merged = []
+    processor_s = 0.0
     names = file_names(sorted(set(ann.column("scene"))), ("", _LON_LAT))
     for scene in args.scene or names:
-        drives.append(confident(read_drive(ann, scene, results), args.score_thr))
+        drive = confident(read_drive(ann, scene, results), args.score_thr)
         start_s = time.process_time()
-        merged.append(merge(drives[-1], config) if has_poses else MapElements.from_polylines())
-        spent_s += time.process_time() - start_s
-        for path in write_map(args.out / names[scene], args, ann, drives[-1], merged[-1]):
-            seen = counted(len(drives[-1].frames), "frame")
-            print(f"{counted(len(merged[-1]), 'element')} of {seen}: {path}")
+        elements = merge(drive, config) if has_poses else MapElements.from_polylines()
+        processor_s += time.process_time() - start_s
+        drives.append(drive)
+        merged.append(elements)
+        summary = f"{counted(len(elements), 'element')} of {counted(len(drive.frames), 'frame')}"
+        for path in write_map(args.out / names[scene], args, ann, drive, elements):
+            print(f"{summary}: {path}")
     if has_truth(ann):
         score(drives, merged, ann, args.out)
     frames = sum(len(drive.frames) for drive in drives)
-    done = f"{counted(len(drives), 'drive')}, {counted(frames, 'frame')}"
-    return f"{done}, merged in {spent_s:.1f} s of processor time"
+    numbers = f"{counted(len(drives), 'drive')}, {counted(frames, 'frame')}"
+    return f"{numbers}, merged in {processor_s:.1f} s of processor time"
 
 
 if __name__ == "__main__":

@@ -1,13 +1,14 @@
 #!/usr/bin/env python
-r"""Fit the sigmas of a model's Gaussians to its errors, and write a checkpoint that has them.
+r"""Fit the sigmas of a model's Gaussians to its errors, and write a calibrated checkpoint.
 
-RESULTS are this checkpoint's predictions of samples that it was not trained on. Each class gets a
-factor for sigma along and one for sigma across the line: 68.3 % of the errors then lie within one
-sigma, or with ``--sigmas 2`` 95.4 % within two. With ``--law laplace`` they lie within as large
-intervals of a Laplace distribution with this sigma (0.81 and 2.18 sigma to each side), whose tails
-are longer. The checkpoint's meta and its results say both under ``calibration``.
+RESULTS are predictions of this checkpoint on samples that are not in its training. The fit gives a
+factor per class for sigma along the line and one for sigma across: 68.3 % of the errors then lie
+within one sigma, or with ``--sigmas 2``, 95.4 % within two. With ``--law laplace`` the intervals
+are those quantiles of a Laplace distribution with this sigma (0.81 and 2.18 sigma to each side),
+whose tails are longer. The law and the number of sigmas are recorded as ``calibration`` in the meta
+of the checkpoint and in its results.
 
-Results that say that another checkpoint made them are refused, and samples of the training's split.
+Results of another checkpoint and samples of the training's split are refused.
 
 Example:
     python tools/test.py gsmap_r18_minicity --eval --out half.json \
@@ -58,7 +59,7 @@ def parse_args() -> argparse.Namespace:
 
 
 def require_held_out(trained: Mapping[str, Any], ground_truth: Path) -> None:
-    """Refuse samples of the split that a model was trained on, where both are known."""
+    """Refuse samples of the training's split, if both splits are known."""
     if ground_truth.suffix.lower() != ".json":
         meta = AnnotationFile(ground_truth).meta
         if (trained.get("dataset"), trained.get("split")) == (meta.dataset, meta.split):
@@ -81,7 +82,8 @@ def main() -> str:
     from gsmap.checkpoints.settings import IMAGE_SIZE, MODEL_SETTINGS, SIGNALS, plain
     from gsmap.engine.launch import read_config
 
-    cfg, source = read_config(args.config), read_checked(args.checkpoint)
+    cfg = read_config(args.config)
+    source = read_checked(args.checkpoint)
     require_held_out(source.dataset_meta, args.ground_truth)
     with building(cfg):
         adopt_settings(cfg, args.checkpoint, None)
@@ -93,10 +95,12 @@ def main() -> str:
         model = MODELS.build(cfg.model)
         if "scales" not in model.map_head.reference.outputs:
             raise InputError(f"{args.config} has no Gaussians: give a config of GSMap.")
-        pairs = SamplePairs(args.results, args.ground_truth, classes, True, gaussians=True)
+        pairs = SamplePairs(
+            args.results, args.ground_truth, classes, allow_mismatch=True, gaussians=True
+        )
         vertices = matched_vertices(pairs, ChamferConfig(classes))
-        made_by = pairs.about.get(CHECKPOINT)  # nothing in earlier files
-        if made_by not in (None, digest(find_checkpoint(args.checkpoint))):
+        checkpoint_digest = pairs.about.get(CHECKPOINT)  # None in files of earlier versions
+        if checkpoint_digest not in (None, digest(find_checkpoint(args.checkpoint))):
             raise InputError(
                 f"{args.results} was made with another checkpoint than {args.checkpoint}: give "
                 "this one's predictions (tools/test.py --out)."
@@ -108,17 +112,17 @@ def main() -> str:
         SIGNALS: source.can_bus,
         CALIBRATION: {"law": args.law, "sigmas": args.sigmas},
     }
-    if source.dataset_meta:  # with the split, which no other may be tested on
+    if source.dataset_meta:  # a test checks its split
         meta["dataset_meta"] = dict(source.dataset_meta)
     if source.image_size:
         meta[IMAGE_SIZE] = source.image_size
     with atomic_write(args.target, "wb") as file:
         torch.save({"state_dict": source.state, "meta": meta}, file)
-    rows = (
-        f"{name}: sigma {along:.2f} times along, {across:.2f} times across"
-        for name, (along, across) in zip(classes, factors, strict=True)
-    )
-    return "\n".join([*rows, f"by the {args.law} law, {args.sigmas:g} sigma: {args.target}"])
+    lines = []
+    for name, (along, across) in zip(classes, factors, strict=True):
+        lines.append(f"{name}: sigma {along:.2f} times along, {across:.2f} times across")
+    lines.append(f"by the {args.law} law, {args.sigmas:g} sigma: {args.target}")
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":

@@ -25,12 +25,13 @@ def main(argv: list[str] | None = None) -> str:
         "--max-error", type=float, default=0.1, help="of a curve from its line, in metres"
     )
     args = parser.parse_args(argv)
-    found = compact_results(args.results, args.out, args.degree, args.max_error)
-    sizes = [path.stat().st_size / 1e6 for path in (args.results, args.out)]
+    summary = compact_results(args.results, args.out, args.degree, args.max_error)
+    old_mb = args.results.stat().st_size / 1e6
+    new_mb = args.out.stat().st_size / 1e6
     return (
-        f"{counted(found.elements, 'element')}, {found.vertices} points as {found.controls} "
-        f"control points, at most {found.largest_m:.3f} m off: {args.out} "
-        f"({sizes[1]:.1f} MB instead of {sizes[0]:.1f})"
+        f"{counted(summary.elements, 'element')}, {summary.vertices} points as {summary.controls} "
+        f"control points, at most {summary.largest_m:.3f} m off: {args.out} "
+        f"({new_mb:.1f} MB instead of {old_mb:.1f})"
     )
 
 

@@ -88,12 +88,14 @@ def parse_args() -> argparse.Namespace:
 
 
 def read_tables(pattern: str = "*") -> list[dict[str, Any]]:
-    """Return the tables whose name fits.
+    """Tables whose name matches a shell pattern.
 
     Raises:
-        ValueError: If there is none.
+        ValueError: If no table matches.
     """
-    tables = [table for method in METHODS for table in method.paper()["tables"]]
+    tables = []
+    for method in METHODS:
+        tables += method.paper()["tables"]
     tables += read_json(shipped("configs/tables.json"))  # of several methods
     chosen = [table for table in tables if fnmatchcase(table["table"], pattern)]
     if not chosen:
@@ -104,8 +106,8 @@ def read_tables(pattern: str = "*") -> list[dict[str, Any]]:
     return chosen
 
 
-def command_of(row: dict[str, Any]) -> str:
-    """Return the command that trains a row's model, or why there is none."""
+def training_command(row: dict[str, Any]) -> str:
+    """Command that trains the model of a row, or the reason why there is none."""
     if row["config"] is None:
         return f"({row['note']})"
     words = ["python", "tools/train.py", row["config"]]
@@ -114,50 +116,58 @@ def command_of(row: dict[str, Any]) -> str:
     return shlex.join(words)
 
 
-def figures_of(table: dict[str, Any], row: dict[str, Any]) -> str:
-    """Return the paper's mean APs and costs of a row; all figures where the table has no mean."""
+def published_figures(table: dict[str, Any], row: dict[str, Any]) -> str:
+    """Mean APs and costs of a row in the paper; all figures if the table has no mean."""
     if row["paper"] is None:
         return "no figure"
-    both = dict(zip(table["columns"], row["paper"], strict=True))
-    means = {name: value for name, value in both.items() if not name.endswith("/AP")} or both
-    return ", ".join(f"{name} {'-' if v is None else v}" for name, v in means.items())
+    figures = dict(zip(table["columns"], row["paper"], strict=True))
+    means = []
+    aps = []
+    for name, value in figures.items():
+        words = aps if name.endswith("/AP") else means
+        words.append(f"{name} {'-' if value is None else value}")
+    return ", ".join(means or aps)
 
 
-def lines(tables: list[dict[str, Any]]) -> Iterator[str]:
-    """Yield the listing."""
+def listing(tables: list[dict[str, Any]]) -> Iterator[str]:
+    """Yield the lines of ``--list``."""
     for table in tables:
         yield table["table"]
         for row in table["rows"]:
-            yield f"  {row['row']}: {figures_of(table, row)}"
-            yield f"    {command_of(row)}"
+            yield f"  {row['row']}: {published_figures(table, row)}"
+            yield f"    {training_command(row)}"
             if row["config"] is not None and "note" in row:
                 yield f"    ({row['note']})"
 
 
 def slurm_commands(runs: list[Run], partition: str) -> str:
-    """Return a command for each run that is not done, one a line."""
-    own = argparse.ArgumentParser(add_help=False)
-    own.add_argument("--slurm")
-    words = own.parse_known_args()[1]
+    """Commands for the unfinished runs, one per line."""
+    slurm_option = argparse.ArgumentParser(add_help=False)
+    slurm_option.add_argument("--slurm")
+    _, other_words = slurm_option.parse_known_args()
     launch = ["srun", f"--partition={partition}", "--gres=gpu:1", "--ntasks=1", "--cpus-per-task=5"]
-    return "\n".join(
-        shlex.join([*launch, f"--job-name={run.label}", sys.executable, sys.argv[0], *words])
-        + f" --only {run.label}"
-        for run in runs
-        if not run.done
-    )
+    commands = []
+    for run in runs:
+        if not run.done:
+            words = [*launch, f"--job-name={run.label}", sys.executable, sys.argv[0], *other_words]
+            commands.append(f"{shlex.join(words)} --only {run.label}")
+    return "\n".join(commands)
 
 
 def train(runs: list[Run]) -> None:
-    """Train and test what is not done, and say how each run ends."""
+    """Train and test the unfinished runs, and print the end of each."""
     for run, state in execute(runs):
         Progress.write(f"{run.label}: {state}")
         sys.stdout.flush()
 
 
 def tabulate(runs: list[Run], args: argparse.Namespace) -> str:
-    """Write tables and plots of all runs, and return the tables."""
-    named: list[tuple[str, Path, int | None]] = [(r.name, r.folder, r.seed) for r in runs]
+    """Write tables and plots of all runs.
+
+    Returns:
+        The tables, in Markdown.
+    """
+    results = [read_result(run.name, run.folder, run.seed) for run in runs]
     for text in args.runs:
         name, _, folder = text.partition("=")
         if not Path(folder or ".", "metrics.json").is_file():
@@ -165,11 +175,10 @@ def tabulate(runs: list[Run], args: argparse.Namespace) -> str:
                 f"{text!r} names no finished run: write NAME=DIR, where DIR holds metrics.json "
                 "(tools/test.py --metrics-out)."
             )
-        named.append((name, Path(folder), None))
-    results = [read_result(*run) for run in named]
+        results.append(read_result(name, Path(folder)))
     check_one_test_set(results)
     reports = apply_rescoring(results, args.rescore or {})
-    rules = ", ".join(f"{k} {v}" for k, v in (args.rescore or {}).items())
+    rules = ", ".join(f"{key} {value}" for key, value in (args.rescore or {}).items())
     title = f"Comparison under {rules}" if rules else "Comparison"
     stem = "rescored" if rules else "comparison"
     command = shlex.join(["python", *sys.argv])
@@ -187,11 +196,11 @@ def tabulate(runs: list[Run], args: argparse.Namespace) -> str:
 def main() -> str:
     args = parse_args()
     if args.list:
-        return "\n".join(lines(read_tables(args.tables)))
+        return "\n".join(listing(read_tables(args.tables)))
     runs: list[Run] = []
     if args.configs:
-        placed = data_root_options(args.data_root) if args.data_root else {}
-        options = [f"{key}={value}" for key, value in placed.items()]
+        data_options = data_root_options(args.data_root) if args.data_root else {}
+        options = [f"{key}={value}" for key, value in data_options.items()]
         protocol = Protocol(
             seeds=args.seeds,
             budget=args.budget,

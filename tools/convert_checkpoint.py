@@ -21,12 +21,12 @@ def main() -> str:
 
     weights = read_weights(args.source)
     try:
-        state, done = convert_state(weights)
+        state, summary = convert_state(weights)
     except ValueError as error:
         raise InputError(f"{args.source}: {error}") from error
     with atomic_write(args.target, "wb") as file:
-        torch.save({"state_dict": state, "meta": {"converted": done}}, file)
-    return f"{done}, {len(state)} tensors, {args.target}"
+        torch.save({"state_dict": state, "meta": {"converted": summary}}, file)
+    return f"{summary}, {len(state)} tensors, {args.target}"
 
 
 if __name__ == "__main__":

@@ -32,7 +32,19 @@ def parse_args() -> argparse.Namespace:
 
 
 def convert(source: Path, target: Path, allow_changes: bool = False) -> str:
-    """Write the converted config and return what to say of it."""
+    """Write the converted config.
+
+    Args:
+        source: Config of an original repository; it is read as data.
+        target: Config to write.
+        allow_changes: Whether to leave out settings of the model that have no counterpart.
+
+    Returns:
+        Lines with the base config and all settings that have no counterpart.
+
+    Raises:
+        ValueError: If the config cannot be converted.
+    """
     settings = read_assignments(source)
     try:
         conversion = convert_upstream(settings)
@@ -41,7 +53,11 @@ def convert(source: Path, target: Path, allow_changes: bool = False) -> str:
         ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError,
     ) as error:  # fmt: skip
         raise InputError(f"{source} cannot be converted: {error}") from error
-    of_model = [setting for setting in conversion.unplaced if setting.startswith("model.")]
+    of_model = []
+    others = []
+    for setting in conversion.unplaced:
+        settings = of_model if setting.startswith("model.") else others
+        settings.append(setting)
     if of_model and not allow_changes:
         raise InputError(
             f"{source} would become another model: {len(of_model)} of its settings have no "
@@ -49,10 +65,10 @@ def convert(source: Path, target: Path, allow_changes: bool = False) -> str:
         )
     write_text(target, text)
     lines = [f"{target} is written: configs/{conversion.base} with the settings of {source}"]
-    others = [setting for setting in conversion.unplaced if setting not in of_model]
-    for what, left_out in (("another model, without", of_model), ("not placed", others)):
-        if left_out:
-            lines += [f"{what}, see docs/migration.md:", *(f"  {s}" for s in left_out)]
+    for title, settings in (("another model, without", of_model), ("not placed", others)):
+        if settings:
+            lines.append(f"{title}, see docs/migration.md:")
+            lines += [f"  {setting}" for setting in settings]
     return "\n".join(lines)
 
 

@@ -25,7 +25,7 @@ COMMANDS = {
     ),
     "infos": ("mapdata.infos.convert", "convert an info file of MapTR or MapTRv2"),
     "split": ("mapdata.splitter", "split scenes by place, at a distance from each other"),
-    "overlap": ("mapdata.overlap", "say which validation samples lie near training"),
+    "overlap": ("mapdata.overlap", "list the validation samples that lie near training"),
     "occlusion": ("mapdata.nuscenes.occlusion", "group samples by how much boxes hide of the map"),
     "check": ("mapdata.check", "check annotation files completely"),
     "export": ("mapdata.vectors_json", "write an annotation file's vectors as JSON"),
@@ -33,21 +33,21 @@ COMMANDS = {
 
 
 def make() -> str | None:
-    """Run the command that is asked for and return what it has to say."""
+    """Run the chosen command and return its summary."""
     parser = CommandParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     commands = parser.add_subparsers(dest="command", required=True)
-    asked_for = next((word for word in sys.argv[1:] if word in COMMANDS), None)
+    chosen = next((word for word in sys.argv[1:] if word in COMMANDS), None)
     for name, (module, text) in COMMANDS.items():
         subparser = commands.add_parser(name, help=text, description=text)
-        if name == asked_for:
+        if name == chosen:
             importlib.import_module(module).add_arguments(subparser)
     arguments = parser.parse_args()
     if getattr(arguments, "executor", None):
         return run_on_ray(arguments, sys.argv)
     module, _ = COMMANDS[arguments.command]
-    words = without_options(sys.argv, "--shard")  # the whole is made by the same command
+    words = without_options(sys.argv, "--shard")  # the command of the whole file
     arguments.command = printable(shlex.join(["python", *words]))
     return importlib.import_module(module).run(arguments)
 

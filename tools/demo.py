@@ -336,10 +336,13 @@ def table(folder: Path, shipped: Iterable[str], trained: Iterable[Training]) -> 
         others = f"{training.title}, images of other samples"
         rows[others] = training.test_folder("shuffled") / "metrics.json"
     keys = []
+    head = ["model"]
     for metric in ("chamfer", "raster"):
-        keys += [f"{metric}/{name}/AP" for name in CLASSES]
+        for name in CLASSES:
+            keys.append(f"{metric}/{name}/AP")
+            head.append(f"{metric} {name}")
         keys.append(f"{metric}/mAP")
-    head = ["model", *(key.replace("/AP", "").replace("/", " ") for key in keys)]
+        head.append(f"{metric} mAP")
     lines = []
     for name, path in rows.items():
         figures = json.loads(path.read_text())

@@ -210,8 +210,13 @@ def main(argv: list[str] | None = None) -> str:
     groups = read_groups(args)  # faults of these files end the command before it scores
     resamples = read_resamples(args)
     reports, notes = evaluate_input(args, evaluator)
-    ranked = [report for report in reports if report.detections]
-    counts = [report for report in reports if not report.detections]
+    ranked = []
+    counts = []
+    for report in reports:
+        if report.detections:
+            ranked.append(report)
+        else:
+            counts.append(report)
     analyses = []
     if resamples is not None:
         others = evaluate_results(args.against, args, evaluator) if args.against else None

@@ -82,7 +82,17 @@ def parse_args() -> argparse.Namespace:
 def open_samples(
     inferencer: MapInferencer, args: argparse.Namespace, source: Path | None, split: str
 ) -> "VectorizedMapDataset":
-    """Open an annotation file, by default that of the config's split."""
+    """Open the samples of an annotation file.
+
+    Args:
+        inferencer: The model with its config.
+        args: The options of the command.
+        source: The annotation file; None for the one of the config.
+        split: ``train`` or ``test``, for the file of the config.
+
+    Raises:
+        FileNotFoundError: If the file of the config does not exist.
+    """
     options = inferencer.cfg[f"{split}_dataloader"].dataset
     if source is None:
         source = Path(args.data_root or options.data_root, options.ann_file)
@@ -95,13 +105,14 @@ def open_samples(
 
 
 def write_model(inferencer: MapInferencer, args: argparse.Namespace) -> OnnxInferencer:
-    """Export in the precision that is asked for."""
+    """Export the model in the chosen precision, and open the written file."""
     options = inferencer.cfg.test_dataloader.dataset
     if not options.get("cameras"):
         raise InputError(f"{args.config} lists no cameras: set test_dataloader.dataset.cameras.")
     size = args.size
     if size is None:
-        size = open_samples(inferencer, args, args.samples, "test")[0]["inputs"]["img"].shape[-2:]
+        first_sample = open_samples(inferencer, args, args.samples, split="test")[0]
+        size = first_sample["inputs"]["img"].shape[-2:]
     write = partial(
         export_onnx,
         inferencer.model,
@@ -126,41 +137,63 @@ def write_model(inferencer: MapInferencer, args: argparse.Namespace) -> OnnxInfe
 def calibration_samples(
     inferencer: MapInferencer, exported: OnnxInferencer, args: argparse.Namespace
 ) -> Iterator[dict[str, NDArray[np.float32]]]:
-    """Yield what --int8 is calibrated on."""
-    dataset = open_samples(inferencer, args, args.calibration, "train")
+    """Yield the inputs that calibrate the 8-bit model.
+
+    Args:
+        inferencer: The model with its config.
+        exported: The model in single precision, as ONNX.
+        args: The options of the command.
+
+    Yields:
+        Arrays of one sample, by the name of the input.
+    """
+    dataset = open_samples(inferencer, args, args.calibration, split="train")
     chosen = select_samples(dataset.annotations.column("token"), None, args.calibration_samples)
     for _, inputs in graph_inputs(exported, dataset, chosen):
         yield inputs
 
 
 def check(inferencer: MapInferencer, exported: OnnxInferencer, args: argparse.Namespace) -> str:
-    """Compare with torch; return what to print."""
-    dataset = open_samples(inferencer, args, args.samples, "test")
+    """Compare the exported model with torch.
+
+    Args:
+        inferencer: The model in torch.
+        exported: The exported model.
+        args: The options of the command.
+
+    Returns:
+        A sentence with the largest differences.
+    """
+    dataset = open_samples(inferencer, args, args.samples, split="test")
     chosen = select_samples(dataset.annotations.column("token"), None, args.check)
-    differences, predictions = [], []
+    unfolded = exported.metadata.get("unfold_classes", [])
     in_torch = inferencer.predict(dataset, chosen)
     samples = graph_inputs(exported, dataset, chosen)
-    for expected, (token, inputs) in zip(in_torch, samples, strict=True):
-        found = exported.elements(exported.run(inputs))
-        truth = elements_of_predictions(expected.pred_instances_3d)
-        unfolded = exported.metadata.get("unfold_classes", [])
-        differences.append(largest_differences(found, truth, unfolded))
-        predictions.append((token, found))
+    differences = []
+    predictions = []
+    for sample, (token, inputs) in zip(in_torch, samples, strict=True):
+        elements = exported.elements(exported.run(inputs))
+        expected = elements_of_predictions(sample.pred_instances_3d)
+        differences.append(largest_differences(elements, expected, unfolded))
+        predictions.append((token, elements))
     if args.results:
         exported.write(args.results, predictions)
-    alike = [pair for pair in differences if np.isfinite(pair).all()]
-    scores, metres = np.max(alike or [(0, 0)], 0)
+    equal_classes = [pair for pair in differences if np.isfinite(pair).all()]
+    score, distance_m = np.max(equal_classes or [(0, 0)], axis=0)
     return (
-        f"{len(alike)} of {len(chosen)} samples have the same classes in ONNX Runtime as in torch; "
-        f"these differ by at most {scores:.1e} in score, {metres:.1e} m in the nearest element"
+        f"{len(equal_classes)} of {len(chosen)} samples have the same classes in ONNX Runtime as "
+        f"in torch; these differ by at most {score:.1e} in score, {distance_m:.1e} m in the "
+        "nearest element"
     )
 
 
 def main() -> str:
     args = parse_args()
-    for name in ("torch.onnx", "onnxscript"):  # they tell of what they need not do
+    for name in ("torch.onnx", "onnxscript"):  # their notes are about optional steps
         logging.getLogger(name).setLevel(logging.ERROR)
-    inferencer = MapInferencer(args.config, args.checkpoint, "cpu", args.cfg_options)
+    inferencer = MapInferencer(
+        args.config, args.checkpoint, device="cpu", cfg_options=args.cfg_options
+    )
     exported = write_model(inferencer, args)
     rows, columns = exported.image_size
     print(

@@ -49,7 +49,7 @@ if TYPE_CHECKING:  # slow to import
     from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
 
 _ONE_SAMPLE_HZ = 1e-4
-_SAMPLES = ".arrow"  # what the samples go to, in place of the suffix of --out
+_SAMPLES = ".arrow"  # suffix of the file with the samples, in place of the one of --out
 SKIPPED = DOUBTFUL = 1  # exit code when frames were broken, or a calibration is implausible
 
 
@@ -138,7 +138,7 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
 
 
 def _trained_cameras(args: argparse.Namespace) -> dict[str, tuple[float, ...]]:
-    """Return the cameras that the model was trained on, nothing where it does not say."""
+    """Cameras of the model's training, by name; empty if the checkpoint does not record them."""
     if not args.model:
         return {}
     from gsmap.apis.loading import trained_rig
@@ -148,21 +148,32 @@ def _trained_cameras(args: argparse.Namespace) -> dict[str, tuple[float, ...]]:
 
 
 def chosen_checkpoint(args: argparse.Namespace) -> Path:
-    """Return the file of the model's weights."""
-    return checkpoint_for(args.model[0], args.model[1] if len(args.model) > 1 else None)
+    """File with the weights of the model."""
+    checkpoint = args.model[1] if len(args.model) > 1 else None
+    return checkpoint_for(args.model[0], checkpoint)
 
 
 def read_input(args: argparse.Namespace, frames: Path | None = None) -> Source:
-    """Open the input and say what its reader has to say; with a folder for frames, few samples."""
-    all_samples = frames is None
-    place = args.out.with_suffix("") if args.out else (args.show_dir or Path()) / "input"
+    """Open the input and print the notes of its reader.
+
+    Args:
+        args: The options of the command.
+        frames: Folder for extracted frames, for a look at few samples. None extracts all samples
+            into a folder beside the output.
+
+    Raises:
+        ValueError: If the input is not a recording.
+    """
+    rate_hz = _ONE_SAMPLE_HZ
     if frames is None:
+        rate_hz = args.rate
+        place = args.out.with_suffix("") if args.out else (args.show_dir or Path()) / "input"
         frames = own_folder(place.with_name(f"{place.name}_frames"))
     options = InputOptions(
         data_root=args.data_root,
         allow_missing_cameras=args.allow_missing_cameras,
         version=args.version,
-        rate_hz=args.rate if all_samples else _ONE_SAMPLE_HZ,
+        rate_hz=rate_hz,
         frames_dir=frames,
         vehicle_frame=args.vehicle_frame,
         vehicle_ground_z_m=args.vehicle_ground_z,
@@ -179,16 +190,16 @@ def read_input(args: argparse.Namespace, frames: Path | None = None) -> Source:
 
 
 def require_own_samples(path: Path) -> None:
-    """Refuse to replace an annotation file that is not the samples of an earlier run.
+    """Check that an annotation file may be replaced: an earlier run of this command wrote it.
 
     Raises:
-        ValueError: If it is another one.
+        ValueError: If the file is there and another command wrote it.
     """
     from gsmap.apis.input_dataset import SAMPLES_BY
 
     if not path.exists():
         return
-    with suppress(ValueError):  # it is no annotation file at all
+    with suppress(ValueError):  # not an annotation file
         if AnnotationFile(path).meta.command == SAMPLES_BY:
             return
     raise InputError(
@@ -198,8 +209,13 @@ def require_own_samples(path: Path) -> None:
 
 
 def check_calibration(args: argparse.Namespace, source: Source) -> list[str]:
-    """Print what is implausible about an input's cameras; draw them if that is asked for."""
-    sample, root = source.samples[0], source.data_root or Path()
+    """Print implausible properties of the cameras; with ``--check-calibration``, draw them.
+
+    Returns:
+        The warnings.
+    """
+    sample = source.samples[0]
+    root = source.data_root or Path()
     warnings = calibration_warnings(source.samples, source.frame, source.ground_z_m)
     warnings += image_warnings(sample, root)
     for line in warnings:
@@ -207,46 +223,56 @@ def check_calibration(args: argparse.Namespace, source: Source) -> list[str]:
     if args.check_calibration:
         figure = calibration_figure(sample, source.frame, root, source.ground_z_m)
         path = save_figure(figure, args.check_calibration)
-        found = counted(len(warnings), "warning")
-        print(f"{found}; the ground plane as the cameras should see it: {path}")
+        number = counted(len(warnings), "warning")
+        print(f"{number}; the ground plane as the cameras should see it: {path}")
     return warnings
 
 
 def open_model(args: argparse.Namespace) -> "MapInferencer":
-    """Load the model, with the options of its pictures."""
+    """Load the model and set the options of its pictures."""
     from gsmap import MapInferencer
 
-    config, checkpoint = args.model[0], args.model[1] if len(args.model) > 1 else None
     inferencer = MapInferencer(
-        config,
-        checkpoint_for(config, checkpoint),
-        args.device,
-        args.cfg_options,
-        args.amp,
-        args.cuda_graphs,
+        args.model[0],
+        chosen_checkpoint(args),
+        device=args.device,
+        cfg_options=args.cfg_options,
+        amp=args.amp,
+        cuda_graphs=args.cuda_graphs,
     )
     visualizer = inferencer.visualizer
     visualizer.show_order = args.order
-    visualizer.ground_z_m = args.ground_z if args.ground_z is not None else visualizer.ground_z_m
-    visualizer.width_px = args.width or visualizer.width_px
+    if args.ground_z is not None:
+        visualizer.ground_z_m = args.ground_z
+    if args.width is not None:
+        visualizer.width_px = args.width
     return inferencer
 
 
-def about_results(args: argparse.Namespace, data: dict[str, Any]) -> dict[str, Any]:
-    """Return what a result file says of itself: classes, model, lists of scenes where known."""
+def result_header(args: argparse.Namespace, data: dict[str, Any]) -> dict[str, Any]:
+    """Header of the result file: classes, model and, where known, calibration and scene lists.
+
+    Args:
+        args: The options of the command.
+        data: Meta information of the data set.
+    """
     from gsmap.checkpoints.reading import read_checked
 
     path = chosen_checkpoint(args)
     checkpoint = read_checked(path)
-    about = {"classes": list(data["classes"]), CHECKPOINT: digest(path)}
-    known: dict[str, Any] = {CALIBRATION: checkpoint.calibration}
+    header = {"classes": list(data["classes"]), CHECKPOINT: digest(path)}
+    optional: dict[str, Any] = {CALIBRATION: checkpoint.calibration}
     if identity := data.get(SPLIT_LIST):
-        known |= {SPLIT_LIST: identity, TRAINED_ON: checkpoint.list_of(data["dataset"])}
-    return about | {key: said for key, said in known.items() if said}
+        optional[SPLIT_LIST] = identity
+        optional[TRAINED_ON] = checkpoint.list_of(data["dataset"])
+    for key, value in optional.items():
+        if value:
+            header[key] = value
+    return header
 
 
 def run_settings(args: argparse.Namespace) -> dict[str, str]:
-    """Return what decides the predictions of a run, besides its samples."""
+    """Settings that determine the predictions of a sample."""
     checkpoint = chosen_checkpoint(args)
     settings = {"model": args.model[0], "checkpoint": digest(checkpoint)}
     for name in ("cfg_options", "token", "max_samples", "allow_missing_cameras", "amp"):
@@ -260,7 +286,15 @@ def open_log(
     tokens: list[str],
     classes: Sequence[str],
 ) -> AbstractContextManager[ResultLog | None]:
-    """Return the log of the run's predictions, or an empty context without ``--out``."""
+    """Open the log of the run's predictions; without ``--out`` there is none.
+
+    Args:
+        args: The options of the command.
+        settings: Settings that determine the predictions. Predictions of an earlier run are used
+            if its settings are equal.
+        tokens: Tokens of the samples to predict, in their order.
+        classes: Names of the classes.
+    """
     if not args.out:
         return nullcontext()
     return ResultLog(args.shard.path_of(args.out), settings, tokens=tokens, classes=classes)
@@ -273,8 +307,20 @@ def predict(
     chosen: list[int],
     results: ResultLog | None,
 ) -> dict[str, str]:
-    """Predict samples, draw them and keep what was found; return the broken ones' reasons."""
-    tokens, broken = dataset.annotations.column("token"), {}
+    """Predict samples, draw them and log the predictions.
+
+    Args:
+        args: The options of the command.
+        inferencer: The model.
+        dataset: The samples.
+        chosen: Indices of the samples to predict.
+        results: Log of the predictions; None without ``--out``.
+
+    Returns:
+        The reason for each broken frame, by the token of its sample.
+    """
+    tokens = dataset.annotations.column("token")
+    broken: dict[str, str] = {}
     done = set(results.done) if results else set()
     with Progress(total=len(chosen), unit="samples", smoothing=0.05) as bar:
         if results and results.dropped:
@@ -314,8 +360,16 @@ def draw(
     dataset: "VectorizedMapDataset",
     sample: "Det3DDataSample",
 ) -> None:
-    """Draw a predicted sample into the folder of pictures."""
-    token, points = str(sample.metainfo["token"]), None
+    """Draw a predicted sample into the folder of pictures.
+
+    Args:
+        args: The options of the command.
+        inferencer: The model.
+        dataset: The samples, which have the LiDAR sweeps of ``--lidar``.
+        sample: The prediction.
+    """
+    token = str(sample.metainfo["token"])
+    points = None
     if args.lidar:
         index = dataset.annotations.column("token").index(token)
         points = inferencer.lidar_points(dataset, index)
@@ -350,19 +404,22 @@ def main(argv: list[str] | None = None) -> str | None:
     dataset = inferencer.dataset(source)
     tokens = dataset.annotations.column("token")
     chosen = args.shard.part(select_samples(tokens, args.token, args.max_samples))
-    settings, made_from = run_settings(args), digest(dataset.annotations.path)
-    run = {**settings, "input": str(args.input.resolve()), "samples": made_from}
-    run["images"] = str(source.data_root)  # its folder tells content and calibration
-    wanted = [tokens[index] for index in chosen]
+    settings = run_settings(args)
+    samples_digest = digest(dataset.annotations.path)
+    run = {**settings, "input": str(args.input.resolve()), "samples": samples_digest}
+    run["images"] = str(source.data_root)  # the folder name depends on content and calibration
+    chosen_tokens = [tokens[index] for index in chosen]
     classes = dataset.metainfo["classes"]
-    with open_log(args, run, tokens=wanted, classes=classes) as results:
+    with open_log(args, run, tokens=chosen_tokens, classes=classes) as results:
         broken = predict(args, inferencer, dataset, chosen, results)
         if chosen and len(broken) == len(chosen):
-            noted = "".join(f"; as said: {note}" for note in source.notes[-1:])
-            raise InputError(f"no frame can be used: {next(iter(broken.values()))}{noted}")
+            reason = next(iter(broken.values()))
+            if source.notes:
+                reason = f"{reason}; as said: {source.notes[-1]}"
+            raise InputError(f"no frame can be used: {reason}")
         if results:
-            count = results.finish(about_results(args, dataset.metainfo))
-            args.shard.seal(args.out, RESULTS, made_from, settings, count)
+            count = results.finish(result_header(args, dataset.metainfo))
+            args.shard.seal(args.out, RESULTS, samples_digest, settings, count)
     print_summary(args, source, dataset.ann_file, len(chosen), broken)
     return None
 
@@ -370,10 +427,18 @@ def main(argv: list[str] | None = None) -> str | None:
 def print_summary(
     args: argparse.Namespace, source: Source, ann_file: str, count: int, broken: dict[str, str]
 ) -> None:
-    """Say what was written, and leave with `SKIPPED` if frames were broken."""
+    """Print the written files; exit with `SKIPPED` if frames were broken.
+
+    Args:
+        args: The options of the command.
+        source: The recording.
+        ann_file: Annotation file of the samples, which is copied beside ``--out``.
+        count: Number of samples of the run.
+        broken: Reasons of broken frames, by token.
+    """
     out = args.out and args.shard.path_of(args.out)
-    where = " and ".join(str(path) for path in (out, args.show_dir) if path)
-    print(f"{count - len(broken)} of {counted(count, 'sample')} predicted: {where}")
+    written = " and ".join(str(path) for path in (out, args.show_dir) if path)
+    print(f"{count - len(broken)} of {counted(count, 'sample')} predicted: {written}")
     if args.out and not isinstance(source.samples, AnnotationFile):
         annotations = args.out.with_suffix(_SAMPLES)
         write_bytes(annotations, Path(ann_file).read_bytes())

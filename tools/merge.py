@@ -1,8 +1,8 @@
 #!/usr/bin/env python
-"""Join the parts that ``--shard I/N`` of other commands made: ``python tools/merge.py FILE ...``.
+"""Join the parts that commands with ``--shard I/N`` wrote: ``python tools/merge.py FILE ...``.
 
-FILE is what the command makes without ``--shard``: an annotation file, results or metrics. All of
-its N parts must be in the same folder. The result is identical, byte for byte (docs/scale.md).
+FILE is the output of a command without ``--shard``: an annotation file, results or metrics. Its N
+parts must lie in its folder. The joined file is identical, byte for byte (docs/scale.md).
 """
 
 from importlib import import_module
@@ -22,10 +22,14 @@ from gsmap.utils.words import counted
 
 
 def merge_matches(path: Path, shards: list[ShardFile]) -> int:
-    """Write and print the figures of all shards; return the number of samples."""
+    """Write and print the figures of all shards.
+
+    Returns:
+        The number of samples.
+    """
     reports, notes = report_shards(shards)
-    for found in reports:
-        print(format_table(found) + "\n")
+    for report in reports:
+        print(format_table(report) + "\n")
     for note in notes:
         print(f"note: {note}")
     write_figures(path, reports)

@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Write a page about a result file: figures, curves and frames in one HTML file. Or film a drive.
+"""Write a page about a result file, with figures, curves and frames, or film a drive.
 
 Examples:
     python tools/report.py results.json --ann gsmap_nuscenes_val.arrow --out report.html
@@ -16,7 +16,8 @@ from gsmap.utils.errors import InputError
 from gsmap.visualization.film import write_drive_film
 from gsmap.visualization.page.page import PageOptions, is_own_page, page_data, write_page
 
-_PAGE = Path("report.html")  # if none is named
+_PAGE = Path("report.html")  # without --out
+_IMAGE_WIDTH_PX = 320  # without --image-width
 
 
 def parse_args() -> argparse.Namespace:
@@ -69,8 +70,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument(
         "--law",
         choices=LAWS,
-        help="distribution of the errors (that of the model's calibration, as the results say, or "
-        "normal)",
+        help="distribution of the errors (default: the one of the model's calibration, or normal)",
     )
     parser.add_argument("--scene", help="drive of a film; default: the first one of --ann")
     args = parser.parse_args()
@@ -89,32 +89,40 @@ def main() -> str:
     args = parse_args()
     if args.out is _PAGE and foreign:
         raise FileExistsError(f"{_PAGE} is there, and no page of this command: give --out PAGE.")
-    paths = [args.results, *([args.compare] if args.compare else [])]
+    paths = [args.results]
+    if args.compare:
+        paths.append(args.compare)
     names = args.names or [f"{path.resolve().parent.name}/{path.stem}" for path in paths]
     if len(names) != len(paths) or len(set(names)) != len(names):
         raise InputError(f"--names must give {len(paths)} different names, got {names}.")
     named = dict(zip(names, paths, strict=True))
-    options = PageOptions(
-        args.data_root,
-        args.max_frames,
-        args.score_thr,
-        0 if args.no_images else 320 if args.image_width is None else args.image_width,
-        args.allow_mismatch,
-        args.by,
-        args.allow_other_split,
-        args.law,
-    )
+    if args.no_images:
+        image_width_px = 0
+    elif args.image_width is not None:
+        image_width_px = args.image_width
+    else:
+        image_width_px = _IMAGE_WIDTH_PX
     if args.out.suffix.lower() == ".mp4":
         return write_drive_film(
             args.out,
             args.ann,
             named,
             args.scene,
-            options.data_root,
-            options.score_thr,
+            args.data_root,
+            args.score_thr,
             not args.no_images,
-            options.max_frames,
+            args.max_frames,
         )
+    options = PageOptions(
+        data_root=args.data_root,
+        max_frames=args.max_frames,
+        score_thr=args.score_thr,
+        image_width=image_width_px,
+        allow_mismatch=args.allow_mismatch,
+        by=args.by,
+        allow_other_split=args.allow_other_split,
+        law=args.law,
+    )
     data = page_data(args.ann, named, options)
     return write_page(args.out, data)
 

@@ -1,8 +1,8 @@
 #!/usr/bin/env python
-r"""Measure what a model loses when cameras fail: AP_chamfer over five severities of corruptions.
+r"""Measure the loss of accuracy when cameras fail: AP_chamfer at five severities of corruptions.
 
-Writes ``robustness.md``, ``robustness.json`` and ``robustness.png``. Resilience is the mean of AP
-over the severities, as a share of that without corruption.
+Writes ``robustness.md``, ``robustness.json`` and ``robustness.png``. Resilience is the mean AP over
+the severities, divided by the AP without corruption.
 
 Example:
     python tools/robustness.py gsmap_r18_minicity --data-root data/minicity --samples 50 --out r
@@ -13,6 +13,7 @@ import gsmap  # noqa: F401 - first: Ctrl-C is one line from here on, foreign set
 # isort: split
 import argparse
 import json
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.files import lock_folder, read_json, write_text
 from gsmap.utils.progress import Progress
 from gsmap.utils.split_lists import require_same_list
+from gsmap.utils.words import markdown_table
 
 KINDS = (
     "camera_lost", "camera_delayed", "rotation", "translation",
@@ -44,7 +46,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("checkpoint", nargs="?", help="not needed with the name of a model")
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
     parser.add_argument("--samples", type=int, help="that many, evenly spread; default: all")
-    parser.add_argument("--seed", type=int, default=0, help="of what the corruptions draw")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the random corruptions")
     parser.add_argument("--out", type=Path, required=True, help="folder of table and plot")
     parser.add_argument(
         "--allow-other-split",
@@ -58,23 +60,43 @@ def parse_args() -> argparse.Namespace:
     return args
 
 
-def corrupted(settings: Any, kind: str, severity: int, seed: int) -> dict[str, Any]:
-    """Return a data set's settings with a corruption in the pipeline, where its images are read."""
+def add_corruption(settings: Any, kind: str, severity: int, seed: int) -> dict[str, Any]:
+    """Settings of a data set, with a corruption beside the loading of images in its pipeline.
+
+    Args:
+        settings: Settings of the data set in a config.
+        kind: One of ``KINDS``, or ``CLEAN`` for no corruption.
+        severity: Severity of the corruption, 1 to 5.
+        seed: Seed of the random numbers.
+    """
     if kind == CLEAN:
-        return {**settings}
+        return dict(settings)
     steps = list(settings["pipeline"])
-    (load,) = (i for i, step in enumerate(steps) if step["type"] == "LoadCameraImages")
-    step = {"severity": severity, "seed": seed}
+    types = [step["type"] for step in steps]
+    load = types.index("LoadCameraImages")
     if kind == _DELAYED:
-        files = {key: settings[key] for key in ("ann_file", "data_root")}
-        steps.insert(load, {"type": "DelayCameras", **files, **step})
+        step = {
+            "type": "DelayCameras",
+            "ann_file": settings["ann_file"],
+            "data_root": settings["data_root"],
+            "severity": severity,
+            "seed": seed,
+        }
+        steps.insert(load, step)
     else:
-        steps.insert(load + 1, {"type": "CorruptImages", "kind": kind, **step})
+        step = {"type": "CorruptImages", "kind": kind, "severity": severity, "seed": seed}
+        steps.insert(load + 1, step)
     return {**settings, "pipeline": steps}
 
 
 def average_precisions(model: Any, settings: Any, samples: int | None) -> dict[str, float]:
-    """Return AP_chamfer of each class and their mean, in percent."""
+    """AP_chamfer of each class, and ``mean``, in percent.
+
+    Args:
+        model: The model.
+        settings: Settings of the data set.
+        samples: Number of samples, evenly spread; None for all.
+    """
     from mmdet3d.registry import DATASETS, METRICS
     from mmengine.dataset import pseudo_collate
 
@@ -83,79 +105,89 @@ def average_precisions(model: Any, settings: Any, samples: int | None) -> dict[s
     metric.dataset_meta = dataset.metainfo
     count = min(samples or len(dataset), len(dataset))
     for index in np.linspace(0, len(dataset) - 1, count).round().astype(int).tolist():
-        found = model.test_step(pseudo_collate([dataset[index]]))
-        metric.process(None, [sample.to_dict() for sample in found])
+        predictions = model.test_step(pseudo_collate([dataset[index]]))
+        metric.process(None, [sample.to_dict() for sample in predictions])
     figures = metric.evaluate(count)
-    keys = {name: f"chamfer/{name}/AP" for name in dataset.metainfo["classes"]}
-    return {n: 100 * figures[key] for n, key in {**keys, "mean": "chamfer/mAP"}.items()}
+    aps = {}
+    for name in dataset.metainfo["classes"]:
+        aps[name] = 100 * figures[f"chamfer/{name}/AP"]
+    aps["mean"] = 100 * figures["chamfer/mAP"]
+    return aps
 
 
-def table(found: dict[str, list[dict[str, float]]]) -> str:
-    """Return the table of all corruptions: the mean AP at each severity, and the resilience."""
-    rows = [
-        f"AP_chamfer without corruption: {found[CLEAN][0]['mean']:.1f}\n",
-        f"| corruption | {' | '.join(map(str, SEVERITIES))} | resilience |",
-        "| --- " * (len(SEVERITIES) + 2) + "|",
-    ]
-    for kind, figures in found.items():
+def mean_aps(figures: dict[str, list[dict[str, float]]], kind: str) -> list[float]:
+    """Mean AP at each severity of a corruption, in percent."""
+    return [at_severity["mean"] for at_severity in figures[kind]]
+
+
+def resilience(figures: dict[str, list[dict[str, float]]], kind: str) -> float:
+    """Mean AP over the severities as a share of the AP without corruption, in percent."""
+    (clean,) = mean_aps(figures, CLEAN)
+    return 100 * float(np.mean(mean_aps(figures, kind))) / max(clean, 1e-9)
+
+
+def table(figures: dict[str, list[dict[str, float]]]) -> str:
+    """Markdown table of all corruptions: mean AP at each severity, and resilience."""
+    (clean,) = mean_aps(figures, CLEAN)
+    heads = ["corruption", *(str(severity) for severity in SEVERITIES), "resilience"]
+    rows = []
+    for kind in figures:
         if kind != CLEAN:
-            aps = [of["mean"] for of in figures]
-            cells = [f"{value:.1f}" for value in aps] + [f"{resilience(found, kind):.0f} %"]
-            rows.append(f"| {kind} | {' | '.join(cells)} |")
-    return "\n".join(rows) + "\n"
-
-
-def resilience(found: dict[str, list[dict[str, float]]], kind: str) -> float:
-    """Return the mean AP over the severities as a share of that without corruption, in percent."""
-    clean = found[CLEAN][0]["mean"]
-    return 100 * float(np.mean([of["mean"] for of in found[kind]])) / max(clean, 1e-9)
+            cells = [f"{ap:.1f}" for ap in mean_aps(figures, kind)]
+            rows.append([kind, *cells, f"{resilience(figures, kind):.0f} %"])
+    return f"AP_chamfer without corruption: {clean:.1f}\n\n{markdown_table(heads, rows)}\n"
 
 
 def earlier_figures(path: Path) -> dict[str, list[dict[str, float]]]:
-    """Return the figures of an earlier run into the folder; none without one.
+    """Figures of an earlier run in the output folder; empty without one.
 
     Raises:
-        ValueError: If the file holds anything else.
+        ValueError: If the file has other contents.
     """
     if not path.exists():
         return {}
     figures = read_json(path)
-    good = isinstance(figures, dict) and all(
-        isinstance(rows, list)
-        and len(rows) == (1 if kind == CLEAN else len(SEVERITIES))
-        and all(isinstance(row, dict) and isinstance(row.get("mean"), float) for row in rows)
-        for kind, rows in figures.items()
-    )
-    if not good or CLEAN not in figures or not {*figures} <= {CLEAN, *KINDS}:
-        raise InputError(f"{path} holds no figures of this command: give another --out.")
+    refusal = InputError(f"{path} holds no figures of this command: give another --out.")
+    if not isinstance(figures, dict) or CLEAN not in figures:
+        raise refusal
+    for kind, rows in figures.items():
+        number = 1 if kind == CLEAN else len(SEVERITIES)
+        if kind not in (CLEAN, *KINDS) or not isinstance(rows, list) or len(rows) != number:
+            raise refusal
+        for row in rows:
+            if not isinstance(row, dict) or not isinstance(row.get("mean"), float):
+                raise refusal
     return figures
 
 
-def kept_figures(
-    before: dict[str, list[dict[str, float]]],
+def other_figures(
+    earlier: dict[str, list[dict[str, float]]],
     clean: list[dict[str, float]],
     args: argparse.Namespace,
 ) -> dict[str, list[dict[str, float]]]:
-    """Return the earlier run's figures of corruptions that this run does not measure.
+    """Earlier figures of the corruptions that this run does not measure.
 
-    Without corruption both must score the same: figures of another model or other samples belong
-    into another folder.
+    Args:
+        earlier: All figures of the earlier run.
+        clean: Figures of this run without corruption. Equal figures show that both runs are of one
+            model and of equal samples.
+        args: The options of the command.
 
     Raises:
-        ValueError: If they do not, and figures would be lost.
+        ValueError: If the figures without corruption differ, so that earlier ones would be lost.
     """
-    others = {kind: rows for kind, rows in before.items() if kind not in {CLEAN, *args.kinds}}
-    if others and before[CLEAN] != clean:
+    others = {kind: rows for kind, rows in earlier.items() if kind not in {CLEAN, *args.kinds}}
+    if others and earlier[CLEAN] != clean:
         raise InputError(
             f"{args.out} has figures of {', '.join(others)} of another model or other samples "
-            f"(AP {before[CLEAN][0]['mean']:.1f} without corruption, here {clean[0]['mean']:.1f}): "
-            "give another --out, or name these --kinds too."
+            f"(AP {earlier[CLEAN][0]['mean']:.1f} without corruption, here "
+            f"{clean[0]['mean']:.1f}): give another --out, or name these --kinds too."
         )
     return others
 
 
 def require_own_split(checkpoint: Path, settings: Any) -> None:
-    """Refuse a data set of another split than that of the model's training."""
+    """Refuse a data set whose split is not the one of the training."""
     from gsmap.checkpoints.reading import read_checked
 
     meta = AnnotationFile(Path(settings["data_root"], settings["ann_file"])).meta
@@ -180,27 +212,30 @@ def main() -> str:
     if model.temporal is not None and args.samples:
         raise InputError("--samples tears drives apart, which a model with memory needs whole.")
     MMLogger.get_instance("robustness", log_level="ERROR")  # one table for each run is too much
-    cases = [(CLEAN, 1), *((kind, severity) for kind in args.kinds for severity in SEVERITIES)]
-    found: dict[str, list[dict[str, float]]] = {}
+    cases = [(CLEAN, 1), *product(args.kinds, SEVERITIES)]
+    measured: dict[str, list[dict[str, float]]] = {}
     with (
         lock_folder(args.out, ".robustness", "wait for its end, or give another --out"),
         Progress(total=len(cases), unit="corruptions") as bar,
         torch.no_grad(),
     ):
-        before = earlier_figures(args.out / "robustness.json")
+        earlier = earlier_figures(args.out / "robustness.json")
         for kind, severity in cases:
-            settings = corrupted(model.cfg.test_dataloader.dataset, kind, severity, args.seed)
-            figures = average_precisions(model, settings, args.samples)
-            found.setdefault(kind, []).append(figures)
+            settings = add_corruption(
+                model.cfg.test_dataloader.dataset, kind, severity=severity, seed=args.seed
+            )
+            aps = average_precisions(model, settings, args.samples)
+            measured.setdefault(kind, []).append(aps)
             bar.update(1)
             if kind == CLEAN:
-                kept = kept_figures(before, found[CLEAN], args)
-        found = {kind: rows for kind in (CLEAN, *KINDS) if (rows := {**kept, **found}.get(kind))}
-        text = table(found)
-        write_text(args.out / "robustness.json", json.dumps(found, indent=1) + "\n")
+                others = other_figures(earlier, measured[CLEAN], args)
+        measured.update(others)
+        figures = {kind: measured[kind] for kind in (CLEAN, *KINDS) if kind in measured}
+        text = table(figures)
+        write_text(args.out / "robustness.json", json.dumps(figures, indent=1) + "\n")
         write_text(args.out / "robustness.md", text)
-        means = {kind: [of["mean"] for of in figures] for kind, figures in found.items()}
-        clean = means.pop(CLEAN)[0]
+        means = {kind: mean_aps(figures, kind) for kind in figures}
+        (clean,) = means.pop(CLEAN)
         save_figure(plot_severities(means, clean, SEVERITIES), args.out / "robustness.png")
     return f"{text}\nfiles: {args.out}"
 

@@ -60,7 +60,7 @@ def parse_args() -> argparse.Namespace:
 
 
 def apply_options(cfg: Config, args: argparse.Namespace) -> None:
-    """Put the tool's own options into the config."""
+    """Apply the options of this command to the config."""
     cfg.resume = False
     cfg.test_evaluator = {
         "type": "MapMetric",

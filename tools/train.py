@@ -51,7 +51,7 @@ def parse_args() -> argparse.Namespace:
 
 
 def choose_start(cfg: Config, resume: str | None) -> None:
-    """Say what the run goes on from or starts from, and check that file."""
+    """Set the checkpoint that the run resumes or starts from, and check that file."""
     from gsmap.checkpoints.reading import read_weights
     from gsmap.engine.launch import newest_checkpoint
 
@@ -72,8 +72,8 @@ def choose_start(cfg: Config, resume: str | None) -> None:
             )
 
 
-def writes_alone(work_dir: str) -> AbstractContextManager:
-    """Keep a work folder for this run alone; the first rank does it for all."""
+def lock_work_dir(work_dir: str) -> AbstractContextManager:
+    """Lock the work folder for this run. The first rank locks it for all ranks."""
     if not is_first_rank():
         return nullcontext()
     advice = "wait for its end, or give another --work-dir"
@@ -104,7 +104,7 @@ def main() -> None:
         if "base_batch_size" not in cfg.get("auto_scale_lr", {}):
             raise InputError(f"{args.config} names no auto_scale_lr.base_batch_size to scale from.")
         cfg.auto_scale_lr.enable = True
-    with writes_alone(cfg.work_dir):
+    with lock_work_dir(cfg.work_dir):
         choose_start(cfg, args.resume)
         runner = RUNNERS.get(cfg.runner_type) if "runner_type" in cfg else MapRunner
         with building(cfg):

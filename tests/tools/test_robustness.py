@@ -68,10 +68,10 @@ def test_figures_of_earlier_runs_into_a_folder_are_kept(tool, tmp_path):
     path.write_text(json.dumps({"none": clean, "fog": rows, "jpeg": rows}))
     before = tool.earlier_figures(path)
     args = Namespace(out=tmp_path, kinds=["jpeg", "rain"])
-    assert tool.kept_figures(before, clean, args) == {"fog": rows}
+    assert tool.other_figures(before, clean, args) == {"fog": rows}
     with pytest.raises(ValueError, match=r"has figures of fog of another model .* give another"):
-        tool.kept_figures(before, other, args)
-    assert tool.kept_figures(before, other, Namespace(out=tmp_path, kinds=["fog", "jpeg"])) == {}
+        tool.other_figures(before, other, args)
+    assert tool.other_figures(before, other, Namespace(out=tmp_path, kinds=["fog", "jpeg"])) == {}
     for wrong in ("[]", "{}", '{"none": [{"mean": 1.0}], "mist": []}', '{"none": [{"mean": "a"}]}'):
         path.write_text(wrong)
         with pytest.raises(ValueError, match=r"robustness.json holds no figures of this command"):

@@ -9,7 +9,7 @@ from comparison.run_curves import (
     plot_runs,
     plot_series,
     read_run,
-    smoothed,
+    smooth,
     summary_table,
 )
 
@@ -95,14 +95,14 @@ def test_values_that_are_not_finite_are_left_out(tmp_path):
 
 
 def test_smoothed_is_a_centred_mean_that_starts_and_ends_as_the_values():
-    np.testing.assert_allclose(smoothed(np.array([2.0, 4, 6, 8])), [2, 4, 6, 8])  # too few
+    np.testing.assert_allclose(smooth(np.array([2.0, 4, 6, 8])), [2, 4, 6, 8])  # too few
     values = np.zeros(40)
     values[[0, 20, 39]] = 5, 15, 3
-    found = smoothed(values)  # over five
+    found = smooth(values)  # over five
     assert found[0] == 5
     assert found[-1] == 3
     np.testing.assert_allclose(found[[1, 17, 18, 20, 22, 23]], [5 / 3, 0, 3, 3, 3, 0])
-    np.testing.assert_allclose(smoothed(np.arange(100.0)), np.arange(100.0))  # it does not lag
+    np.testing.assert_allclose(smooth(np.arange(100.0)), np.arange(100.0))  # it does not lag
 
 
 def test_legends_stand_beside_the_curves_and_no_place_is_empty(run):

@@ -79,7 +79,15 @@ class Traps:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         modules = {*sys.stdlib_module_names, *packages_distributions(), "sitecustomize"}
-        modules |= {"usercustomize", "gsmap", "mapdata", "drivemaps", "minicity", "comparison", "scoring"}
+        modules |= {
+            "usercustomize",
+            "gsmap",
+            "mapdata",
+            "drivemaps",
+            "minicity",
+            "comparison",
+            "scoring",
+        }
         for name in (name for name in modules if name.isidentifier()):
             (folder / f"{name}.py").write_text(TRAP)
         for name, text in SETTINGS.items():

@@ -1,1 +1,1 @@
-"""Comparisons of configs (tools/compare.py): what to run, running it, the table of it."""
+"""Comparisons of configs (tools/compare.py): plan, processes, tables and curves."""

@@ -1,4 +1,4 @@
-"""Runs of a comparison under way: their processes, how they end, and the progress of all."""
+"""Processes of a comparison: training, test, exit states and common progress."""
 
 import json
 import os
@@ -21,34 +21,39 @@ from gsmap.utils.files import lock_folder, open_to_append, require_no_link, writ
 from gsmap.utils.parallel import die_with_parent
 from gsmap.utils.progress import Progress
 
-_PAUSE_S = 2.0  # between two looks at the runs
-_SAID = 200  # characters of a failed run's error
+_PAUSE_S = 2.0  # between two polls of the runs
+_MESSAGE_LENGTH = 200  # characters of a failed run's error
 
 
 def devices() -> list[str | None]:
-    """Return the GPUs, on which runs go side by side; without one the CPU, for one at a time."""
+    """GPUs, each for one run at a time; without a GPU, None for the CPU."""
     count = torch.cuda.device_count()
+    if not count:
+        return [None]
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")
-    return list(visible.split(",") if visible else map(str, range(count))) if count else [None]
+    if visible:
+        return list(visible.split(","))
+    return [str(index) for index in range(count)]
 
 
 def machine() -> str:
-    """Name the processor or GPU, and how many there are."""
+    """Name and number of the GPUs, or of the processor cores."""
     if torch.cuda.is_available():
         return f"{torch.cuda.device_count()} x {torch.cuda.get_device_name()}"
-    found = re.search(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text())
-    return f"{len(os.sched_getaffinity(0))} cores, {found[1] if found else 'unknown processor'}"
+    model = re.search(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text())
+    name = model[1] if model else "unknown processor"
+    return f"{len(os.sched_getaffinity(0))} cores, {name}"
 
 
 class Job:
-    """A run under way on one device: a process, which dies with this one.
+    """Training and test of one run on one device, in a process that ends with this one.
 
     Args:
-        run: The run; its folder is locked while the job lives.
+        run: The run. Its folder is locked until the end of the job.
         device: GPU for the run; None for the CPU.
 
     Raises:
-        RuntimeError: If another process works in its folder.
+        RuntimeError: If another process uses the folder.
     """
 
     def __init__(self, run: Run, device: str | None) -> None:
@@ -61,7 +66,7 @@ class Job:
         for stage, command in run.commands().items():
             self.record[stage] = shlex.join(command)
         self._peak_mib = 0
-        self.stage = "test" if run.trained else "train"
+        self.stage = "test" if run.is_trained else "train"
         self._start()
 
     @property
@@ -77,7 +82,7 @@ class Job:
         else:
             environment["CUDA_VISIBLE_DEVICES"] = self.device
         with open_to_append(self._log) as log:
-            self._begin = log.seek(0, os.SEEK_END)  # an attempt that was killed may stand before
+            self._begin = log.seek(0, os.SEEK_END)  # after the output of an attempt that was killed
             self._process = subprocess.Popen(
                 self.run.commands()[self.stage],
                 env=environment,
@@ -86,13 +91,14 @@ class Job:
                 preexec_fn=partial(die_with_parent, os.getpid()),
             )
 
-    def ended(self) -> bool:
-        """Look at the process, go on to the test after training, and note how the run ends."""
+    def poll(self) -> bool:
+        """Poll the process: start the test after the training, record the end of the test."""
         if not self._has_ended():
             return False
         code = self._process.returncode
         if code != 0:
-            self.end(f"{self.stage} ended with exit code {code} ({self._log.name}: {self._said()})")
+            cause = f"{self._log.name}: {self._error_message()}"
+            self.end(f"{self.stage} ended with exit code {code} ({cause})")
             return True
         if self.stage == "train":
             self.stage = "test"
@@ -102,7 +108,7 @@ class Job:
         return True
 
     def _has_ended(self) -> bool:
-        """Whether the process has ended; the most memory of it, a rank or a worker is noted."""
+        """Whether the process has ended; updates the peak memory of its largest process."""
         pid, status, usage = os.wait4(self._process.pid, os.WNOHANG)
         if pid == 0:
             return False
@@ -110,16 +116,17 @@ class Job:
         self._peak_mib = max(self._peak_mib, usage.ru_maxrss // 1024)
         return True
 
-    def _said(self) -> str:
-        """First error in the output of the stage, which is the cause of later ones; or its end."""
+    def _error_message(self) -> str:
+        """First error in the output of the stage, or else its last line."""
         text = self._log.read_bytes()[self._begin :].decode(errors="replace")
         lines = text.splitlines()
         errors = [line for line in lines if line.startswith("error: ")]
-        found = errors[:1] or lines[-1:]
-        return " ".join(found)[:_SAID]
+        if errors:
+            return errors[0][:_MESSAGE_LENGTH]
+        return lines[-1][:_MESSAGE_LENGTH] if lines else ""
 
     def end(self, state: str) -> None:
-        """Stop the process if it still runs, note the run's end and free its folder."""
+        """Stop a process that still runs, record the state of the run and unlock its folder."""
         if self._process.returncode is None:
             self._process.kill()
             self._process.wait()
@@ -130,13 +137,13 @@ class Job:
 
 
 def execute(runs: Sequence[Run]) -> Iterator[tuple[Run, str]]:
-    """Train and test the runs that are not done, one after another on each device.
+    """Train and test the unfinished runs, one after another on each device.
 
     Args:
         runs: From `plan`.
 
     Yields:
-        Each run with its state, as it ends: ``done``, or the fault.
+        Each run at its end, with its state: ``done``, or the fault.
     """
     waiting = deque(run for run in runs if not run.done)
     jobs: dict[str | None, Job] = {}
@@ -151,7 +158,7 @@ def execute(runs: Sequence[Run]) -> Iterator[tuple[Run, str]]:
                     if device not in jobs and waiting:
                         jobs[device] = Job(waiting.popleft(), device)
                 for job in list(jobs.values()):
-                    if job.ended():
+                    if job.poll():
                         del jobs[job.device]
                         yield job.run, job.record["state"]
                 stages = [f"{job.run.label} {job.stage}s" for job in jobs.values()]

@@ -1,7 +1,7 @@
 """Runs of several configs and seeds, planned and checked before anything trains.
 
-Each run is a work folder of ``tools/train.py`` with its test in it; nothing is known of a run that
-does not stand there, so a comparison that was killed goes on when its command is given again.
+Each run is a work folder of ``tools/train.py`` with its test in it. The folder holds the whole
+state of a run, so a comparison that was killed continues when its command is given again.
 """
 
 import math
@@ -11,7 +11,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import chain, combinations
+from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,13 +31,18 @@ from gsmap.utils.files import read_json
 from gsmap.utils.shards import digest
 from gsmap.utils.shipped import shipped
 
-SETTINGS = "settings.json"  # what a run was started with; another start must agree
+SETTINGS = "settings.json"  # settings at the start of a run; a later start must have equal ones
 RECORD = "run.json"  # machine, load, command and end of a run
 _SHOWN = 10
 _digest = cache(digest)  # of files that many runs share
 _DECIDING = (
-    *("model", "optim_wrapper", "param_scheduler", "train_cfg", "randomness"),
-    *("default_hooks", "custom_hooks"),
+    "model",
+    "optim_wrapper",
+    "param_scheduler",
+    "train_cfg",
+    "randomness",
+    "default_hooks",
+    "custom_hooks",
 )
 
 
@@ -45,7 +50,7 @@ class Entry(NamedTuple):
     """A config with overrides.
 
     Attributes:
-        name: Its name in tables and folders.
+        name: Name in tables and folders.
         config: Config file, or the name of a model.
         options: Overrides, ``KEY=VALUE``.
     """
@@ -56,14 +61,15 @@ class Entry(NamedTuple):
 
 
 def parse_entry(text: str) -> Entry:
-    """Read ``CONFIG`` or ``NAME=CONFIG[,KEY=VALUE...]``; commas within brackets are a value's.
+    """Read ``CONFIG`` or ``NAME=CONFIG[,KEY=VALUE...]``; commas in brackets belong to a value.
 
     Raises:
-        ValueError: If the name cannot be a folder's, or an override has no value.
+        ValueError: If the name is not valid for a folder, or an override has no value.
     """
     first, *options = re.split(r",(?![^\[(]*[\])])", text)
-    name, given, config = first.rpartition("=")
-    name = name if given else Path(config).stem
+    name, separator, config = first.rpartition("=")
+    if not separator:
+        name = Path(config).stem
     if not re.fullmatch(r"[\w.+-]+", name):
         raise InputError(f"{text!r}: a name holds letters, digits and . _ + - only, got {name!r}.")
     for option in options:
@@ -77,15 +83,15 @@ class Run:
     """One config with one seed.
 
     Attributes:
-        name: Name of its config in the comparison.
-        seed: Seed of every random choice.
-        folder: Its work folder.
+        name: Name of the config in the comparison.
+        seed: Seed of all random numbers.
+        folder: Work folder.
         config: Config file.
         options: All overrides.
-        epochs: Epochs to train.
-        iterations: Optimizer steps of these.
-        processes: Processes that train together.
-        settings: Whatever decides its outcome.
+        epochs: Number of epochs.
+        iterations: Number of optimizer steps.
+        processes: Number of processes that train together.
+        settings: All settings that affect the result.
     """
 
     name: str
@@ -100,20 +106,21 @@ class Run:
 
     @property
     def label(self) -> str:
-        """Its name and seed, as the folder has them."""
+        """Name and seed, as in the path of the folder."""
         return f"{self.name}/seed_{self.seed}"
 
     @property
     def checkpoint(self) -> Path:
-        """Checkpoint that training ends with."""
+        """Last checkpoint of the training."""
         return self.folder / f"epoch_{self.epochs}.pth"
 
     @property
-    def trained(self) -> bool:
+    def is_trained(self) -> bool:
         """Whether training has ended, with its last validation."""
         validated = self.folder / VALIDATED
-        ended = validated.is_file() and validated.read_text() == str(self.iterations)
-        return ended and self.checkpoint.is_file()
+        if not validated.is_file() or validated.read_text() != str(self.iterations):
+            return False
+        return self.checkpoint.is_file()
 
     @property
     def done(self) -> bool:
@@ -122,20 +129,22 @@ class Run:
 
     @property
     def position(self) -> int:
-        """Iterations that its log tells of."""
+        """Number of iterations in the log."""
         if self.done:
             return self.iterations
         logs = sorted(self.folder.glob("2*/vis_data/scalars.json"))
-        steps = re.findall(r'"step": (\d+)}', logs[-1].read_text()) if logs else []
+        if not logs:
+            return 0
+        steps = re.findall(r'"step": (\d+)}', logs[-1].read_text())
         return max(map(int, steps), default=0)
 
     def commands(self) -> dict[str, list[str]]:
-        """Return the commands that train and test it."""
+        """Commands that train and test the model, by stage."""
         train = [str(shipped("tools/train.py")), self.config]
         train += ["--work-dir", str(self.folder), "--resume"]
         python = [sys.executable, "-u"]
         launcher = python
-        if self.processes > 1:  # torchrun chooses a free port itself if it stands alone
+        if self.processes > 1:  # alone, torchrun chooses a free port
             launcher = [str(shipped("tools/dist_run.sh")), str(self.processes)]
             launcher += ["--standalone", "--local_addr=127.0.0.1"]
             train += ["--launcher", "pytorch"]
@@ -152,14 +161,14 @@ class Run:
 
 @dataclass(frozen=True)
 class Protocol:
-    """What all runs of a comparison share.
+    """Settings of all runs of a comparison.
 
     Attributes:
         seeds: Number of seeds, from 0 on.
         budget: Optimizer steps of each run.
         out: Folder of all work folders.
         batch: Samples of a step, over all processes.
-        init: Checkpoint or named model that all start from; None trains from scratch.
+        init: Checkpoint or named model at the start of all runs; None trains from scratch.
         options: Overrides of every config.
     """
 
@@ -174,17 +183,21 @@ class Protocol:
 def plan(entries: Sequence[Entry], protocol: Protocol) -> list[Run]:
     """Plan all runs and check them, before anything trains.
 
-    On a GPU a run has one process; on a CPU as many as the runs that are there, and the first of
-    all one a core, as far as these share a step's samples evenly. Batch statistics are those of a
-    process's samples.
+    On a GPU a run has one process. On a CPU it has as many as earlier runs of the comparison, or
+    else one per core; the number divides the batch. Batch normalization uses the samples of one
+    process.
+
+    Args:
+        entries: The configs with their overrides.
+        protocol: Settings of all runs.
 
     Returns:
         The runs, seed by seed.
 
     Raises:
         FileNotFoundError: If a config, a checkpoint or a data set does not exist.
-        ValueError: If names repeat, the budget is no whole number of epochs, the configs are of
-            different data or do not differ, or a work folder is of other settings.
+        ValueError: If names repeat, the budget is not a whole number of epochs, the configs use
+            different data or are equal, or a work folder has other settings.
     """
     names = [entry.name for entry in entries]
     if len(set(names)) < len(names):
@@ -192,16 +205,15 @@ def plan(entries: Sequence[Entry], protocol: Protocol) -> list[Run]:
     if protocol.init is not None:
         read_weights(protocol.init)
     processes = _processes(protocol)
-    runs = [
-        _plan_run(entry, seed, protocol, processes)
-        for seed in range(protocol.seeds)
-        for entry in entries
-    ]
+    runs = []
+    for seed in range(protocol.seeds):
+        for entry in entries:
+            runs.append(_plan_run(entry, seed, protocol, processes))
     for run in runs[1:]:
-        _refuse(
+        _refuse_differences(
             differences(runs[0].settings["data"], run.settings["data"]),
-            f"{runs[0].label} and {run.label} are of different data",
-            "compare configs of one data set, split, range and class list",
+            fault=f"{runs[0].label} and {run.label} are of different data",
+            remedy="Compare configs of one data set, split, range and class list.",
         )
     for one, other in combinations(runs[: len(entries)], 2):
         if not differences(one.settings, other.settings):
@@ -215,55 +227,63 @@ def plan(entries: Sequence[Entry], protocol: Protocol) -> list[Run]:
 
 
 def _processes(protocol: Protocol) -> int:
-    """Return each run's number of processes, of which each gets as many samples."""
+    """Number of processes of each run, which divides the batch."""
     if torch.cuda.device_count():
         return 1
-    paths = protocol.out.glob(f"*/seed_*/{SETTINGS}")
-    there = (_noted(path)["processes"] for path in paths)
-    possible = chain(there, range(len(os.sched_getaffinity(0)), 0, -1))
-    return next(n for n in possible if n > 0 and protocol.batch % n == 0)
+    numbers = []
+    for path in protocol.out.glob(f"*/seed_*/{SETTINGS}"):  # earlier runs
+        numbers.append(_read_settings(path)["processes"])
+    cores = len(os.sched_getaffinity(0))
+    numbers.extend(range(cores, 0, -1))
+    return next(number for number in numbers if number > 0 and protocol.batch % number == 0)
 
 
 def _plan_run(entry: Entry, seed: int, protocol: Protocol, processes: int) -> Run:
-    """Plan one run, and build its data set and model once to see that they can be."""
+    """Plan one run; build its data set and its model once, so that faults are found early."""
     words = [f"train_dataloader.batch_size={protocol.batch // processes}"]
     words += ["val_evaluator.eval=chamfer,raster", f"randomness.seed={seed}"]
     init = None if protocol.init is None else find_checkpoint(protocol.init).resolve()
-    words += [] if init is None else [f"load_from={init}"]
-    own = (*entry.options, *protocol.options)
-    cfg = read_config(entry.config, parse_options([*words, *own]))
+    if init is not None:
+        words.append(f"load_from={init}")
+    overrides = (*entry.options, *protocol.options)
+    cfg = read_config(entry.config, parse_options([*words, *overrides]))
     with building(cfg):
-        share = math.ceil(len(DATASETS.build(cfg.train_dataloader.dataset)) / processes)
-    epoch = math.ceil(share / cfg.train_dataloader.batch_size)
-    epochs = round(protocol.budget / epoch) or 1
-    if epochs * epoch != protocol.budget:
+        samples = len(DATASETS.build(cfg.train_dataloader.dataset))
+    samples_per_process = math.ceil(samples / processes)
+    steps_per_epoch = math.ceil(samples_per_process / cfg.train_dataloader.batch_size)
+    epochs = round(protocol.budget / steps_per_epoch) or 1
+    if epochs * steps_per_epoch != protocol.budget:
         raise InputError(
             f"a budget of {protocol.budget} iterations is no whole number of epochs of {entry.name}"
-            f" ({epoch} iterations each): give {epochs * epoch}."
+            f" ({steps_per_epoch} iterations each): give {epochs * steps_per_epoch}."
         )
     words += [f"train_cfg.max_epochs={epochs}", f"train_cfg.val_interval={max(1, epochs // 4)}"]
     for index, scheduler in enumerate(cfg.get("param_scheduler") or []):
         if "T_max" in scheduler and scheduler.get("by_epoch", True):
             words.append(f"param_scheduler.{index}.T_max={epochs}")
-    cfg = read_config(entry.config, parse_options([*words, *own]))
+    cfg = read_config(entry.config, parse_options([*words, *overrides]))
     check_config(cfg)
     if cfg.train_cfg.max_epochs != epochs:
         raise InputError(f"{entry.name}: the budget decides train_cfg.max_epochs; leave it out.")
     with building(cfg):
         MODELS.build(cfg.model)
+    dataset = plain(cfg.train_dataloader.dataset)
+    for place in ("data_root", "ann_file"):  # the data may move; its digest is part of "data"
+        dataset.pop(place, None)
     settings = {key: plain(cfg.get(key)) for key in _DECIDING}
-    settings |= {"processes": processes, "batch": protocol.batch, "data": _data_of(cfg)}
+    settings["processes"] = processes
+    settings["batch"] = protocol.batch
+    settings["data"] = _data_settings(cfg)
     settings["sampler"] = plain(cfg.train_dataloader.get("sampler"))
-    dataset = plain(cfg.train_dataloader.dataset)  # wherever it lies: "data" has its file's digest
-    settings["dataset"] = {k: v for k, v in dataset.items() if k not in ("data_root", "ann_file")}
-    settings["init"] = init and _digest(init)
+    settings["dataset"] = dataset
+    settings["init"] = None if init is None else _digest(init)
     folder = protocol.out.resolve() / entry.name / f"seed_{seed}"
     return Run(
         name=entry.name,
         seed=seed,
         folder=folder,
         config=entry.config,
-        options=(*words, *own),
+        options=(*words, *overrides),
         epochs=epochs,
         iterations=protocol.budget,
         processes=processes,
@@ -271,40 +291,42 @@ def _plan_run(entry: Entry, seed: int, protocol: Protocol, processes: int) -> Ru
     )
 
 
-def _data_of(cfg: Config) -> dict[str, Any]:
-    """Return what says which data a config trains and tests on."""
-    found: dict[str, Any] = {}
+def _data_settings(cfg: Config) -> dict[str, Any]:
+    """Settings that identify the data of training and test."""
+    settings: dict[str, Any] = {}
     for part in ("train", "test"):
         dataset = cfg[f"{part}_dataloader"].dataset
         path = Path(dataset.get("data_root", ""), dataset.ann_file)
         keys = ("split", "classes", "grid", "frame", "cameras", "indices")
-        found[part] = {key: plain(dataset.get(key)) for key in keys} | {"file": _digest(path)}
-    return found
+        settings[part] = {key: plain(dataset.get(key)) for key in keys}
+        settings[part]["file"] = _digest(path)
+    return settings
 
 
-def _refuse(found: Mapping[str, tuple[Any, Any]], what: str, remedy: str) -> None:
-    """Raise an error that names settings that differ, if any do."""
-    if found:
-        shown = "; ".join(f"{key}: {a} and {b}" for key, (a, b) in list(found.items())[:_SHOWN])
-        raise InputError(f"{what}: {shown}. {remedy[0].upper()}{remedy[1:]}.")
+def _refuse_differences(unequal: Mapping[str, tuple[Any, Any]], *, fault: str, remedy: str) -> None:
+    """Raise an InputError that names unequal settings, if there are any."""
+    if not unequal:
+        return
+    pairs = [f"{key}: {one} and {other}" for key, (one, other) in unequal.items()]
+    raise InputError(f"{fault}: {'; '.join(pairs[:_SHOWN])}. {remedy}")
 
 
-def _noted(path: Path) -> dict[str, Any]:
-    """Return what a run was started with."""
-    found = read_json(path)
-    if not isinstance(found, dict) or not isinstance(found.get("processes"), int):
+def _read_settings(path: Path) -> dict[str, Any]:
+    """Read the settings of an earlier start."""
+    settings = read_json(path)
+    if not isinstance(settings, dict) or not isinstance(settings.get("processes"), int):
         raise InputError(f"{path} is not what a run noted: give another --out, or remove the run.")
-    return found
+    return settings
 
 
 def _check_folder(run: Run) -> None:
-    """Refuse a work folder that another run made."""
+    """Refuse a work folder of another run."""
     path = run.folder / SETTINGS
     if path.is_file():
-        _refuse(
-            differences(_noted(path), plain(run.settings)),
-            f"{run.folder} holds a run of other settings",
-            "give another --out, or remove it",
+        _refuse_differences(
+            differences(_read_settings(path), plain(run.settings)),
+            fault=f"{run.folder} holds a run of other settings",
+            remedy="Give another --out, or remove it.",
         )
     elif run.folder.is_dir() and any(run.folder.iterdir()):
         raise InputError(

@@ -1,4 +1,4 @@
-"""What a comparison found: figures with their standard deviation, differences, cost, curves."""
+"""Results of a comparison: figures with standard deviations, differences, costs, curves."""
 
 import json
 import re
@@ -43,18 +43,18 @@ _BATCH_STATISTICS = ("running_mean", "running_var", "num_batches_tracked")
 
 @dataclass
 class Result:
-    """What one run's folder tells.
+    """Contents of the work folder of one run.
 
     Attributes:
-        name: Name of its config in the comparison.
-        seed: Its seed; None if its folder does not say.
-        folder: Its work folder.
-        state: ``done``, or what is wrong.
-        figures: All figures of its test, by flat key; empty if it is not done.
-        costs: Iterations, million parameters, seconds a step and a tested sample, peak memory in
-            MiB, as far as the folder tells.
-        record: Machine, load and commands, where the comparison ran it.
-        log: Its training log; None if there is none.
+        name: Name of the config in the comparison.
+        seed: The seed; None if it is unknown.
+        folder: The work folder.
+        state: ``done``, or the fault.
+        figures: All figures of the test, by flat key; empty if the run is not done.
+        costs: Iterations, million parameters, seconds per step and per tested sample, peak memory
+            in MiB, as far as they are known.
+        record: Machine, load and commands, if the comparison has run it.
+        log: The training log; None if there is none.
     """
 
     name: str
@@ -71,29 +71,31 @@ def read_result(name: str, folder: Path, seed: int | None = None) -> Result:
     """Read the work folder of a run that ``tools/train.py`` and ``tools/test.py`` made.
 
     Args:
-        name: Name of its config in the comparison.
-        folder: The folder; its metrics are ``metrics.json`` (``tools/test.py --metrics-out``).
-        seed: Its seed; the folder's config says it if it is not given.
+        name: Name of the config in the comparison.
+        folder: The folder, with ``metrics.json`` (``tools/test.py --metrics-out``).
+        seed: The seed; None reads it from the config in the folder.
     """
     record = _json(folder / RECORD)
     figures = _json(folder / "metrics.json")
     log = read_run(folder, name) if any(folder.glob("2*/vis_data/scalars.json")) else None
-    steps = [r["step"] for r in log.train] if log else []
-    state = "done" if figures else record.get("state", "cut off" if steps else "not started")
-    if not figures and steps:
-        state += f", after {max(steps):.0f} iterations"
+    steps = [record["step"] for record in log.train] if log else []
+    if figures:
+        state = "done"
+    else:
+        state = record.get("state", "cut off" if steps else "not started")
+        if steps:
+            state += f", after {max(steps):.0f} iterations"
     costs = {}
     if log and steps:
         costs["iterations"] = max(steps)
-        costs["seconds a step"] = float(np.median(log.series("time")[1]))
-        memory = log.series("memory")[1]  # only logged on a GPU
+        _, seconds = log.series("time")
+        costs["seconds a step"] = float(np.median(seconds))
+        _, memory = log.series("memory")  # only logged on a GPU
         if len(memory) or "peak_mib" in record:
             costs["peak MiB"] = float(memory.max()) if len(memory) else record["peak_mib"]
     newest = newest_checkpoint(folder) if figures else None
     if newest:
-        weights = read_weights(newest).items()
-        counted = sum(w.numel() for key, w in weights if not key.endswith(_BATCH_STATISTICS))
-        costs["million parameters"] = counted / 1e6
+        costs["million parameters"] = _count_parameters(newest) / 1e6
     tests = sorted(folder.glob("test/*/[0-9]*.json"))
     if tests:
         timing = json.loads(tests[-1].read_text().splitlines()[-1])
@@ -107,6 +109,12 @@ def read_result(name: str, folder: Path, seed: int | None = None) -> Result:
     return Result(name, seed, folder, state, figures, costs, record, log)
 
 
+def _count_parameters(checkpoint: Path) -> int:
+    """Number of weights, without the statistics of batch normalization."""
+    weights = read_weights(checkpoint).items()
+    return sum(weight.numel() for key, weight in weights if not key.endswith(_BATCH_STATISTICS))
+
+
 def _json(path: Path) -> dict[str, Any]:
     """Read a JSON object; empty if there is no such file."""
     content = read_json(path) if path.is_file() else {}
@@ -116,126 +124,176 @@ def _json(path: Path) -> dict[str, Any]:
 
 
 def _config(folder: Path) -> Fields:
-    """Return the config that a run noted in its folder, read as data: others may have written it.
+    """Read the config in the folder of a run as data: a stranger's config must not be run.
 
     Raises:
-        ValueError: If there is none, or it is more than assignments of plain values.
+        ValueError: If there is none, or it has more than assignments of plain values.
     """
-    noted = sorted(folder.glob("2*/vis_data/config.py"))
-    if not noted:
+    configs = sorted(folder.glob("2*/vis_data/config.py"))
+    if not configs:
         raise InputError(
             f"{folder} does not say what it is a run of: it holds no 2*/vis_data/config.py, which "
             "tools/train.py writes. Copy the whole work folder."
         )
-    return Fields(read_assignments(noted[-1]))
+    return Fields(read_assignments(configs[-1]))
 
 
 def check_one_test_set(results: Sequence[Result]) -> None:
-    """Raise a ValueError if the results' numbers of samples or of elements differ."""
-    counts = [
-        (r.folder, {k: v for k, v in r.figures.items() if k.endswith(("num_gts", "num_samples"))})
-        for r in results
-        if r.figures
-    ]
-    for folder, found in counts[1:]:
-        first, expected = counts[0]
-        if found != expected:
+    """Check that all runs were tested on equal numbers of samples and elements.
+
+    Raises:
+        ValueError: If the numbers differ.
+    """
+    first_folder = None
+    expected: dict[str, float] = {}
+    for result in results:
+        if not result.figures:
+            continue
+        counts = {}
+        for key, value in result.figures.items():
+            if key.endswith(("num_gts", "num_samples")):
+                counts[key] = value
+        if first_folder is None:
+            first_folder = result.folder
+            expected = counts
+        elif counts != expected:
             raise InputError(
-                f"{first} and {folder} were tested on different data: {expected} and {found}."
+                f"{first_folder} and {result.folder} were tested on different data: {expected} and "
+                f"{counts}."
             )
 
 
 def evaluator_for(annotations: Path, changes: Mapping[str, Any]) -> MapEvaluator:
-    """Return the rules of both metrics for an annotation file, which says classes and range.
+    """Build both metrics for an annotation file, with its classes and range.
 
-    ``changes`` are fields of ``ChamferConfig`` or ``RasterConfig``, or ``ground_truth_points``;
-    ValueError if there is no such field.
+    Args:
+        annotations: The annotation file.
+        changes: Fields of ``ChamferConfig`` or ``RasterConfig``, or ``ground_truth_points``.
+
+    Raises:
+        ValueError: If there is no such field.
     """
     meta = AnnotationFile(annotations).meta
-    own: dict[str, Any] = {"classes": meta.classes, "grid": BEVGrid(meta.x_range, meta.y_range)}
-    own |= {k: tuple(v) if isinstance(v, list) else v for k, v in changes.items()}
-    known = [{f.name for f in fields(c)} for c in (ChamferConfig, RasterConfig)]
-    known.append({"ground_truth_points"})
-    unknown = own.keys() - set().union(*known)
+    settings: dict[str, Any] = {"classes": meta.classes}
+    settings["grid"] = BEVGrid(meta.x_range, meta.y_range)
+    for key, value in changes.items():
+        settings[key] = tuple(value) if isinstance(value, list) else value
+    points = settings.pop("ground_truth_points", None)
+    configs = []
+    allowed = {"ground_truth_points"}
+    for config in (ChamferConfig, RasterConfig):
+        names = {field.name for field in fields(config)}
+        allowed |= names
+        configs.append(config(**{key: settings[key] for key in names & settings.keys()}))
+    unknown = settings.keys() - allowed
     if unknown:
-        allowed = sorted(set().union(*known))
-        raise InputError(f"no metric has the setting {sorted(unknown)}; there are {allowed}.")
-    chamfer, raster, both = ({k: v for k, v in own.items() if k in part} for part in known)
-    return MapEvaluator(ChamferConfig(**chamfer), RasterConfig(**raster), **both)
+        raise InputError(
+            f"no metric has the setting {sorted(unknown)}; there are {sorted(allowed)}."
+        )
+    return MapEvaluator(*configs, ground_truth_points=points)
 
 
 def rescore(result: Result, changes: Mapping[str, Any]) -> list[MetricReport]:
-    """Score a run's ``results.json`` again, under changed rules if any are given."""
+    """Score the ``results.json`` of a run again, with changed rules if there are any."""
     dataset = _config(result.folder).section("test_dataloader.dataset")
     if "ann_file" not in dataset:
         raise InputError(f"{result.folder}: its config does not name the data of its test.")
     annotations = Path(str(dataset.get("data_root", "")), str(dataset["ann_file"]))
     evaluator = evaluator_for(annotations, changes)
     predictions = result.folder / "results.json"
-    return evaluate_files(predictions, annotations, evaluator, default_workers())[0]
+    reports, _ = evaluate_files(predictions, annotations, evaluator, default_workers())
+    return reports
 
 
 def _columns(results: Sequence[Result]) -> list[str]:
-    """Return the keys of a table's figures: the APs of each class and their mean, both metrics."""
-    keys = next((list(r.figures) for r in results if r.figures), [])
+    """Keys of the figures in a table: the AP of each class and the mean, for both metrics."""
+    tested = _finished(results)
+    if not tested:
+        return []
     columns = []
     for metric in METRIC_NAMES:
-        counted = [k for k in keys if re.fullmatch(rf"{metric}/[^/]+/num_gts", k)]
-        columns += [key.replace("num_gts", "AP") for key in counted]
-        columns += [f"{metric}/mAP"] * bool(counted)
+        aps = []
+        for key in tested[0].figures:
+            if re.fullmatch(rf"{metric}/[^/]+/num_gts", key):
+                aps.append(key.replace("num_gts", "AP"))
+        if aps:
+            columns += [*aps, f"{metric}/mAP"]
     return columns
 
 
+def _finished(results: Sequence[Result]) -> list[Result]:
+    """Results with figures, which failed runs do not have."""
+    return [result for result in results if result.figures]
+
+
 def _cell(values: Sequence[float], factor: float = 1.0, form: str = ".1f") -> str:
-    """Write a mean and, of several values, their standard deviation."""
+    """Mean and, for several values, standard deviation, as the text of a table's cell."""
     if not values:
         return "-"
     scaled = [factor * value for value in values]
-    spread = f" ± {stdev(scaled):{form.lstrip('+')}}" if len(scaled) > 1 else ""
-    return f"{mean(scaled):{form}}{spread}"
+    text = f"{mean(scaled):{form}}"
+    if len(scaled) > 1:
+        text += f" ± {stdev(scaled):{form.lstrip('+')}}"
+    return text
 
 
 def differences_to_first(results: Sequence[Result]) -> dict[str, dict[str, list[float]]]:
-    """Return, by name and figure, each seed's difference to the first config with that seed."""
-    done = [r for r in results if r.figures]
+    """Differences of each config to the first one, seed by seed, by name and figure."""
+    done = _finished(results)
     if not done:
         return {}
-    first = {r.seed: r.figures for r in done if r.name == results[0].name}
-    found: dict[str, dict[str, list[float]]] = {}
-    for r in done:
-        if r.name != results[0].name and r.seed in first:
-            for key in _columns(results):
-                pairs = found.setdefault(r.name, {}).setdefault(key, [])
-                pairs.append(r.figures[key] - first[r.seed][key])
-    return found
+    first_name = results[0].name
+    first = {}
+    for result in done:
+        if result.name == first_name:
+            first[result.seed] = result.figures
+    differences: dict[str, dict[str, list[float]]] = {}
+    for result in done:
+        if result.name == first_name or result.seed not in first:
+            continue
+        by_figure = differences.setdefault(result.name, {})
+        for key in _columns(results):
+            difference = result.figures[key] - first[result.seed][key]
+            by_figure.setdefault(key, []).append(difference)
+    return differences
 
 
 def markdown(results: Sequence[Result], title: str, command: str) -> str:
-    """Write the tables of a comparison in Markdown: figures, paired differences, cost, runs.
+    """Tables of a comparison in Markdown: figures, paired differences, costs, runs.
 
-    Runs that failed are there, too. Differences are to the config of the first result.
+    Args:
+        results: Results of all runs, failed ones included. Differences are taken to the config of
+            the first one.
+        title: Title of the document.
+        command: Command line that made the comparison.
     """
-    names = list(dict.fromkeys(r.name for r in results))
+    by_name: dict[str, list[Result]] = {}
+    for result in results:
+        by_name.setdefault(result.name, []).append(result)
+    names = list(by_name)
     columns = _columns(results)
     heads = [key.replace("/AP", "") for key in columns]
-    figures, costs = [], []
-    for name in names:
-        done = [r for r in results if r.name == name and r.figures]
-        cells = [_cell([r.figures[key] for r in done], 100) for key in columns]
-        failed = sum(r.name == name and not r.figures for r in results)
-        figures.append([name, f"{len(done)}" + f" ({failed} not done)" * bool(failed), *cells])
-        spent = {key: [r.costs[key] for r in done if key in r.costs] for key in _COSTS}
-        costs.append([name, *(_cell(spent[key], form=form) for key, form in _COSTS.items())])
-    paired = differences_to_first(results)
-    changes = [
-        [name, str(len(of[columns[0]])), *(_cell(of[key], 100, "+.1f") for key in columns)]
-        for name, of in paired.items()
-    ]
-    runs = []
-    for r in results:
-        at = [f"{r.record[k]:.1f}" for k in ("load_at_start", "load_at_end") if k in r.record]
-        where = [str(r.folder), r.record.get("machine", "-"), " to ".join(at) or "-"]
-        runs.append([r.name, str(r.seed), r.state, *where])
+    figures = []
+    costs = []
+    for name, of_name in by_name.items():
+        done = _finished(of_name)
+        failed = len(of_name) - len(done)
+        seeds = f"{len(done)} ({failed} not done)" if failed else f"{len(done)}"
+        row = [name, seeds]
+        for key in columns:
+            row.append(_cell([result.figures[key] for result in done], factor=100))
+        figures.append(row)
+        row = [name]
+        for key, form in _COSTS.items():
+            row.append(_cell([run.costs[key] for run in done if key in run.costs], form=form))
+        costs.append(row)
+    changes = []
+    for name, differences in differences_to_first(results).items():
+        row = [name, str(len(differences[columns[0]]))]
+        for key in columns:
+            row.append(_cell(differences[key], factor=100, form="+.1f"))
+        changes.append(row)
+    runs = [_run_row(result) for result in results]
     parts = [
         f"# {title}\n\n`{command}`",
         "AP in percent, mean and standard deviation over seeds.",
@@ -252,31 +310,70 @@ def markdown(results: Sequence[Result], title: str, command: str) -> str:
     return "\n\n".join(parts) + "\n"
 
 
+def _run_row(result: Result) -> list[str]:
+    """Name, seed, state, folder, machine and load of a run."""
+    loads = []
+    for key in ("load_at_start", "load_at_end"):
+        if key in result.record:
+            loads.append(f"{result.record[key]:.1f}")
+    machine = result.record.get("machine", "-")
+    load = " to ".join(loads) or "-"
+    return [result.name, str(result.seed), result.state, str(result.folder), machine, load]
+
+
 def as_json(results: Sequence[Result], title: str, command: str) -> str:
-    """Write all figures of a comparison."""
-    keys = ("name", "seed", "state", "figures", "costs", "record")
-    runs = [{key: getattr(r, key) for key in keys} | {"folder": str(r.folder)} for r in results]
-    content = {"title": title, "command": command, "differences": differences_to_first(results)}
-    return json.dumps({**content, "runs": runs}, indent=1)
+    """All figures of a comparison as JSON.
+
+    Args:
+        results: Results of all runs.
+        title: Title of the comparison.
+        command: Command line that made the comparison.
+    """
+    runs = []
+    for result in results:
+        run = {
+            "name": result.name,
+            "seed": result.seed,
+            "state": result.state,
+            "figures": result.figures,
+            "costs": result.costs,
+            "record": result.record,
+            "folder": str(result.folder),
+        }
+        runs.append(run)
+    content = {
+        "title": title,
+        "command": command,
+        "differences": differences_to_first(results),
+        "runs": runs,
+    }
+    return json.dumps(content, indent=1)
 
 
 def plot_iterations(results: Sequence[Result]) -> Figure | None:
-    """Draw both metrics' mean over the iterations; None if no run was validated while training."""
-    runs = [r for r in results if r.log and r.log.val and r.log.train]
-    if not runs:
+    """Draw the mAP of both metrics over the iterations; None if no run has a validation."""
+    logs: dict[str, list[RunLog]] = {}
+    for result in results:
+        if result.log and result.log.val and result.log.train:
+            logs.setdefault(result.name, []).append(result.log)
+    if not logs:
         return None
-    drawn = [m for m in METRIC_NAMES if any(f"{m}/mAP" in r.log.metrics for r in runs if r.log)]
-    figure, axes = panel_grid(1, max(len(drawn), 1))
-    for panel, metric in zip(axes[0], drawn, strict=False):
-        for name, colour in zip(dict.fromkeys(r.name for r in runs), RUN_COLOURS * 9, strict=False):
-            for index, run in enumerate(r for r in runs if r.name == name):
-                assert run.log is not None
-                per_step = 1.0
-                if "epoch" in run.log.train[-1]:  # validation counts epochs
-                    per_step = run.log.train[-1]["step"] / run.log.train[-1]["epoch"]
-                steps, values = run.log.series(f"{metric}/mAP", validation=True)
-                label = None if index else name
-                panel.plot(per_step * steps, 100 * values, ".-", color=colour, label=label)
+    logged: set[str] = set()
+    for runs in logs.values():
+        for log in runs:
+            logged.update(log.metrics)
+    metrics = [metric for metric in METRIC_NAMES if f"{metric}/mAP" in logged]
+    figure, axes = panel_grid(1, max(len(metrics), 1))
+    for panel, metric in zip(axes[0], metrics, strict=False):
+        for (name, runs), colour in zip(logs.items(), RUN_COLOURS * 9, strict=False):
+            label: str | None = name
+            for log in runs:
+                steps, values = log.series(f"{metric}/mAP", validation=True)
+                last = log.train[-1]
+                if "epoch" in last:  # validation counts epochs
+                    steps = last["step"] / last["epoch"] * steps
+                panel.plot(steps, 100 * values, ".-", color=colour, label=label)
+                label = None  # one entry of the legend for all seeds
         panel.set_ylim(0)
         finish_panel(panel, f"mAP_{metric} (%)", "iteration")
     return figure
@@ -285,16 +382,20 @@ def plot_iterations(results: Sequence[Result]) -> Figure | None:
 def apply_rescoring(
     results: Sequence[Result], changes: Mapping[str, Any]
 ) -> dict[str, list[MetricReport]]:
-    """Score again what the curves need: one run of each config, or all runs if rules change.
+    """Score runs again: with changed rules all runs, else one of each config, for its curves.
 
-    With changed rules (`evaluator_for`) the results' figures become the new ones. Returns the
-    reports of each config's first run that is done, by its name.
+    Args:
+        results: Results of all runs. Their figures are replaced if rules change.
+        changes: Changed rules, see `evaluator_for`.
+
+    Returns:
+        Reports of the first finished run of each config, by name.
     """
     reports: dict[str, list[MetricReport]] = {}
     for result in results:
         if result.figures and (changes or result.name not in reports):
-            found = rescore(result, changes)
-            reports.setdefault(result.name, found)
+            rescored = rescore(result, changes)
+            reports.setdefault(result.name, rescored)
             if changes:
-                result.figures = flat_metrics(found)
+                result.figures = flat_metrics(rescored)
     return reports

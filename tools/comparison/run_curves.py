@@ -1,9 +1,9 @@
-"""Curves and a table of runs: the JSON logs of their trainings, and what their tests found."""
+"""Curves and a table of runs, from the JSON logs of trainings and the reports of tests."""
 
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,12 +24,12 @@ _TIMING = ("data_time", "time", "step", "epoch", "iter", "memory")
 
 @dataclass(frozen=True)
 class RunLog:
-    """What one run logged.
+    """Log of one training.
 
     Args:
         name: Name for legends and tables.
-        train: Records of training: ``step`` (iteration) and every scalar, such as ``loss``.
-        val: Records of validation: ``step`` (epoch or iteration) and every metric.
+        train: Records of training, with ``step`` (iteration) and scalars such as ``loss``.
+        val: Records of validation, with ``step`` (epoch or iteration) and metrics.
     """
 
     name: str
@@ -37,21 +37,37 @@ class RunLog:
     val: Sequence[Mapping[str, float]]
 
     def series(self, key: str, validation: bool = False) -> tuple[np.ndarray, np.ndarray]:
-        """Return steps and finite values of one scalar, both (n,)."""
+        """Steps and finite values of one scalar, both (n,)."""
         records = self.val if validation else self.train
-        pairs = [(r["step"], r[key]) for r in records if math.isfinite(r.get(key, math.nan))]
-        steps, values = np.array(pairs, dtype=float).reshape(-1, 2).T
-        return steps, values
+        steps = []
+        values = []
+        for record in records:
+            value = record.get(key, math.nan)
+            if math.isfinite(value):
+                steps.append(record["step"])
+                values.append(value)
+        return np.array(steps, dtype=float), np.array(values, dtype=float)
 
     @property
     def metrics(self) -> list[str]:
-        """Names of the validation metrics; of those with "mAP" in a name, these summaries alone."""
-        names = list(dict.fromkeys(k for record in self.val for k in record if k not in _TIMING))
+        """Names of the validation metrics: the mAPs, or all metrics if there is no mAP."""
+        names = []
+        for key in logged_keys(self.val):
+            if key not in _TIMING:
+                names.append(key)
         return [name for name in names if "map" in name.lower()] or names
 
 
+def logged_keys(records: Iterable[Mapping[str, float]]) -> list[str]:
+    """Keys of all records, in the order of their first use."""
+    keys: dict[str, None] = {}
+    for record in records:
+        keys.update(dict.fromkeys(record))
+    return list(keys)
+
+
 def _records(path: Path) -> list[dict[str, float]]:
-    """Read one JSON record per line; a last line that a killed run left unfinished is dropped."""
+    """Read one JSON record per line, without an unfinished last line of a killed run."""
     lines = read_text(path).splitlines()
     records = []
     for number, line in enumerate(lines, start=1):
@@ -59,7 +75,11 @@ def _records(path: Path) -> list[dict[str, float]]:
             record = json.loads(line)
             if not isinstance(record, dict):
                 raise InputError("it is no object")
-            records.append({k: float(v) for k, v in record.items() if isinstance(v, int | float)})
+            scalars = {}
+            for key, value in record.items():
+                if isinstance(value, int | float):
+                    scalars[key] = float(value)
+            records.append(scalars)
         except (ValueError, OverflowError) as error:
             if number == len(lines):
                 break
@@ -68,7 +88,7 @@ def _records(path: Path) -> list[dict[str, float]]:
 
 
 def read_run(path: str | Path, name: str | None = None) -> RunLog:
-    """Read the log of a run; of a step logged twice, as after a resume, the later record counts.
+    """Read the log of a run. A step that was logged twice, as after a resume, has its later record.
 
     Args:
         path: Work folder of the run, or a ``scalars.json``.
@@ -79,8 +99,11 @@ def read_run(path: str | Path, name: str | None = None) -> RunLog:
         ValueError: If a line is not JSON, or there is no record.
     """
     path = Path(path)
-    found = [*path.glob("*/vis_data/scalars.json"), *path.glob("vis_data/scalars.json")]
-    files = [path] if path.is_file() else sorted(found)
+    if path.is_file():
+        files = [path]
+    else:
+        logs = [*path.glob("*/vis_data/scalars.json"), *path.glob("vis_data/scalars.json")]
+        files = sorted(logs)
     if not files:
         raise FileNotFoundError(
             f"No vis_data/scalars.json under {path}: give a work folder of tools/train.py, whose "
@@ -90,36 +113,44 @@ def read_run(path: str | Path, name: str | None = None) -> RunLog:
     val: dict[float, dict[str, float]] = {}
     for file in files:  # oldest first: one per start
         for record in _records(file):
-            (train if "loss" in record else val)[record["step"]] = record
+            records = train if "loss" in record else val
+            records[record["step"]] = record
     if not (train or val):
         raise InputError(f"{files[0]} holds no record of training: give a run's scalars.json.")
-    ordered = [[part[step] for step in sorted(part)] for part in (train, val)]
-    return RunLog(name or path.resolve().name, *ordered)
+    return RunLog(
+        name=name or path.resolve().name,
+        train=list(dict(sorted(train.items())).values()),
+        val=list(dict(sorted(val.items())).values()),
+    )
 
 
-def smoothed(values: np.ndarray) -> np.ndarray:
-    """Return the centred mean over a tenth of the values; it starts and ends as they do. (n,)"""
-    total, at = np.cumsum(np.concatenate([[0.0], values])), np.arange(len(values))
-    half = np.minimum(np.minimum(at, at[::-1]), len(values) // 20)
-    return (total[at + half + 1] - total[at - half]) / (2 * half + 1)
+def smooth(values: np.ndarray) -> np.ndarray:
+    """Centred moving average over a tenth of the values; the window narrows at both ends. (n,)"""
+    total = np.cumsum(np.concatenate([[0.0], values]))
+    index = np.arange(len(values))
+    half = np.minimum(np.minimum(index, index[::-1]), len(values) // 20)
+    return (total[index + half + 1] - total[index - half]) / (2 * half + 1)
 
 
 def _draw_training(ax: Axes, runs: Sequence[RunLog], key: str, title: str) -> None:
-    """Draw a figure of training, faintly as it was logged and smoothed, one colour per run."""
+    """Draw a scalar of training, faintly with all its values and smoothed, one colour per run."""
     for run, colour in zip(runs, RUN_COLOURS * len(runs), strict=False):
         steps, values = run.series(key)
         ax.plot(steps, values, color=colour, alpha=0.25, linewidth=0.8)
-        ax.plot(steps, smoothed(values), color=colour, linewidth=1.6, label=run.name)
+        ax.plot(steps, smooth(values), color=colour, linewidth=1.6, label=run.name)
     _finish(ax, title)
 
 
 def _draw_parts_of_loss(ax: Axes, run: RunLog) -> None:
-    """Draw the terms of the last decoder layer; those of earlier ones begin with d0., d1."""
-    keys = dict.fromkeys(k for record in run.train for k in record if "loss" in k and k != "loss")
-    last = [key for key in keys if not re.match(r"d\d+\.", key)]
-    for name, colour in zip(last, RUN_COLOURS * 8, strict=False):
+    """Draw the loss terms of the last decoder layer, which have no prefix such as d0."""
+    last_layer = []
+    for key in logged_keys(run.train):
+        is_term = "loss" in key and key != "loss"
+        if is_term and not re.match(r"d\d+\.", key):
+            last_layer.append(key)
+    for name, colour in zip(last_layer, RUN_COLOURS * 8, strict=False):
         steps, values = run.series(name)
-        ax.plot(steps, smoothed(values), color=colour, linewidth=1.4, label=name)
+        ax.plot(steps, smooth(values), color=colour, linewidth=1.4, label=name)
     _finish(ax, f"its parts, last decoder layer ({run.name})")
 
 
@@ -129,19 +160,17 @@ def _draw_metrics(ax: Axes, runs: Sequence[RunLog]) -> None:
         styles = ("-", "--", ":", "-.") * len(run.metrics)
         for name, style in zip(run.metrics, styles, strict=False):
             label = f"{run.name}: {name}" if len(runs) > 1 else name
-            series = run.series(name, validation=True)
-            ax.plot(*series, style, color=colour, marker=".", label=label)
-    by_epoch = any("epoch" in record for run in runs for record in run.train)
+            steps, values = run.series(name, validation=True)
+            ax.plot(steps, values, style, color=colour, marker=".", label=label)
+    by_epoch = any("epoch" in logged_keys(run.train) for run in runs)
     _finish(ax, "validation", "epoch" if by_epoch else "iteration")
     ax.xaxis.set_major_locator(MaxNLocator("auto", integer=True))
 
 
 def _finish(ax: Axes, title: str, x_label: str = "iteration") -> None:
-    """Finish a panel; its y axis is logarithmic if the values span a decade.
-
-    The legend stands beside the panel, off the curves.
-    """
-    values = np.concatenate([np.empty(0), *(np.asarray(line.get_ydata()) for line in ax.lines)])
+    """Finish a panel: a logarithmic y axis if the values span a decade, the legend beside it."""
+    curves = [np.asarray(line.get_ydata()) for line in ax.lines]
+    values = np.concatenate([np.empty(0), *curves])
     if len(values) and values.min() > 0 and values.max() > 10 * values.min():
         ax.set_yscale("log")
         ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
@@ -153,19 +182,19 @@ def _finish(ax: Axes, title: str, x_label: str = "iteration") -> None:
 
 
 def _fill_row(axes: np.ndarray, panels: int) -> None:
-    """Remove the panels that are not used; the last one that is takes the rest of its row."""
+    """Remove unused panels and widen the last used one to the end of its row."""
     for panel in axes.ravel()[panels:]:
         panel.remove()
-    last, columns = axes.ravel()[panels - 1], axes.shape[1]
-    row, column = divmod(panels - 1, columns)
+    last = axes.ravel()[panels - 1]
+    row, column = divmod(panels - 1, axes.shape[1])
     last.set_subplotspec(last.get_gridspec()[row, column:])
 
 
 def plot_runs(runs: Sequence[RunLog]) -> Figure:
-    """Draw total loss, the loss's parts (of the last run), and the validation metrics of runs.
+    """Draw the total loss of runs, the loss terms of the last run, and the validation metrics.
 
     Raises:
-        ValueError: If there is no run, or none that logged a loss.
+        ValueError: If no run has logged a loss.
     """
     if not any(run.train for run in runs):
         raise InputError("plot_runs needs at least one run that logged a loss.")
@@ -180,12 +209,14 @@ def plot_runs(runs: Sequence[RunLog]) -> Figure:
 
 
 def plot_series(runs: Sequence[RunLog], keys: Sequence[str]) -> Figure:
-    """Draw logged figures of training, such as ``at_floor``, a panel each, one colour per run.
+    """Draw logged scalars of training, such as ``at_floor``: a panel each, one colour per run.
 
     Raises:
-        ValueError: If a figure is in no run's log.
+        ValueError: If no run has logged one of the scalars.
     """
-    logged = {key for run in runs for record in run.train for key in record}
+    logged: set[str] = set()
+    for run in runs:
+        logged.update(logged_keys(run.train))
     unknown = [key for key in keys if key not in logged]
     if unknown:
         raise InputError(f"no run logged {unknown}; there are {sorted(logged - set(_TIMING))}.")
@@ -198,47 +229,64 @@ def plot_series(runs: Sequence[RunLog], keys: Sequence[str]) -> Figure:
 
 
 def plot_precision_recall(reports: Mapping[str, Sequence[MetricReport]]) -> Figure:
-    """Draw precision over recall of configs, by name, at the middle threshold.
+    """Draw precision over recall at the middle threshold: a row per metric, a panel per class.
 
-    ``reports`` are of one run of each; a row is a metric, a panel a class.
+    Args:
+        reports: Reports of one run of each config, by name.
     """
     first = next(iter(reports.values()))
     style = MapStyle(tuple(first[0].detections))
     figure, axes = panel_grid(len(first), len(style.classes))
     for index, row in enumerate(axes):
-        for label, (name, found) in enumerate(first[index].detections.items()):
-            middle = len(found.thresholds) // 2
-            for of_run, colour in zip(reports.values(), RUN_COLOURS * 9, strict=False):
-                of_class = of_run[index].detections[name]
-                curve = precision_recall(of_class.hits[:, middle], of_class.num_gts)
-                row[label].plot(*curve, color=colour, linewidth=1.3)
-            if not found.num_gts:
-                row[label].text(0.5, 0.5, "no ground truth", ha="center", fontsize=8)
-            unit = " m" if first[index].name == "chamfer" else " IoU"
-            title = f"{style.title(label)}, {found.thresholds[middle]:g}{unit}"
+        unit = " m" if first[index].name == "chamfer" else " IoU"
+        for label, (name, detections) in enumerate(first[index].detections.items()):
+            panel = row[label]
+            middle = len(detections.thresholds) // 2
+            for report, colour in zip(reports.values(), RUN_COLOURS * 9, strict=False):
+                of_run = report[index].detections[name]
+                curve = precision_recall(of_run.hits[:, middle], of_run.num_gts)
+                panel.plot(*curve, color=colour, linewidth=1.3)
+            if not detections.num_gts:
+                panel.text(0.5, 0.5, "no ground truth", ha="center", fontsize=8)
+            title = f"{style.title(label)}, {detections.thresholds[middle]:g}{unit}"
             y_label = "" if label else "precision"
-            finish_shares(row[label], title, "recall", y_label, style.colour(label))
-    lines, names = axes[0, 0].lines, list(reports)
-    figure.legend(lines, names, loc="outside upper left", ncols=4, fontsize=8, frameon=False)
+            finish_shares(panel, title, "recall", y_label, style.colour(label))
+    figure.legend(
+        axes[0, 0].lines,
+        list(reports),
+        loc="outside upper left",
+        ncols=4,
+        fontsize=8,
+        frameon=False,
+    )
     return figure
 
 
 def summary_table(runs: Sequence[RunLog]) -> str:
-    """Return a Markdown table: per run its length, loss, speed, and last and best metrics."""
-    names = list(dict.fromkeys(name for run in runs for name in run.metrics))
+    """Markdown table of runs: length, loss, speed, last and best value of each metric."""
+    names: list[str] = []
+    for run in runs:
+        names += [name for name in run.metrics if name not in names]
     header = ["run", "iterations", "loss (first)", "loss (last)", "s / iteration"]
-    rows = [header + [f"{name} (last / best)" for name in names]]
+    header += [f"{name} (last / best)" for name in names]
+    rows = [header]
     for run in runs:
         steps, loss = run.series("loss")
-        seconds = run.series("time")[1]
-        row = [run.name, f"{steps[-1]:g}" if len(steps) else "-"]
-        row += [f"{loss[i]:.3g}" if len(loss) else "-" for i in (0, -1)]
+        _, seconds = run.series("time")
+        row = [run.name]
+        if len(steps):
+            row += [f"{steps[-1]:g}", f"{loss[0]:.3g}", f"{loss[-1]:.3g}"]
+        else:
+            row += ["-", "-", "-"]
         row.append(f"{np.median(seconds):.3g}" if len(seconds) else "-")
         for name in names:
-            values = run.series(name, validation=True)[1]
+            _, values = run.series(name, validation=True)
             row.append(f"{values[-1]:.4g} / {values.max():.4g}" if len(values) else "-")
         rows.append(row)
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     rows.insert(1, ["-" * width for width in widths])
-    padded = ([c.ljust(w) for c, w in zip(row, widths, strict=True)] for row in rows)
-    return "\n".join(f"| {' | '.join(row)} |" for row in padded)
+    lines = []
+    for row in rows:
+        cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)

@@ -32,6 +32,11 @@ if TYPE_CHECKING:
 DEFAULT_RESAMPLES = 1000
 
 
+def polygon_labels(args: argparse.Namespace, classes: Sequence[str]) -> list[int]:
+    """Labels of the classes of ``--polygon-classes``, whose elements are areas."""
+    return [label for label, name in enumerate(classes) if name in args.polygon_classes]
+
+
 def consistency_report(args: argparse.Namespace) -> MetricReport:
     """Score the drives of a result file; with ``--tracks``, write its tracks."""
     from gsmap.evaluation.analysis.consistency import ConsistencyConfig
@@ -45,13 +50,10 @@ def consistency_report(args: argparse.Namespace) -> MetricReport:
     annotations = AnnotationFile(args.ground_truth)
     meta = annotations.meta
     classes = tuple(args.classes or meta.classes)
-    polygon_labels = tuple(
-        label for label, name in enumerate(classes) if name in args.polygon_classes
-    )
     config = ConsistencyConfig(
         classes,
         BEVGrid(meta.x_range, meta.y_range),
-        polygon_labels,
+        tuple(polygon_labels(args, classes)),
         tuple(args.thresholds or CHAMFER_THRESHOLDS),
     )
     figures = evaluate_drives(args.results, annotations, config, args.tracks)
@@ -181,8 +183,7 @@ def group_report(
             shard=args.shard,
             allow_other_split=True,  # the first reading of the files has checked it
         )
-        areas = [label for label, name in enumerate(classes) if name in args.polygon_classes]
-        pieces = cut_by_distance(pairs, areas)
+        pieces = cut_by_distance(pairs, polygon_labels(args, classes))
         reports = evaluator.reports(match_samples(pieces, evaluator, args.workers))
         groups = distance_groups(reports[0].tokens)
     aps = grouping.ap_by_group(reports, groups)
