@@ -13,6 +13,9 @@ import os
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")  # idle threads would only stand in the workers' way
 
+import gsmap  # noqa: F401 - first: Ctrl-C is one line from here on, foreign settings are kept out
+
+# isort: split
 import argparse
 import sys
 import time

@@ -413,15 +413,20 @@ def main(argv: list[str] | None = None) -> str | None:
     with open_log(args, run, tokens=chosen_tokens, classes=classes) as results:
         broken = predict(args, inferencer, dataset, chosen, results)
         if chosen and len(broken) == len(chosen):
-            reason = next(iter(broken.values()))
-            if source.notes:
-                reason = f"{reason}; as said: {source.notes[-1]}"
-            raise InputError(f"no frame can be used: {reason}")
+            raise no_usable_frame(broken, source.notes)
         if results:
             count = results.finish(result_header(args, dataset.metainfo))
             args.shard.seal(args.out, RESULTS, samples_digest, settings, count)
     print_summary(args, source, dataset.ann_file, len(chosen), broken)
     return None
+
+
+def no_usable_frame(broken: dict[str, str], notes: Sequence[str]) -> InputError:
+    """Error for a recording without a usable frame, with the first reason and the last note."""
+    reason = next(iter(broken.values()))
+    if notes:
+        reason = f"{reason}; as said: {notes[-1]}"
+    return InputError(f"no frame can be used: {reason}")
 
 
 def print_summary(

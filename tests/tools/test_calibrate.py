@@ -185,7 +185,7 @@ def test_the_command_scores_and_draws_sigmas(files, tmp_path, capsys):
         (["--law", "laplace"], "--law needs --uncertainty"),
         (
             ["--uncertainty", "--shard", "0/2", "--out", "a.json"],
-            "--uncertainty needs a result file",
+            "--uncertainty needs all samples: leave out --shard",
         ),
     ],
 )

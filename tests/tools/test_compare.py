@@ -14,7 +14,7 @@ from processes import run_tool
 from gsmap.engine.arguments import add_config_options
 from gsmap.engine.launch import check_config, read_config
 from gsmap.evaluation.core.metric import metric_class
-from tools.compare import command_of, figures_of, read_tables
+from tools.compare import published_figures, read_tables, training_command
 
 REPO = Path(__file__).resolve().parents[2]
 ROWS = [
@@ -114,13 +114,13 @@ def test_the_means_of_the_papers_are_means():
 def test_commands_and_figures_of_a_row_by_hand():
     (table,) = read_tables("GSMap Table 5*")
     row = table["rows"][0]
-    assert command_of(row) == (
+    assert training_command(row) == (
         "python tools/train.py projects/GSMap/configs/gsmap_maptr_r50_24e.py "
         "--cfg-options model.map_head.loss_raster.loss_weight=5.0"
     )
-    assert figures_of(table, row) == "chamfer/mAP 49.1, raster/mAP 32.3"
+    assert published_figures(table, row) == "chamfer/mAP 49.1, raster/mAP 32.3"
     (table,) = read_tables("GSMap Table 7*")
-    assert figures_of(table, table["rows"][1]).endswith("mAP 33.9, memory_MB 11615")
+    assert published_figures(table, table["rows"][1]).endswith("mAP 33.9, memory_MB 11615")
 
 
 def test_the_command_lists_and_names_what_there_is():

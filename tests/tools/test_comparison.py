@@ -244,7 +244,7 @@ def test_a_run_that_fails_says_the_first_error_of_this_attempt(tmp_path):
     run.folder.mkdir()
     (run.folder / "train.log").write_text("error: of an attempt before\n")
     job = Job(run, None)
-    while not job.ended():
+    while not job.poll():
         time.sleep(0.01)
     record = json.loads((run.folder / "run.json").read_text())
     assert record["state"] == "train ended with exit code 2 (train.log: error: the cause)"

@@ -205,9 +205,9 @@ def test_results_name_the_model_and_the_scenes_of_data_and_training(model, tmp_p
     args = SimpleNamespace(model=[model[0], str(path)])
     data = {"classes": ("divider",), "dataset": "nuscenes", "split_list": "official"}
     about = {"classes": ["divider"], "checkpoint": digest(path), "calibration": calibration}
-    assert infer.about_results(args, {"classes": ("divider",)}) == about
+    assert infer.result_header(args, {"classes": ("divider",)}) == about
     listed = {**about, "split_list": "official"}
-    assert infer.about_results(args, data) == {**listed, "trained_on": near}
-    assert infer.about_results(args, {**data, "dataset": "minicity"}) == listed
-    plain = infer.about_results(SimpleNamespace(model=model), {"classes": ("divider",)})
+    assert infer.result_header(args, data) == {**listed, "trained_on": near}
+    assert infer.result_header(args, {**data, "dataset": "minicity"}) == listed
+    plain = infer.result_header(SimpleNamespace(model=model), {"classes": ("divider",)})
     assert plain == {"classes": ["divider"], "checkpoint": digest(Path(model[1]))}

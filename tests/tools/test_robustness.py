@@ -27,12 +27,12 @@ def tool():
 def test_corruptions_come_right_after_the_images_and_delays_before(tool):
     load, scale = {"type": "LoadCameraImages"}, {"type": "ScaleImages"}
     settings = {"ann_file": "a.arrow", "data_root": "d", "pipeline": [load, scale]}
-    fog = tool.corrupted(settings, "fog", 3, 7)["pipeline"]
+    fog = tool.add_corruption(settings, "fog", 3, 7)["pipeline"]
     assert fog == [load, {"type": "CorruptImages", "kind": "fog", "severity": 3, "seed": 7}, scale]
-    late = tool.corrupted(settings, "camera_delayed", 2, 7)["pipeline"]
+    late = tool.add_corruption(settings, "camera_delayed", 2, 7)["pipeline"]
     files = {"ann_file": "a.arrow", "data_root": "d"}
     assert late == [{"type": "DelayCameras", **files, "severity": 2, "seed": 7}, load, scale]
-    assert tool.corrupted(settings, "none", 1, 7) == settings
+    assert tool.add_corruption(settings, "none", 1, 7) == settings
 
 
 def test_every_kind_is_registered_and_in_the_table(tool):
