@@ -1,1 +1,1 @@
-"""Annotation files: what a sample is, how it is stored, how it is read."""
+"""Annotation files: records of samples, file format, reader and writer."""

@@ -1,4 +1,4 @@
-"""What samples of an annotation file must be: checked where one is written and where it is read."""
+"""Checks of the values in annotation files, before writing and after reading."""
 
 from collections.abc import Callable
 
@@ -8,112 +8,174 @@ import pyarrow.compute as pc
 
 from gsmap.datasets.annotations.record import AnnotationMeta
 from gsmap.datasets.annotations.schema import matrices_of
+from gsmap.structures.calibration import NUM_CAN_BUS
 from gsmap.structures.elements import FARTHEST_M
 from gsmap.structures.rigid import is_rigid
 from gsmap.utils.errors import InputError
 
 _OPTIONAL = {"lidar", "can_bus", "instances", "ego_from_frame"}
-_PLACES = {"cameras[]": "camera's ", "lidar": "LiDAR ", "sweeps[]": "sweep's "}
-_OUTSIDE = r"^$|^/|[\\\x00-\x1f]|(^|/)\.\.(/|$)"  # of a data root, with forward slashes
+_PREFIXES = {"cameras[]": "camera's ", "lidar": "LiDAR ", "sweeps[]": "sweep's "}  # of messages
+# Paths that are not relative, lead out of the data root or have other separators.
+_OUTSIDE = r"^$|^/|[\\\x00-\x1f]|(^|/)\.\.(/|$)"
 
 
 def check_batch(batch: pa.RecordBatch, meta: AnnotationMeta) -> None:
     """Check the values of a batch of samples.
 
-    Labels are among the classes, points and calibration finite, transforms rigid (proper rotations
-    to 1e-3), focal lengths and image sizes positive, and paths relative and inside the data root.
-    Names of scenes, maps and cameras must lead nowhere else, either, if a path is made of them.
+    Labels must be among the classes, points and calibration finite, transforms rigid (proper
+    rotations to 1e-3), focal lengths and image sizes positive, and paths relative and inside the
+    data root. Names of scenes, maps and cameras must be safe as parts of a path.
+
+    Args:
+        batch: Batch of samples with the columns of an annotation file.
+        meta: Metadata of the file.
 
     Raises:
-        ValueError: If a value is wrong or missing; the message names the sample.
+        ValueError: If a value is wrong or missing. The message names the sample.
     """
-    walk = _Walk(batch.column("token"), meta)
+    checker = _BatchChecker(batch.column("token"), meta)
     for name in batch.schema.names:
-        walk.check(batch.column(name), name, np.arange(len(batch)))
+        checker.check(batch.column(name), name=name, rows=np.arange(len(batch)))
 
 
-class _Walk:
-    """A walk through a batch, which checks every array and all that is in it."""
+class _BatchChecker:
+    """Recursive check of the nested arrays of a batch.
+
+    Args:
+        tokens: Tokens of the samples, for messages.
+        meta: Metadata of the file.
+    """
 
     def __init__(self, tokens: pa.StringArray, meta: AnnotationMeta) -> None:
         self.tokens = tokens
         self.meta = meta
 
     def check(self, array: pa.Array, name: str, rows: np.ndarray, where: str = "") -> None:
-        """Check an array; ``rows`` are the samples that its items belong to. (items,)."""
+        """Check an array and all nested arrays.
+
+        Args:
+            array: Array of a column or a field.
+            name: Name of the column or field; with ``[]`` for items of a list.
+            rows: Number of the sample of each item. (items,)
+            where: Beginning of messages.
+
+        Raises:
+            ValueError: If a value is wrong or missing.
+        """
         if array.null_count:
-            known = array.is_valid().to_numpy(zero_copy_only=False)
-            self.require(known | (name in _OPTIONAL), rows, f"{where}{name} is missing")
-            array, rows = array.drop_null(), rows[known]
+            is_valid = array.is_valid().to_numpy(zero_copy_only=False)
+            if name not in _OPTIONAL:
+                self.require(is_valid, rows=rows, problem=f"{where}{name} is missing")
+            array = array.drop_null()
+            rows = rows[is_valid]
         if pa.types.is_struct(array.type):
+            prefix = where + _PREFIXES.get(name, "")
             for part in array.type:
-                self.check(array.field(part.name), part.name, rows, where + _PLACES.get(name, ""))
+                self.check(array.field(part.name), name=part.name, rows=rows, where=prefix)
         elif pa.types.is_list(array.type):
             lengths = np.diff(array.offsets.to_numpy())
             if lengths.sum() != len(array.values):
                 raise InputError(f"{where}{name} has items that belong to no sample.")
             if pa.types.is_struct(array.type.value_type):
-                self.check(array.values, f"{name}[]", np.repeat(rows, lengths), where)
+                item_rows = np.repeat(rows, lengths)
+                self.check(array.values, name=f"{name}[]", rows=item_rows, where=where)
         if name in _RULES:
-            rule, wrong = _RULES[name]
-            good = rule(array, rows, self.meta)
-            value = None if good.all() else array[int(np.argmin(good))].as_py()
-            self.require(good, rows, where + name + wrong.format(value, self.meta))
+            rule, text = _RULES[name]
+            is_good = rule(array, rows, self.meta)
+            if not is_good.all():
+                first_wrong = array[int(np.argmin(is_good))].as_py()
+                problem = where + name + text.format(first_wrong, self.meta)
+                self.require(is_good, rows=rows, problem=problem)
 
-    def require(self, good: np.ndarray, rows: np.ndarray, wrong: str) -> None:
-        """Raise an error that names the sample of the first item that is not good."""
-        if not good.all():
-            token = self.tokens[int(rows[np.argmin(good)])].as_py()
-            raise InputError(f"sample {token!r}: {wrong}.")
+    def require(self, is_good: np.ndarray, rows: np.ndarray, problem: str) -> None:
+        """Raise an error unless all items are good.
+
+        Args:
+            is_good: Result of the check of each item. (items,)
+            rows: Number of the sample of each item. (items,)
+            problem: Message about the first wrong item.
+
+        Raises:
+            ValueError: If an item is wrong, with the token of its sample.
+        """
+        if not is_good.all():
+            token = self.tokens[int(rows[np.argmin(is_good)])].as_py()
+            raise InputError(f"sample {token!r}: {problem}.")
 
 
 @np.errstate(invalid="ignore", over="ignore")
-def _are_pinholes(arrays: pa.FixedSizeListArray, *_of: object) -> np.ndarray:
-    entries = np.ascontiguousarray(matrices_of(arrays, 9).T)  # each in one piece
-    good = np.isfinite(entries.sum(0)) & (entries[[0, 4]] > 0).all(0)
-    return good & (entries[6] == 0) & (entries[7] == 0) & (entries[8] == 1)
+def _are_pinholes(arrays: pa.FixedSizeListArray, *_: object) -> np.ndarray:
+    """Test which intrinsics are valid pinhole matrices."""
+    entries = np.ascontiguousarray(matrices_of(arrays, (9,)).T)  # (9, items), contiguous entries
+    are_finite = np.isfinite(entries.sum(0))
+    have_focal_lengths = (entries[[0, 4]] > 0).all(0)
+    have_last_row = (entries[6] == 0) & (entries[7] == 0) & (entries[8] == 1)
+    return are_finite & have_focal_lengths & have_last_row
 
 
-def _are_inside(paths: pa.StringArray, *_of: object) -> np.ndarray:
-    text = b"" if paths.buffers()[2] is None else paths.buffers()[2].to_pybytes()
-    starts = np.frombuffer(paths.buffers()[1], np.int32, len(paths) + 1)[:-1]
-    # a look at the bytes is enough for nearly all files, and much faster than an expression
+def _are_transforms(arrays: pa.FixedSizeListArray, *_: object) -> np.ndarray:
+    """Test which matrices are rigid transforms with a translation within the limit."""
+    matrices = matrices_of(arrays, (4, 4))
+    are_near = (np.abs(matrices[:, :3, 3]) <= _MAX_TRANSLATION_M).all(-1)
+    return is_rigid(matrices) & are_near
+
+
+def _are_inside(paths: pa.StringArray, *_: object) -> np.ndarray:
+    """Test which paths are relative, inside the data root and without control characters."""
+    _, offsets, data = paths.buffers()
+    text = b"" if data is None else data.to_pybytes()
+    starts = np.frombuffer(offsets, np.int32, len(paths) + 1)[:-1]
+    # Fast path for nearly all files: a scan of the bytes instead of a regular expression.
     letters = np.frombuffer(text + b"/", np.uint8)
-    plain = b".." not in text and b"\\" not in text and (letters >= ord(" ")).all()
-    if plain and (letters[starts] != ord("/")).all():
+    are_plain = b".." not in text and b"\\" not in text and (letters >= ord(" ")).all()
+    if are_plain and (letters[starts] != ord("/")).all():
         return np.ones(len(paths), bool)
     return ~pc.match_substring_regex(paths, _OUTSIDE).to_numpy(zero_copy_only=False)
 
 
-def _are_own_names(names: pa.StringArray, rows: np.ndarray, _meta: AnnotationMeta) -> np.ndarray:
-    """Say which cameras have a good name of their own in their sample."""
+def _are_names(names: pa.StringArray, *_: object) -> np.ndarray:
+    """Test which names of scenes or maps are empty or safe as parts of a path."""
+    are_empty = pc.equal(names, "").to_numpy(zero_copy_only=False)
+    return are_empty | _are_inside(names)
+
+
+def _are_camera_names(names: pa.StringArray, rows: np.ndarray, _: AnnotationMeta) -> np.ndarray:
+    """Test which names of cameras are unique in their sample and safe as parts of a path."""
     encoded = names.dictionary_encode()
-    each = rows * len(encoded.dictionary) + encoded.indices.to_numpy()
-    return (np.bincount(each)[each] == 1) & _are_inside(names)
+    keys = rows * len(encoded.dictionary) + encoded.indices.to_numpy()  # of sample and name
+    are_unique = np.bincount(keys)[keys] == 1
+    return are_unique & _are_inside(names)
 
 
-def _are_polylines(lists: pa.ListArray, _rows: np.ndarray, meta: AnnotationMeta) -> np.ndarray:
-    """Say which polylines have two points or more, all of them finite and within reach."""
+def _are_labels(labels: pa.Int32Array, _: np.ndarray, meta: AnnotationMeta) -> np.ndarray:
+    """Test which labels are indices of a class."""
+    numbers = labels.to_numpy()
+    return (numbers >= 0) & (numbers < len(meta.classes))
+
+
+def _are_polylines(lists: pa.ListArray, _: np.ndarray, meta: AnnotationMeta) -> np.ndarray:
+    """Test which polylines have two or more points, all finite and within the limit."""
     counts = np.diff(lists.offsets.to_numpy())
-    good = (counts % meta.dim == 0) & (counts >= 2 * meta.dim)
-    near = np.abs(lists.values.to_numpy(zero_copy_only=False)) <= FARTHEST_M  # NaN is not
-    if not near.all():
-        good[np.repeat(np.arange(len(counts)), counts)[~near]] = False
-    return good
+    are_good = (counts % meta.dim == 0) & (counts >= 2 * meta.dim)
+    are_near = np.abs(lists.values.to_numpy(zero_copy_only=False)) <= FARTHEST_M  # False for NaN
+    if not are_near.all():
+        line_numbers = np.repeat(np.arange(len(counts)), counts)
+        are_good[line_numbers[~are_near]] = False
+    return are_good
 
 
-_FARTHEST_POSE_M = 1e8  # several times the Earth
+_MAX_TRANSLATION_M = 1e8  # several times the circumference of the Earth
 _TRANSFORM = (
-    lambda arrays, *_: (
-        is_rigid(matrices_of(arrays, 4, 4))
-        & (np.abs(matrices_of(arrays, 4, 4)[:, :3, 3]) <= _FARTHEST_POSE_M).all(-1)
-    ),
+    _are_transforms,
     " is no rigid transform: it must be finite, with a rotation, a translation within 100,000 km "
     "and 0, 0, 0, 1 below",
 )
-_SIZE = lambda numbers, *_: numbers.to_numpy() > 0, " {0}: the size is not positive"
+_SIZE = (
+    lambda numbers, *_: numbers.to_numpy() > 0,
+    " {0}: the size is not positive",
+)
 _NAME = (
-    lambda texts, *_: pc.equal(texts, "").to_numpy(zero_copy_only=False) | _are_inside(texts),
+    _are_names,
     " {0!r} would lead out of a folder or has control characters: give it a plain name",
 )
 _RULES: dict[str, tuple[Callable[..., np.ndarray], str]] = {
@@ -125,11 +187,11 @@ _RULES: dict[str, tuple[Callable[..., np.ndarray], str]] = {
     "cam_from_frame": _TRANSFORM,
     "frame_from_lidar": _TRANSFORM,
     "can_bus": (
-        lambda arrays, *_: np.isfinite(matrices_of(arrays, 18)).all(-1),
+        lambda arrays, *_: np.isfinite(matrices_of(arrays, (NUM_CAN_BUS,))).all(-1),
         " holds NaN or infinity",
     ),
     "name": (
-        _are_own_names,
+        _are_camera_names,
         " {0!r} appears twice, is empty, would lead out of a folder or has control characters",
     ),
     "path": (
@@ -140,7 +202,7 @@ _RULES: dict[str, tuple[Callable[..., np.ndarray], str]] = {
     "height": _SIZE,
     "intrinsics": (_are_pinholes, " must be finite, with focal lengths > 0 and 0, 0, 1 below"),
     "label": (
-        lambda labels, _, meta: (labels.to_numpy() >= 0) & (labels.to_numpy() < len(meta.classes)),
+        _are_labels,
         " {0} is none of the classes {1.classes}",
     ),
     "points": (
@@ -148,4 +210,8 @@ _RULES: dict[str, tuple[Callable[..., np.ndarray], str]] = {
         " of an element must be (n >= 2, {1.dim}), not NaN or infinite, nor beyond 100 km",
     ),
 }
-"""By field: which items of an array are good, and what is said of the first that is not."""
+"""Test of the items of each field, and message about the first wrong item.
+
+Tests get the array, the number of the sample of each item and the metadata. In messages, {0} is the
+item and {1} is the metadata.
+"""

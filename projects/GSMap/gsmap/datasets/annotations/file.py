@@ -1,7 +1,7 @@
-"""Annotation files: one memory-mapped Arrow file per split, without pickle.
+"""Reader and writer of annotation files, memory-mapped Arrow files with the samples of a split.
 
-They are made once by a command and never cached silently; a reader refuses a file made for
-something else, and one that is damaged.
+A command creates the file once; there is no hidden cache. The reader raises an error for a damaged
+file and for a file with other metadata than expected. Files have no pickled objects.
 """
 
 import json
@@ -38,21 +38,21 @@ from gsmap.utils.shards import WHOLE, Shard, ShardFile
 
 SHARD_KIND = "annotations"
 _ROWS_PER_BATCH = 256
-_WORDS = ("dataset", "frame", "split", "command", "source_fingerprint")  # of the metadata
+_TEXTS = ("dataset", "frame", "split", "command", "source_fingerprint")  # of the metadata
 
 
 class AnnotationWriter:
-    """Write an annotation file that appears only when it is whole.
+    """Writer of an annotation file that appears only when it is complete.
 
-    A context manager: the file takes its name when the block ends well, and is removed when it ends
-    with an exception.
+    The writer is a context manager. The file gets its name at the end of the block, and is removed
+    if the block raises an exception.
 
     Args:
-        path: File to write; parent folders are made.
-        meta: What holds for the whole file.
-        shard: Part of the file to write; it gets a manifest.
-        source: Digest of what the whole is made from, for the manifest; by default that of
-            ``meta``.
+        path: File to write; parent folders are created.
+        meta: Metadata of the file.
+        shard: Part of the file to write, which gets a manifest; by default the whole file.
+        source: Digest of the source data of the whole file, for the manifest; by default
+            ``source_fingerprint`` of ``meta``.
     """
 
     def __init__(
@@ -60,17 +60,21 @@ class AnnotationWriter:
     ):
         self.path = shard.path_of(Path(path))
         self.meta = meta
-        self._seal = partial(
-            shard.seal, Path(path), SHARD_KIND, source or meta.source_fingerprint, asdict(meta)
+        self._write_manifest = partial(
+            shard.seal,
+            Path(path),
+            SHARD_KIND,
+            source=source or meta.source_fingerprint,
+            options=asdict(meta),
         )
         self._schema = schema_of(meta)
-        self._opened = ExitStack()
+        self._resources = ExitStack()
         self._rows: list[dict[str, Any]] = []
         self._tokens: set[str] = set()
         self._finished = False
 
     def __enter__(self) -> "AnnotationWriter":
-        self._file = self._opened.enter_context(atomic_write(self.path, "wb"))
+        self._file = self._resources.enter_context(atomic_write(self.path, "wb"))
         self._writer = pa.ipc.new_file(self._file, self._schema)
         return self
 
@@ -80,9 +84,14 @@ class AnnotationWriter:
     def write(self, sample: MapSample) -> None:
         """Append a sample.
 
+        Values are checked in batches (see ``check_batch``), so a wrong value may raise an error in
+        the call for a later sample or in `finish`.
+
+        Args:
+            sample: Sample with a token that is not in the file.
+
         Raises:
-            ValueError: If a shape is wrong or its token was already written. A wrong value
-                (``check_batch``) may be noticed some samples later, or when the file is finished.
+            ValueError: If a shape or a value is wrong, or the token was written before.
         """
         if sample.token in self._tokens:
             raise InputError(f"sample {sample.token!r} was already written to {self.path}.")
@@ -92,6 +101,7 @@ class AnnotationWriter:
             self._flush()
 
     def _flush(self) -> None:
+        """Check and write the rows in memory."""
         if self._rows:
             batch = batch_of(self._rows, self._schema)
             check_batch(batch, self.meta)
@@ -99,9 +109,12 @@ class AnnotationWriter:
             self._rows.clear()
 
     def finish(self) -> None:
-        """Write all that is left to the disk, under the provisional name.
+        """Write all remaining samples and the seal to the disk, under the temporary name.
 
-        Several files appear together if each is finished before the first block ends.
+        Several files appear together if all are finished before the end of the first block.
+
+        Raises:
+            ValueError: If a value is wrong.
         """
         if self._finished:
             return
@@ -109,20 +122,19 @@ class AnnotationWriter:
         self._file.flush()
         content = pa.memory_map(self._file.name).read_buffer()
         seal = {"rows": len(self), "bytes": content.size, "crc32": zlib.crc32(content)}
-        self._writer.write_batch(
-            batch_of([], self._schema), custom_metadata={SEAL_KEY: json.dumps(seal)}
-        )
+        empty_batch = batch_of([], self._schema)
+        self._writer.write_batch(empty_batch, custom_metadata={SEAL_KEY: json.dumps(seal)})
         self._writer.close()
         self._file.flush()
         os.fsync(self._file.fileno())
         self._finished = True
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        with self._opened:
+        with self._resources:
             if error is not None:
                 raise error
             self.finish()
-        self._seal(len(self))
+        self._write_manifest(samples=len(self))
 
 
 def write_annotations(
@@ -132,71 +144,93 @@ def write_annotations(
     shard: Shard = WHOLE,
     source: str = "",
 ) -> int:
-    """Write an annotation file from samples, and return how many it has.
+    """Write an annotation file.
 
     Args:
-        path: File to write; parent folders are made.
-        meta: What holds for the whole file.
-        samples: The samples, taken one by one.
-        shard: Part of the file that the samples are; it gets a manifest.
-        source: Digest of what the whole is made from; by default that of ``meta``.
+        path: File to write; parent folders are created.
+        meta: Metadata of the file.
+        samples: Samples, which are read one by one.
+        shard: Part of the file with these samples, which gets a manifest; by default the whole
+            file.
+        source: Digest of the source data of the whole file, for the manifest; by default
+            ``source_fingerprint`` of ``meta``.
+
+    Returns:
+        Number of samples.
 
     Raises:
-        ValueError: If a sample is malformed; then no file is left behind.
+        ValueError: If a sample is malformed. No file is written then.
     """
-    with AnnotationWriter(path, meta, shard, source) as writer:
+    with AnnotationWriter(path, meta, shard=shard, source=source) as writer:
         for sample in samples:
             writer.write(sample)
         return len(writer)
 
 
 def merge_annotations(path: Path, shards: Sequence[ShardFile]) -> int:
-    """Write an annotation file from all its shards (``find_shards``), and count its samples.
+    """Write an annotation file from the samples of all shards.
 
-    It is byte for byte as if it had been made at once.
+    The file is equal, byte for byte, to a file that is written at once.
+
+    Args:
+        path: File to write; parent folders are created.
+        shards: All shards in order, from ``find_shards``.
+
+    Returns:
+        Number of samples.
 
     Raises:
-        ValueError: If it has no sample, or one twice.
+        ValueError: If there is no sample, or two samples have one token.
     """
     files = [AnnotationFile(shard.path) for shard in shards]
     if not any(map(len, files)):
         raise InputError(f"no shard of {path} has a sample: give the command other data.")
-    return write_annotations(path, files[0].meta, chain.from_iterable(files))
+    samples = chain.from_iterable(files)
+    return write_annotations(path, meta=files[0].meta, samples=samples)
 
 
 def check_samples(samples: Sequence[MapSample], meta: AnnotationMeta) -> None:
-    """Check samples that come from elsewhere as those of an annotation file are.
+    """Check samples of any origin with the rules for annotation files.
+
+    Args:
+        samples: Samples.
+        meta: Metadata with the annotation frame and the classes of the samples.
 
     Raises:
-        ValueError: If a shape or value is wrong; the message names the sample.
+        ValueError: If a shape or a value is wrong. The message names the sample.
     """
-    batch = batch_of([row_of(sample, meta) for sample in samples], schema_of(meta))
+    rows = [row_of(sample, meta) for sample in samples]
+    batch = batch_of(rows, schema_of(meta))
     check_batch(batch, meta)
 
 
 class AnnotationFile(Sequence[MapSample]):
-    """Read a memory-mapped annotation file, which is checked from end to end when it is opened.
+    """Sequence of the samples in a memory-mapped annotation file.
 
-    Pickling hands on the path and the checksums of the batches, so that each worker process maps
-    the same pages. There, and in all processes after anything has written to the file, a batch is
-    compared with its checksum when it is next read.
+    The whole file is checked when it is opened. A pickled instance has only the path and the
+    checksums of the batches, so that all worker processes share the pages of the file. In an
+    unpickled instance, and after a change of the file, a batch is compared with its checksum before
+    it is read.
+
+    Args:
+        path: Annotation file.
 
     Raises:
-        FileNotFoundError: If it does not exist.
-        ValueError: If it is not a whole annotation file of this format version, its checksum does
-            not fit, or a value is out of its domain (``check_batch``); when reading, if the file
-            is not the one that was checked any more.
+        FileNotFoundError: If there is no such file.
+        ValueError: If the file is not a complete annotation file of this format version, the
+            checksum is wrong, or a value is out of its domain (see ``check_batch``). Also when a
+            sample is read, if the file has changed since it was opened.
     """
 
     sealed: bool
-    """Whether the file has a checksum; those of earlier versions have none."""
+    """Whether the file has a checksum, unlike files of earlier versions."""
 
     def __init__(self, path: str | Path):
         self.path = Path(path)
         self._open()
 
     def _open(self, sums: list[tuple[int, int]] | None = None) -> None:
-        """Map the file; check it unless its ``_sums`` are known from another process."""
+        """Map and read the file, and check it unless ``sums`` of another process are given."""
         if not self.path.is_file():
             raise FileNotFoundError(
                 f"no annotation file at {self.path}: make it with tools/create_data.py (see "
@@ -218,56 +252,66 @@ class AnnotationFile(Sequence[MapSample]):
             ) from error
         self.sealed = seal is not None
         try:
-            # Where each message ends, and the checksum of all bytes up to there.
+            # End of each message in bytes, and checksum of all bytes before it.
             self._sums = sums or checksums(self._content, ends)
-            self._intact = set() if sums else set(range(len(self._batches)))
+            # Numbers of the batches that have been checked since the last change of the file.
+            self._intact_batches = set() if sums else set(range(len(self._batches)))
             if sums is None:
-                self._check(seal)
+                self._check_content(seal)
             elif [end for end, _ in sums] != ends:
                 raise InputError("it was replaced after this run had opened it")
         except (pa.ArrowException, ValueError, TypeError, KeyError) as error:
             if is_of_the_machine(error):
                 raise
-            text = str(error).rstrip(".")
+            reason = str(error).rstrip(".")
             raise InputError(
-                f"{self.path} is damaged: {text}. Copy it again, or {self.remedy}"
+                f"{self.path} is damaged: {reason}. Copy it again, or {self.remedy}"
             ) from error
-        self._decoders = [decoder_of(b.to_struct_array(), self.meta.dim) for b in self._batches]
+        self._decoders = []
+        for batch in self._batches:
+            self._decoders.append(decoder_of(batch.to_struct_array(), dim=self.meta.dim))
         self._starts = np.cumsum([0, *map(len, self._batches)])
 
-    def _check(self, seal: bytes | None) -> None:
-        """Raise an error unless a file's bytes, rows and values are those that were written."""
+    def _check_content(self, seal: bytes | None) -> None:
+        """Raise an error if the file does not match the seal, or a value is wrong."""
         if seal is not None:
-            stated = json.loads(seal)
-            found = dict(self._sums).get(stated["bytes"])
-            if found != stated["crc32"] or sum(map(len, self._batches)) != stated["rows"]:
+            expected = json.loads(seal)
+            checksum = dict(self._sums).get(expected["bytes"])
+            num_rows = sum(map(len, self._batches))
+            if checksum != expected["crc32"] or num_rows != expected["rows"]:
                 raise InputError("its checksum does not fit its content")
         for batch in self._batches:
             batch.validate(full=True)
             check_batch(batch, self.meta)
-        tokens = pa.chunked_array([batch.column("token") for batch in self._batches], pa.string())
+        columns = [batch.column("token") for batch in self._batches]
+        tokens = pa.chunked_array(columns, type=pa.string())
         if pc.count_distinct(tokens).as_py() < len(tokens):
             raise InputError("two samples have one token")
 
     def _current_state(self) -> tuple[int, int, int]:
-        """Return what differs after a write to the file: its size and time; and the process."""
+        """Return size and time of the file, which change with a write, and the process id."""
         status = os.fstat(self._map.fileno())
         return status.st_size, status.st_mtime_ns, os.getpid()
 
     def _require_intact(self, number: int) -> None:
-        """Raise an error unless a batch still is what was checked when the file was opened.
+        """Raise an error if a batch has changed since the file was opened.
 
-        A look at size and time goes first: memory beyond a file's end must not be touched.
+        The size of the file is compared first: reading mapped memory beyond the end of a file ends
+        the process.
         """
         state = self._current_state()
         if state != self._state:
-            self._state, self._intact = state, set()
-        if number in self._intact:
+            self._state = state
+            self._intact_batches = set()
+        if number in self._intact_batches:
             return
-        if state[0] == self._content.size:
-            (start, before), (end, after) = self._sums[number + 1 : number + 3]
-            if zlib.crc32(memoryview(self._content)[start:end], before) == after:
-                self._intact.add(number)
+        size = state[0]
+        if size == self._content.size:
+            start, previous_checksum = self._sums[number + 1]
+            end, checksum = self._sums[number + 2]
+            content = memoryview(self._content)[start:end]
+            if zlib.crc32(content, previous_checksum) == checksum:
+                self._intact_batches.add(number)
                 return
         raise InputError(
             f"{self.path} was changed while it was in use: end what writes there, {self.remedy} "
@@ -276,7 +320,7 @@ class AnnotationFile(Sequence[MapSample]):
 
     @property
     def batches(self) -> list[pa.RecordBatch]:
-        """The samples as Arrow has them."""
+        """Samples as Arrow record batches."""
         for number in range(len(self._batches)):
             self._require_intact(number)
         return self._batches
@@ -290,40 +334,50 @@ class AnnotationFile(Sequence[MapSample]):
 
     @property
     def remedy(self) -> str:
-        """What to run to make the file again."""
+        """Advice with the command that creates the file."""
         return f"make it again with `{self.meta.command or 'python tools/create_data.py --help'}`."
 
     def require(self, **expected: Any) -> None:
-        """Refuse a file whose ``AnnotationMeta`` has other values than expected; None is any.
+        """Check the metadata of the file.
+
+        Args:
+            expected: Expected values of fields of ``AnnotationMeta``; None for any value.
 
         Raises:
-            ValueError: If a value differs; the message names it and says what to run.
+            ValueError: If a value differs. The message names the field and the remedy.
         """
         for name, wanted in expected.items():
-            found = getattr(self.meta, name)
-            wanted = tuple(wanted) if isinstance(wanted, list) else wanted
-            if wanted is not None and wanted != found:
+            value = getattr(self.meta, name)
+            if isinstance(wanted, list):
+                wanted = tuple(wanted)
+            if wanted is not None and wanted != value:
                 raise InputError(
-                    f"{self.path} was made with {name} {found}, the config asks for {wanted}: "
+                    f"{self.path} was made with {name} {value}, the config asks for {wanted}: "
                     "change the config, or make the file for it. It was made with "
                     f"`{self.meta.command or 'an unknown command'}`; `python tools/create_data.py "
                     "--help` lists the options."
                 )
 
     def require_rate(self, wanted_hz: float) -> None:
-        """Refuse a file whose samples follow one another at another rate.
+        """Check the number of samples per second of a drive.
 
         Args:
-            wanted_hz: Samples per second; the median of all drives may differ by a fifth.
+            wanted_hz: Expected samples per second. The median over all drives may differ by a
+                factor of 0.8 to 1.25.
 
         Raises:
-            ValueError: If it differs by more; the message says what to run.
+            ValueError: If the rate differs by more. The message names the remedy.
         """
-        scenes = np.unique(np.array(self.column("scene"), dtype=str), return_inverse=True)[1]
-        order = np.lexsort((self.seconds_into_scene, scenes))
-        same, steps = (np.diff(np.asarray(v)[order]) for v in (scenes, self.seconds_into_scene))
-        steps = steps[same == 0]
-        if not len(steps) or 0.8 < (ratio := np.median(steps) * wanted_hz) < 1.25:
+        names = np.array(self.column("scene"), dtype=str)
+        _, scenes = np.unique(names, return_inverse=True)
+        seconds = np.asarray(self.seconds_into_scene)
+        order = np.lexsort((seconds, scenes))
+        has_one_scene = np.diff(scenes[order]) == 0
+        steps = np.diff(seconds[order])[has_one_scene]
+        if not len(steps):
+            return
+        ratio = np.median(steps) * wanted_hz
+        if 0.8 < ratio < 1.25:
             return
         raise InputError(
             f"{self.path} has {wanted_hz / ratio:.3g} samples per second of a drive, the config "
@@ -345,45 +399,56 @@ class AnnotationFile(Sequence[MapSample]):
 
     def column(self, name: str) -> list[Any]:
         """Return ``token``, ``scene``, ``map_name`` or ``timestamp_ns`` of all samples."""
-        return [value for batch in self.batches for value in batch.column(name).to_pylist()]
+        values = []
+        for batch in self.batches:
+            values += batch.column(name).to_pylist()
+        return values
 
     @cached_property
     def seconds_into_scene(self) -> list[float]:
-        """Each sample's time since the first of its scene, in seconds."""
-        scenes, times = self.column("scene"), self.column("timestamp_ns")
-        start: dict[str, int] = {}
-        for scene, time in zip(scenes, times, strict=True):
-            start[scene] = min(time, start.get(scene, time))
-        return [(t - start[scene]) / 1e9 for scene, t in zip(scenes, times, strict=True)]
+        """Time of each sample since the first sample of the scene, in seconds."""
+        scenes = self.column("scene")
+        times_ns = self.column("timestamp_ns")
+        starts_ns: dict[str, int] = {}
+        for scene, time_ns in zip(scenes, times_ns, strict=True):
+            starts_ns[scene] = min(time_ns, starts_ns.get(scene, time_ns))
+        seconds = []
+        for scene, time_ns in zip(scenes, times_ns, strict=True):
+            seconds.append((time_ns - starts_ns[scene]) / 1e9)
+        return seconds
 
     def instance_counts(self) -> np.ndarray:
-        """Return each sample's number of map elements, -1 if not known. (samples,)."""
-        counts = (pc.list_value_length(batch.column("instances")) for batch in self.batches)
-        known = [count.fill_null(-1).to_numpy() for count in counts]
-        return np.concatenate([np.empty(0, np.int64), *known])
+        """Return the number of map elements of each sample, -1 without ground truth. (samples,)"""
+        counts = [np.empty(0, np.int64)]
+        for batch in self.batches:
+            lengths = pc.list_value_length(batch.column("instances"))
+            counts.append(lengths.fill_null(-1).to_numpy())
+        return np.concatenate(counts)
 
 
 def _meta_of(schema: pa.Schema) -> AnnotationMeta:
-    """Read the metadata of a file, which tell whether it is an annotation file of this version."""
+    """Read and check the metadata and the format version of a file."""
     values = json.loads((schema.metadata or {}).get(META_KEY, b"null"))
     if not isinstance(values, dict):
         raise InputError("it holds Arrow's data, but it is not an annotation file")
-    found, command = values.get("format_version"), values.get("command")
-    if found != FORMAT_VERSION or not schema.equals(pa.schema(FIELDS)):
+    version = values.get("format_version")
+    if version != FORMAT_VERSION or not schema.equals(pa.schema(FIELDS)):
+        command = values.get("command") or "tools/create_data.py"
         raise InputError(
-            f"it has format version {found} or other columns than version {FORMAT_VERSION}, which "
-            f"this program reads: make it again with `{command or 'tools/create_data.py'}`"
+            f"it has format version {version} or other columns than version {FORMAT_VERSION}, "
+            f"which this program reads: make it again with `{command}`"
         )
-    _require_plain(values)
+    _require_printable(values)
     return AnnotationMeta(**values)
 
 
-def _require_plain(values: dict[str, Any]) -> None:
-    """Refuse words of a file's metadata that no terminal, picture or map could hold."""
+def _require_printable(values: dict[str, Any]) -> None:
+    """Raise an error for texts in the metadata that are not printable."""
+    texts = {name: values.get(name) for name in _TEXTS}
     classes = values.get("classes")
-    words = {name: values.get(name) for name in _WORDS}
     if isinstance(classes, list):
-        words |= {f"class {number}": name for number, name in enumerate(classes)}
-    for name, word in words.items():
-        if word is not None and not (isinstance(word, str) and word.isprintable()):
-            raise InputError(f"its {name} must be plain text, got {word!a:.80}")
+        for number, name in enumerate(classes):
+            texts[f"class {number}"] = name
+    for name, text in texts.items():
+        if text is not None and not (isinstance(text, str) and text.isprintable()):
+            raise InputError(f"its {name} must be plain text, got {text!a:.80}")

@@ -1,7 +1,8 @@
-"""The messages of an Arrow file, one after another, and the checksums up to each.
+"""Messages of an Arrow file and their checksums.
 
-An Arrow file is a stream of messages between "ARROW1" and a footer that says where each begins. The
-last message of an annotation file is its seal.
+An Arrow file is a stream of messages between the bytes "ARROW1" and a footer with the positions of
+the messages. The last message of an annotation file is the seal, a batch without rows that has a
+checksum of the file in its metadata.
 """
 
 import zlib
@@ -12,17 +13,30 @@ import pyarrow as pa
 
 from gsmap.utils.errors import InputError
 
-_START, _END = b"ARROW1\0\0", b"ARROW1"
-# The seal has no rows; its metadata hold the checksum of all bytes before it.
+_START = b"ARROW1\0\0"
+_END = b"ARROW1"
 SEAL_KEY = b"gsmap_seal"
+"""Key of the seal in the metadata of a message.
+
+The seal is JSON with the number of rows, and the number and the checksum of all bytes before it.
+"""
 
 
 def read_messages(
     content: pa.Buffer,
 ) -> tuple[pa.Schema, list[pa.RecordBatch], bytes | None, list[int]]:
-    """Read a file's messages in their order: schema, batches, and the seal if there is one.
+    """Read the messages of an Arrow file.
 
-    Last come the ends of nothing, the schema and each batch, in bytes.
+    Args:
+        content: Content of the file.
+
+    Returns:
+        Schema; batches; seal, None for a file without it; and end of each part of the file in
+        bytes: 0, the end of the schema and the end of each batch.
+
+    Raises:
+        ValueError: If the content does not begin or end like an Arrow file, or has a batch without
+            rows that is not a seal.
     """
     size = content.size
     if size < len(_START) + 10 or content[: len(_START)].to_pybytes() != _START:
@@ -30,23 +44,39 @@ def read_messages(
     source = pa.BufferReader(content)
     source.seek(len(_START))
     reader = pa.ipc.open_stream(source)
-    ends, found = [0, source.tell()], []
+    ends = [0, source.tell()]
+    batches = []
+    seal = None  # only the metadata of the last message count
     for message in reader.iter_batches_with_custom_metadata():
         ends.append(source.tell())
-        found.append(message)
-    tail = content[source.tell() :].to_pybytes()
-    if tail[-6:] != _END or int.from_bytes(tail[-10:-6], "little") != len(tail) - 10:
+        batches.append(message.batch)
+        seal = (message.custom_metadata or {}).get(SEAL_KEY)
+    footer = content[source.tell() :].to_pybytes()
+    footer_size = int.from_bytes(footer[-10:-6], byteorder="little")
+    if footer[-6:] != _END or footer_size != len(footer) - 10:
         raise InputError("it ends too early")
-    seal = (found[-1].custom_metadata or {}).get(SEAL_KEY) if found else None
-    batches = [batch for batch, _ in (found if seal is None else found[:-1])]
+    if seal is not None:
+        batches.pop()
+        ends.pop()
     if not all(map(len, batches)):
-        raise InputError("it has an empty part")  # as a seal with a damaged name would be
-    return reader.schema, batches, seal, ends[: len(batches) + 2]
+        raise InputError("it has an empty part")  # for example a seal with a damaged key
+    return reader.schema, batches, seal, ends
 
 
 def checksums(content: pa.Buffer, ends: Sequence[int]) -> list[tuple[int, int]]:
-    """Return the places and the checksums of all bytes before each."""
-    view, sums = memoryview(content), [(0, 0)]
+    """Compute the checksum of all bytes before each position.
+
+    Args:
+        content: Content of the file.
+        ends: Positions in bytes in ascending order, from 0.
+
+    Returns:
+        Position and CRC-32 of all bytes before it, for each position.
+    """
+    view = memoryview(content)
+    checksum = 0
+    sums = [(0, checksum)]
     for start, end in pairwise(ends):
-        sums.append((end, zlib.crc32(view[start:end], sums[-1][1])))
+        checksum = zlib.crc32(view[start:end], checksum)
+        sums.append((end, checksum))
     return sums

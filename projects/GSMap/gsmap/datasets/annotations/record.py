@@ -1,4 +1,4 @@
-"""What is known about one sample, as plain values: the rows of an annotation file."""
+"""Records of samples and metadata in an annotation file."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -9,26 +9,27 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.split_lists import SPLIT_LIST, checked_identity
 
 FORMAT_VERSION = 1
-UNITED = "united"  # rule of the crossings in files that name none
-_HIGHEST_GROUND_M = 10.0
-_MOST_CLASSES = 1000
+UNITED = "united"  # default rule for pedestrian crossings
+_MAX_GROUND_Z_M = 10.0
+_MAX_CLASSES = 1000
 CLASSES = ("divider", "ped_crossing", "boundary")
 RANGES = {"lidar": ((-15.0, 15.0), (-30.0, 30.0)), "ego": ((-30.0, 30.0), (-15.0, 15.0))}
-"""The usual range of each annotation frame: smallest and largest x, and y, in metres."""
+"""Usual range of each annotation frame: (smallest, largest) x and y in metres."""
 
 
 @dataclass(eq=False)
 class CameraRecord:
-    """One camera's image and calibration.
+    """Image and calibration of a camera.
 
     Args:
         name: Channel name, such as ``CAM_FRONT``.
         path: Image file, relative to the data root, with forward slashes.
-        width: Width in pixels.
-        height: Height in pixels.
+        width: Width of the image in pixels.
+        height: Height of the image in pixels.
         intrinsics: Pinhole matrix in pixels. (3, 3)
-        cam_from_frame: Transform from the annotation frame at the sample's time to the camera (z
-            forward) at the image's time, with the vehicle's motion in between. (4, 4)
+        cam_from_frame: Transform in metres from the annotation frame at the time of the sample to
+            the camera (z forward) at the time of the image, which includes the motion of the
+            vehicle in between. (4, 4)
     """
 
     name: str
@@ -40,7 +41,7 @@ class CameraRecord:
 
     @property
     def img_from_frame(self) -> np.ndarray:
-        """Projection from the annotation frame to the image's pixels. (4, 4)"""
+        """Projection from the annotation frame in metres to the image in pixels. (4, 4)"""
         projection = np.eye(4)
         projection[:3] = self.intrinsics @ self.cam_from_frame[:3]
         return projection
@@ -48,13 +49,13 @@ class CameraRecord:
 
 @dataclass(eq=False)
 class SweepRecord:
-    """An earlier LiDAR sweep.
+    """LiDAR sweep before the time of a sample.
 
     Args:
         path: Point file, relative to the data root.
         timestamp_ns: Time of the sweep in nanoseconds.
-        frame_from_lidar: Transform from the sweep's sensor to the annotation frame at the sample's
-            time. (4, 4)
+        frame_from_lidar: Transform in metres from the LiDAR at the time of the sweep to the
+            annotation frame at the time of the sample. (4, 4)
     """
 
     path: str
@@ -64,12 +65,12 @@ class SweepRecord:
 
 @dataclass(eq=False)
 class LidarRecord:
-    """The LiDAR sweep at the sample's time, with earlier ones.
+    """LiDAR sweep at the time of a sample, with earlier sweeps.
 
     Args:
         path: Point file, relative to the data root.
-        frame_from_lidar: Transform from the sensor to the annotation frame. (4, 4)
-        sweeps: Earlier sweeps, the latest first.
+        frame_from_lidar: Transform in metres from the LiDAR to the annotation frame. (4, 4)
+        sweeps: Earlier sweeps, latest first.
     """
 
     path: str
@@ -79,12 +80,12 @@ class LidarRecord:
 
 @dataclass(eq=False)
 class MapInstance:
-    """One map element.
+    """Map element.
 
     Args:
-        label: Index into the file's class list.
-        points: Vertices at full resolution, in metres, in the annotation frame; a ring's last
-            vertex equals its first. (n, 2) or (n, 3)
+        label: Index of the class in the metadata of the file.
+        points: Vertices at full resolution in metres in the annotation frame. The last vertex of a
+            ring equals the first. (n, 2 or 3)
     """
 
     label: int
@@ -93,21 +94,21 @@ class MapInstance:
 
 @dataclass(eq=False)
 class MapSample:
-    """One sample: sensors, poses and, where known, the map around it.
+    """Sample with sensor data, poses and map elements.
 
     Args:
         token: Unique name of the sample.
-        scene: Name of the drive that it belongs to.
+        scene: Name of the drive of the sample.
         map_name: Name of the town or map; may be empty.
         timestamp_ns: Time in nanoseconds.
-        cameras: The cameras that have an image at this sample.
-        global_from_frame: Pose of the annotation frame in the map's global frame. (4, 4)
+        cameras: Cameras with an image.
+        global_from_frame: Pose of the annotation frame in the global frame of the map, in metres.
+            (4, 4)
         lidar: LiDAR sweep, or None.
-        can_bus: Vehicle signals in MapTR's layout, or None. (18,)
-        instances: Map elements; None where no ground truth is known (an empty list says that
-            nothing is there).
-        ego_from_frame: Transform from the annotation frame to the vehicle; None where it is not
-            known, which in the frame ``ego`` means the identity. (4, 4)
+        can_bus: Vehicle signals in the layout of MapTR, or None. (18,)
+        instances: Map elements, which may be an empty list; None for unknown ground truth.
+        ego_from_frame: Transform in metres from the annotation frame to the vehicle. None if it is
+            not known; in the frame ``ego``, None is the identity. (4, 4)
     """
 
     token: str
@@ -122,38 +123,40 @@ class MapSample:
     ego_from_frame: np.ndarray | None = None
 
 
-def _names(classes: Any) -> tuple[str, ...]:
-    """Return the names of classes; ValueError if they are none."""
+def _check_classes(classes: Any) -> tuple[str, ...]:
+    """Return the names of classes, after a check that they are different texts."""
     names = classes if isinstance(classes, (list, tuple)) else ()
-    named = all(isinstance(name, str) and name for name in names)
-    if not (named and 0 < len(names) == len(set(names))):
+    are_texts = all(isinstance(name, str) and name for name in names)
+    if not names or not are_texts or len(set(names)) < len(names):
         raise InputError(f"classes must be names, different ones, got {classes!r}.")
-    if len(names) > _MOST_CLASSES:
-        raise InputError(f"there are at most {_MOST_CLASSES} classes, not {len(names)}.")
+    if len(names) > _MAX_CLASSES:
+        raise InputError(f"there are at most {_MAX_CLASSES} classes, not {len(names)}.")
     return tuple(names)
 
 
 @dataclass(frozen=True)
 class AnnotationMeta:
-    """What holds for a whole annotation file; stored in its schema.
+    """Metadata of an annotation file, which are stored in the schema of the file.
 
     Args:
-        dataset: Data set, such as ``nuscenes``, ``minicity``, ``av2`` or a name of your own.
-        frame: ``lidar`` (x right, y forward) or ``ego`` (x forward, y left): the frame of all
-            coordinates.
-        split: Split that the file holds, such as ``train`` or ``val``.
+        dataset: Data set, such as ``nuscenes``, ``minicity``, ``av2`` or a user-defined name.
+        frame: Annotation frame, the frame of all coordinates: ``lidar`` (x right, y forward) or
+            ``ego`` (x forward, y left).
+        split: Split of the data set, such as ``train`` or ``val``.
         classes: Class names in label order.
-        x_range: Smallest and largest x of the ground truth in metres; the frame's usual if None.
-        y_range: Smallest and largest y of the ground truth in metres; the frame's usual if None.
-        dim: Coordinates per point: 2 or 3.
-        source_fingerprint: Digest of what the file was made from; empty if unknown.
-        versions: Versions of the libraries that took part.
-        options: Conversion options that change the content.
-        command: The command that makes the file again, for messages.
+        x_range: Smallest and largest x of the ground truth in metres; None for the usual range of
+            the frame.
+        y_range: Smallest and largest y of the ground truth in metres; None for the usual range of
+            the frame.
+        dim: Coordinates per point, 2 or 3.
+        source_fingerprint: Digest of the source data; empty if unknown.
+        versions: Versions of the libraries that were used for the conversion.
+        options: Options of the conversion that change the content.
+        command: Command that creates the file, for messages.
         format_version: Version of the file format.
-        ground_z_m: Height of the road in the frame, where a record's ``ego_from_frame`` does not
-            tell it, in metres; None is the frame's usual: -1.84 below nuScenes' LiDAR, -0.31 below
-            the axle of Argoverse 2.
+        ground_z_m: Height of the road in the frame in metres, for samples without
+            ``ego_from_frame``. None for the usual height: -1.84 for ``lidar``, as in nuScenes, and
+            -0.31 for ``ego``, as in Argoverse 2.
 
     Raises:
         ValueError: If a value is out of its domain.
@@ -163,7 +166,7 @@ class AnnotationMeta:
     frame: str
     split: str
     classes: tuple[str, ...] = CLASSES
-    x_range: tuple[float, float] = None  # type: ignore[assignment]  # a pair once it is made
+    x_range: tuple[float, float] = None  # type: ignore[assignment]  # never None after init
     y_range: tuple[float, float] = None  # type: ignore[assignment]
     dim: int = 2
     source_fingerprint: str = ""
@@ -180,29 +183,31 @@ class AnnotationMeta:
         if not isinstance(self.options, dict):
             raise InputError(f"options must be a dictionary, got {self.options!r:.60}.")
         checked_identity(self.split_list)
-        if self.ground_z_m is not None and not abs(float(self.ground_z_m)) < _HIGHEST_GROUND_M:
+        if self.ground_z_m is not None and not abs(float(self.ground_z_m)) < _MAX_GROUND_Z_M:
             raise InputError(
-                f"ground_z_m must be metres, between -{_HIGHEST_GROUND_M:g} and "
-                f"{_HIGHEST_GROUND_M:g}, got {self.ground_z_m!r}."
+                f"ground_z_m must be metres, between -{_MAX_GROUND_Z_M:g} and "
+                f"{_MAX_GROUND_Z_M:g}, got {self.ground_z_m!r}."
             )
         if self.frame not in RANGES:
             raise InputError(f"frame must be one of {tuple(RANGES)}, got {self.frame!r}.")
         if type(self.dim) is not int or self.dim not in (2, 3):
             raise InputError(f"dim must be 2 or 3, got {self.dim!r}.")
-        object.__setattr__(self, "classes", _names(self.classes))
-        for name, usual in zip(("x_range", "y_range"), RANGES[self.frame], strict=True):
-            given = getattr(self, name)
-            low, high = (float(v) for v in (usual if given is None else given))
+        object.__setattr__(self, "classes", _check_classes(self.classes))
+        for name, usual_range in zip(("x_range", "y_range"), RANGES[self.frame], strict=True):
+            value = getattr(self, name)
+            if value is None:
+                value = usual_range
+            low, high = (float(limit) for limit in value)
             if not -np.inf < low < high < np.inf:
                 raise InputError(f"{name} must be (low, high) with low < high, got {(low, high)}.")
             object.__setattr__(self, name, (low, high))
 
     @property
     def split_list(self) -> str:
-        """Name and digest of the list of scenes that splits were made by; empty if unknown."""
+        """Name and digest of the list of scenes that defines the splits; empty if unknown."""
         return self.options.get(SPLIT_LIST, "")
 
     @property
     def crossings(self) -> str:
-        """Rule that the crossings follow, see ``tools/create_data.py nuscenes --help``."""
+        """Rule for pedestrian crossings, see ``tools/create_data.py nuscenes --help``."""
         return self.options.get("crossings", UNITED)

@@ -1,6 +1,7 @@
-"""The columns of an annotation file, and samples to and from its rows.
+"""Columns of an annotation file, and conversion of samples to and from rows.
 
-The columns bear the names of the records' fields, so one walk along the types does either way.
+Columns have the names of the fields of the records. Conversions in both directions follow the
+nested types of the columns.
 """
 
 import json
@@ -23,13 +24,15 @@ from gsmap.structures.calibration import NUM_CAN_BUS
 from gsmap.utils.errors import InputError
 
 META_KEY = b"gsmap"
-_POSE, _INTRINSICS = pa.list_(pa.float64(), 16), pa.list_(pa.float64(), 9)
+_POSE = pa.list_(pa.float64(), 16)
+_INTRINSICS = pa.list_(pa.float64(), 9)
 _SHAPES = {
     "intrinsics": (3, 3),
     "can_bus": (NUM_CAN_BUS,),
-    **dict.fromkeys(
-        ("global_from_frame", "ego_from_frame", "cam_from_frame", "frame_from_lidar"), (4, 4)
-    ),
+    "global_from_frame": (4, 4),
+    "ego_from_frame": (4, 4),
+    "cam_from_frame": (4, 4),
+    "frame_from_lidar": (4, 4),
 }
 _INTEGERS = {"timestamp_ns", "width", "height", "label"}
 _CAMERA = pa.struct(
@@ -68,46 +71,56 @@ _RECORDS: dict[pa.DataType, Any] = {
 
 
 def schema_of(meta: AnnotationMeta) -> pa.Schema:
-    """Return the file's schema with its metadata."""
+    """Return the schema of a file with its metadata."""
     values = asdict(meta)
-    if meta.ground_z_m is None:  # as in files that earlier versions read
+    if meta.ground_z_m is None:  # earlier versions do not know the field
         del values["ground_z_m"]
     return pa.schema(FIELDS, metadata={META_KEY: json.dumps(values).encode()})
 
 
 def row_of(record: Any, meta: AnnotationMeta, where: str = "") -> dict[str, Any]:
-    """Return a sample, or a record in it, as the nested values of an Arrow row.
+    """Convert a sample, or a record in it, to the nested values of a row.
 
     Args:
-        record: The sample or record.
-        meta: What holds for the whole file.
-        where: What the message of an error begins with.
+        record: Sample or record.
+        meta: Metadata of the file.
+        where: Beginning of messages about errors.
+
+    Returns:
+        Values by the name of the column.
 
     Raises:
-        ValueError: If a matrix or an element has another shape, or holds no numbers.
+        ValueError: If a matrix or an element has another shape, or is not numeric.
     """
-    where += f"sample {record.token!r}: " if isinstance(record, MapSample) else ""
-    where += f"{record.name}: " if isinstance(record, CameraRecord) else ""
+    if isinstance(record, MapSample):
+        where += f"sample {record.token!r}: "
+    if isinstance(record, CameraRecord):
+        where += f"{record.name}: "
     row = {}
     for name, value in vars(record).items():
         if value is None and name == "ego_from_frame" and meta.frame == "ego":
-            value = np.eye(4)  # the frame is the vehicle
+            value = np.eye(4)  # the annotation frame is the frame of the vehicle
         if name in _SHAPES or name == "points":
-            value = None if value is None else _flat(value, name, meta.dim, where)
+            if value is not None:
+                value = _flatten(value, name=name, dim=meta.dim, where=where)
         elif isinstance(value, (list, tuple)):
-            value = [row_of(item, meta, where) for item in value]
+            value = [row_of(item, meta, where=where) for item in value]
         elif isinstance(value, LidarRecord):
-            value = row_of(value, meta, where)
+            value = row_of(value, meta, where=where)
         row[name] = int(value) if name in _INTEGERS else value
     return row
 
 
-def _flat(value: Any, name: str, dim: int, where: str) -> np.ndarray:
-    """Return a matrix, or the points of an element, in one dimension."""
+def _flatten(value: Any, name: str, dim: int, where: str) -> np.ndarray:
+    """Check a matrix, or the points of an element, and convert it to one dimension."""
     array = np.asarray(value)
-    shape = _SHAPES.get(name, (max(array.size // dim, 2), dim))
+    if name in _SHAPES:
+        shape = _SHAPES[name]
+        wanted = f"of shape {shape}"
+    else:
+        shape = (max(array.size // dim, 2), dim)
+        wanted = f"(n >= 2, {dim})"
     if array.shape != shape or array.dtype.kind not in "iuf":
-        wanted = f"of shape {shape}" if name in _SHAPES else f"(n >= 2, {dim})"
         raise InputError(
             f"{where}{name} must be numbers {wanted}, got {array.dtype} {array.shape}."
         )
@@ -115,52 +128,71 @@ def _flat(value: Any, name: str, dim: int, where: str) -> np.ndarray:
 
 
 def batch_of(rows: Sequence[dict[str, Any]], schema: pa.Schema) -> pa.RecordBatch:
-    """Return rows as one record batch.
+    """Convert rows to a record batch.
+
+    Args:
+        rows: Rows from `row_of`.
+        schema: Schema of the file.
 
     Raises:
-        ValueError: If a value has another type than its column.
+        ValueError: If a value does not have the type of the column.
     """
+    columns = []
     try:
-        columns = [pa.array([row[name] for row in rows], kind) for name, kind in FIELDS.items()]
+        for name, column_type in FIELDS.items():
+            values = [row[name] for row in rows]
+            columns.append(pa.array(values, type=column_type))
     except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError) as error:
         tokens = [row["token"] for row in rows]
         raise InputError(f"one of the samples {tokens[0]!r} to {tokens[-1]!r}: {error}.") from error
     return pa.record_batch(columns, schema=schema)
 
 
-def matrices_of(array: pa.FixedSizeListArray, *shape: int) -> np.ndarray:
-    """Return a column of matrices, NaN where there is none. (rows, *shape)."""
-    return array.values.to_numpy(zero_copy_only=False).reshape(-1, *shape)
+def matrices_of(array: pa.FixedSizeListArray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the matrices of a column, NaN where a row has none. (rows, *shape)
+
+    Args:
+        array: Column with the entries of matrices.
+        shape: Shape of a matrix.
+    """
+    return array.values.to_numpy(zero_copy_only=False).reshape((-1, *shape))
 
 
 def decoder_of(array: pa.Array, dim: int, name: str = "") -> Callable[[int], Any]:
-    """Return a function that makes the record of a row from a valid array.
+    """Return a function that creates the record, or the value, of a row.
 
     Args:
-        array: Structures, or the values of one field of them.
+        array: Records, or the values of a field of records, after validation.
         dim: Coordinates per point, 2 or 3.
-        name: The field that the array holds; by default the whole record.
+        name: Name of the field; empty for whole records.
+
+    Returns:
+        Function of the number of the row. It returns None for a missing value.
     """
-    decode = _decoder_of(array, dim, name)
+    decode = _decoder_of_valid(array, dim=dim, name=name)
     if not array.null_count:
         return decode
-    known = array.is_valid().to_numpy(zero_copy_only=False)
-    return lambda i: decode(i) if known[i] else None
+    is_valid = array.is_valid().to_numpy(zero_copy_only=False)
+    return lambda i: decode(i) if is_valid[i] else None
 
 
-def _decoder_of(array: pa.Array, dim: int, name: str) -> Callable[[int], Any]:
-    """Return what decodes an item that is there."""
+def _decoder_of_valid(array: pa.Array, dim: int, name: str) -> Callable[[int], Any]:
+    """Return a function that creates the record, or the value, of a row that is not missing."""
     if pa.types.is_struct(array.type):
         record = _RECORDS[array.type]
-        parts = {p.name: decoder_of(array.field(p.name), dim, p.name) for p in array.type}
-        return lambda i: record(**{name: part(i) for name, part in parts.items()})
+        decoders = {}
+        for part in array.type:
+            decoders[part.name] = decoder_of(array.field(part.name), dim=dim, name=part.name)
+        return lambda i: record(**{field: decode(i) for field, decode in decoders.items()})
     if name in _SHAPES:
-        matrices = matrices_of(array, *_SHAPES[name])
+        matrices = matrices_of(array, _SHAPES[name])
         return lambda i: matrices[i].copy()
     if name == "points":
-        ends, points = array.offsets.to_numpy() // dim, array.values.to_numpy().reshape(-1, dim)
-        return lambda i: points[ends[i] : ends[i + 1]].copy()
+        starts = array.offsets.to_numpy() // dim
+        points = array.values.to_numpy().reshape(-1, dim)
+        return lambda i: points[starts[i] : starts[i + 1]].copy()
     if pa.types.is_list(array.type):
-        ends, item = array.offsets.to_numpy(), decoder_of(array.values, dim)
-        return lambda i: [item(j) for j in range(ends[i], ends[i + 1])]
+        starts = array.offsets.to_numpy()
+        decode_item = decoder_of(array.values, dim=dim)
+        return lambda i: [decode_item(j) for j in range(starts[i], starts[i + 1])]
     return lambda i: array[i].as_py()
