@@ -22,7 +22,7 @@ def parse_topics(words: Sequence[str]) -> dict[str, tuple[str, str]]:
     """Parse ``NAME=IMAGES,INFO`` of each camera; without ``INFO`` its topic is empty.
 
     Raises:
-        ValueError: If a word has another form, or two cameras have the same name.
+        ValueError: If a word has another form, or the name of a camera repeats.
     """
     topics: dict[str, tuple[str, str]] = {}
     for word in words:
@@ -74,7 +74,7 @@ def image_topics(kinds: Mapping[str, str]) -> dict[str, str]:
     A camera is named by the last part of its topic, or by all parts if names would repeat.
 
     Raises:
-        ValueError: If two cameras get the same name.
+        ValueError: If two cameras would get one name.
     """
     topic_of: dict[str, str] = {}
     for image_kind in IMAGES:
@@ -128,10 +128,10 @@ def camera_topics(kinds: Mapping[str, str], listing: str) -> dict[str, tuple[str
     topics = {}
     for info, names in claims.items():
         matching_names = [name for name in names if _words(cameras[name]) == _words(info)]
-        is_global_info = info.count("/") == 1 and len(claims) > 1
+        is_shared_namespace = info.count("/") == 1 and len(claims) > 1  # the root, of all cameras
         if len(matching_names) == 1:
             name = matching_names[0]
-        elif len(names) > 1 or is_global_info:
+        elif len(names) > 1 or is_shared_namespace:
             raise InputError(f"is {info} that of {' or '.join(names)}? {_REMEDY}")
         else:
             name = names[0]

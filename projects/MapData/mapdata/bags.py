@@ -106,7 +106,7 @@ def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
         times_ns[camera.name] = np.unique(content.images[topic].times_ns)
     first = next((name for name in times_ns if "front" in name.lower()), next(iter(times_ns)))
     pose_at, pose_notes = _poses(content, vehicle=vehicle, ground=ground)
-    count_without_poses = len(thin_out(times_ns[first], options.rate_hz))
+    requested_count = len(thin_out(times_ns[first], options.rate_hz))
     wanted_ns = thin_out(_near_poses(times_ns[first], pose_at), options.rate_hz).tolist()
     frames = []
     nearest = nearest_images(times_ns, wanted_ns, tolerance_ns=_TOLERANCE_NS)
@@ -122,7 +122,7 @@ def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
     notes += content.notes() + content.tree.notes + pose_notes
     notes += _usage_notes(
         len(samples),
-        count_without_poses,
+        requested_count,
         times_ns=times_ns[first],
         pose_at=pose_at,
         camera=first,
@@ -258,13 +258,16 @@ def _near_poses(times_ns: np.ndarray, pose_at: PoseChain | None) -> np.ndarray:
 
 def _usage_notes(
     count: int,
-    count_without_poses: int,
+    requested_count: int,
     times_ns: np.ndarray,
     pose_at: PoseChain | None,
     camera: str,
 ) -> list[str]:
-    """Note on times of a camera's images that have no pose; a ``ValueError`` if none has one."""
-    if pose_at is None or count >= count_without_poses:
+    """Note on requested samples without a pose; a ``ValueError`` if no sample has a pose.
+
+    ``times_ns`` are the times of the images of ``camera``, which define the samples. (n,)
+    """
+    if pose_at is None or count >= requested_count:
         return []
     where = (
         f"the images of {camera!r} are from {_span_text(times_ns)}, the poses from "
@@ -275,14 +278,14 @@ def _usage_notes(
             f"no image has a pose near its time: {where}; images and transforms need one clock"
         )
     return [
-        f"{count} of {count_without_poses} samples used: the others have no pose near them: {where}"
+        f"{count} of {requested_count} samples used: the others have no pose near them: {where}"
     ]
 
 
 def _absence_notes(
     frames: Sequence[RigFrame], times_ns: Mapping[str, np.ndarray], first: str
 ) -> list[str]:
-    """Notes on cameras that lack an image at some samples; ``first`` has images at all of them."""
+    """Notes on cameras that lack an image at some samples; ``first`` defines the samples."""
     notes = []
     for name, image_times in times_ns.items():
         count = sum(name not in frame.images for frame in frames)

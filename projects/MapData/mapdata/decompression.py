@@ -14,8 +14,8 @@ from typing import Any, ClassVar
 from gsmap.utils.errors import InputError
 from gsmap.utils.extras import import_extra
 
-FREE_BYTES = 1 << 26
-TIMES = 100
+FREE_BYTES = 1 << 26  # may be decompressed from any bag
+TIMES = 100  # further bytes for each compressed byte
 _DECOMPRESSING = {  # modules that decompress, by the module that is imported
     "rosbags.rosbag1": ("rosbags.rosbag1.reader",),
     "rosbags.rosbag2": ("rosbags.rosbag2.reader", "rosbags.rosbag2.storage_mcap"),

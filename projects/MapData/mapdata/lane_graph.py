@@ -72,6 +72,7 @@ class LanePaths:
         ends = np.cumsum(list(map(len, polylines)), dtype=np.int64)
         lanes = [lane.tolist() for lane in np.split(nodes, ends)[:-1]]
         self._edges = [_fold_points(lane, uses) for lane in lanes]
+        # For each lane its links: the two lanes, and (start point id, edge).
         self._links: list[list[tuple[int, int, tuple[int, Edge]]]] = []
         for lane_links in links:
             link_edges: list[tuple[int, int, tuple[int, Edge]]] = []

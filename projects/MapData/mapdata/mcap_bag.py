@@ -25,7 +25,7 @@ class McapConnection:
         topic: Name of the topic.
         msgtype: Type of the messages, named as in ROS 2 if it is one of ROS.
         encoding: Serialization of the messages, such as ``cdr``.
-        schema: Definition of the type as a record of ``mcap``; None if there is none.
+        schema: Definition of the type as a record of ``mcap``; None without a definition.
     """
 
     topic: str

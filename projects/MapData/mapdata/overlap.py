@@ -100,7 +100,7 @@ def read_places(paths: Sequence[Path]) -> Places:
 
 
 def nearest_by_map(train: _ByMap, val: _ByMap) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Find the nearest training position of each validation position on the same map.
+    """Find the nearest training position of each validation position, map by map.
 
     Args:
         train: (x, y) of the training samples in metres, by map name. each (n, 2)
@@ -120,7 +120,7 @@ def nearest_by_map(train: _ByMap, val: _ByMap) -> dict[str, tuple[np.ndarray, np
 
 
 def overlap_share(train: _ByMap, val: _ByMap) -> float:
-    """Share of the validation positions within 5 m of a training position on the same map.
+    """Share of the validation positions within 5 m of a training position, map by map.
 
     Args:
         train: (x, y) of the training samples in metres, by map name. each (n, 2)
@@ -152,7 +152,7 @@ def overlap_notes(positions: Positions) -> list[str]:
 
 
 def sample_overlap(train: Places, val: Places) -> tuple[np.ndarray, np.ndarray]:
-    """Find the nearest training sample of each validation sample on the same map.
+    """Find the nearest training sample of each validation sample, map by map.
 
     Args:
         train: Positions of the training samples.
