@@ -20,7 +20,7 @@ from typing import Any
 
 from gsmap.utils.faults import in_words
 from gsmap.utils.handover import tell_lost_batches
-from gsmap.utils.inputs import declare_files, inputs_kept
+from gsmap.utils.inputs import declare_files, protect_inputs
 from gsmap.utils.interrupt import SAID, is_first_rank
 from gsmap.utils.parallel import have_forks_die_too
 from gsmap.utils.terminal import print_safely
@@ -95,7 +95,7 @@ def _paths_in(value: Any) -> Iterator[Path]:
         yield from _paths_in(list(value.values()))
 
 
-@inputs_kept()
+@protect_inputs()
 def run_command(command: Callable[[], str | None], heed_kill: bool = True) -> None:
     """Run a command, print its result, and report user errors in one line.
 

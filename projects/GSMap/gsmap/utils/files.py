@@ -40,7 +40,7 @@ _DAY_S = 24 * 3600.0
 _DEVICES = Path("/dev")
 _STREAMS = Path("/dev/fd"), Path("/proc/self/fd")  # links to the open files of a process
 _OWN_FOLDERS: set[Path] = set()
-_HOLDER = re.compile(r"(process \d+ on \S+ since [\d: -]+)?")  # what `lock_folder` writes
+_HOLDER = re.compile(r"(process \d+ on \S+ since [\d: -]+)?")  # content that `lock_folder` writes
 _DIGEST_ENDING = re.compile(r"-[0-9a-f]{16}\Z")  # of names that `file_name` has changed
 # Exceptions of `zipfile` for a damaged archive
 DAMAGED_ZIP = (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError)
@@ -86,10 +86,11 @@ def file_names(foreign: Iterable[str], endings: Sequence[str] = ("",)) -> dict[s
         has_changes = False
         new_names = dict(names)
         for original, name in names.items():
-            is_ambiguous = any(uses[file] > 1 for file in _folded_names(name=name, endings=endings))
-            changed_name = _changed_name(original)
-            if is_ambiguous and name != changed_name:
-                new_names[original] = changed_name
+            files = _folded_names(name=name, endings=endings)
+            if all(uses[file] == 1 for file in files):
+                continue
+            new_names[original] = _changed_name(original)
+            if new_names[original] != name:
                 has_changes = True
         if not has_changes:
             return names
@@ -102,9 +103,8 @@ def _folded_names(name: str, endings: Sequence[str]) -> list[str]:
 
 
 def _plain_name(foreign: str) -> str:
-    composed = unicodedata.normalize(
-        "NFC", foreign
-    )  # some file systems do not distinguish the forms
+    # some file systems do not distinguish the normal forms of Unicode
+    composed = unicodedata.normalize("NFC", foreign)
     safe = re.sub(r"[^\w.+=-]", repl="_", string=composed)
     start = safe.lstrip(".-").encode()[:_LONGEST_NAME]
     return start.decode(errors="ignore").rstrip(".") or "unnamed"
@@ -383,19 +383,19 @@ def try_lock(file: IO[Any] | int) -> bool | None:
     return True
 
 
-def lock(file: IO[Any] | int, held: str) -> None:
+def lock(file: IO[Any] | int, message: str) -> None:
     """Lock an open file or folder for as long as it is open; warn if there are no locks.
 
     Args:
         file: Open file, or the handle of a file or folder.
-        held: Message of the error if another process holds the lock.
+        message: Text of the error if another process holds the lock.
 
     Raises:
         RuntimeError: If another process holds the lock.
     """
     is_locked = try_lock(file)
     if is_locked is False:
-        raise WorkError(held)
+        raise WorkError(message)
     if is_locked is None:
         text = "files cannot be locked here: take care that one process works at a time."
         logging.getLogger("gsmap").warning(text)
@@ -425,7 +425,7 @@ def lock_folder(folder: Path, name: str, advice: str) -> IO[str]:
     holder = file.read(200)
     if not _HOLDER.fullmatch(holder):
         raise InputError(f"{folder / name} is another program's file: write elsewhere.")
-    lock(file, held=f"{folder} is in use by {holder or 'another process'}: {advice}.")
+    lock(file, message=f"{folder} is in use by {holder or 'another process'}: {advice}.")
     file.truncate(0)
     file.write(f"process {os.getpid()} on {platform.node()} since {time.strftime('%F %T')}")
     file.flush()

@@ -37,7 +37,7 @@ def watch_files() -> None:
 
 
 @contextmanager
-def inputs_kept() -> Iterator[None]:
+def protect_inputs() -> Iterator[None]:
     """Context in which overwriting an input (`declare_files`) or reading a pipe is an error."""
     watch_files()
     try:

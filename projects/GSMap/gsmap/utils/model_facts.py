@@ -7,7 +7,7 @@ from gsmap.utils.errors import InputError
 
 CHECKPOINT = "checkpoint"  # key in results: SHA-256 of the checkpoint file
 CALIBRATION = "calibration"  # key in checkpoints and results: fit of the sigmas to the errors
-MOUNT = "mount"  # key of metainfo: transform from the annotation frame to ground below rear axle
+MOUNT = "mount"  # key of metainfo: transform from annotations to the ground below the rear axle
 RIG = "rig"  # key of metainfo: width, height, fx, fy, cx, cy of the images in pixels, by camera
 LAW_NAMES = ("normal", "laplace")  # distributions of the errors
 
