@@ -25,14 +25,14 @@ _CONTENT_ERRORS = (
 
 
 @contextmanager
-def naming(what: object, remedy: str) -> Iterator[None]:
+def naming(subject: object, remedy: str) -> Iterator[None]:
     """Context manager that adds the name of a file and a remedy to errors about its content.
 
     Errors of the system, such as a lack of memory, and errors with the name pass unchanged.
 
     Args:
-        what: Path or name of the data, with which the message begins.
-        remedy: Advice to the user, with which the message ends.
+        subject: Path or name of the data, the beginning of the message.
+        remedy: Advice to the user, the end of the message.
 
     Raises:
         ValueError: In place of an error of indexing, arithmetic or a parser within the block.
@@ -43,7 +43,7 @@ def naming(what: object, remedy: str) -> Iterator[None]:
         from_devkit = type(error) is Exception  # nuScenes' devkit raises no subclass
         from_arrow = type(error) is OSError and error.errno is None
         about_content = isinstance(error, _CONTENT_ERRORS) or from_devkit or from_arrow
-        if is_of_the_machine(error) or not about_content or str(what) in str(error):
+        if is_of_the_machine(error) or not about_content or str(subject) in str(error):
             raise
         reason = str(error)
         if isinstance(error, KeyError):
@@ -52,4 +52,4 @@ def naming(what: object, remedy: str) -> Iterator[None]:
             reason = f"{type(error).__name__}: {error}"
         reason = reason.rstrip(".")
         advice = "" if reason.endswith(remedy) else f"; {remedy}"
-        raise InputError(f"{what} cannot be used: {reason}{advice}.") from error
+        raise InputError(f"{subject} cannot be used: {reason}{advice}.") from error

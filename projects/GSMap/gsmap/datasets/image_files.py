@@ -216,7 +216,7 @@ def _decode_jpeg(
     _check_num_pixels((width, height))
     num_scans = content.count(_SCAN)
     if num_scans > _MAX_JPEG_SCANS:
-        raise _UnfitError(f"it has {num_scans} scans, more than {_MAX_JPEG_SCANS}: save it anew")
+        raise _UnfitError(f"it has {num_scans} scans, more than {_MAX_JPEG_SCANS}: save it again")
     return (width, height), simplejpeg.decode_jpeg(content, colorspace="BGR")
 
 

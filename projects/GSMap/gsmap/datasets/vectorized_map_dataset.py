@@ -174,7 +174,7 @@ class VectorizedMapDataset(BaseDataset):
     def _ground_from_first_frame(self) -> list[list[float]] | None:
         """Return the transform from the first sample's frame to the ground, None if unknown. (4, 4)
 
-        It is known if the height of the road is known, or the mounting of a LiDAR.
+        The transform depends on the height of the road or on the mounting of the LiDAR.
         """
         if not len(self.annotations):
             return None

@@ -53,12 +53,18 @@ class LoadCameraImages(BaseTransform):
         """
         cameras = results["images"]
         images = []
+        raw_shapes = []
+        max_height = 0
+        max_width = 0
         for name, camera in cameras.items():
             where = f"sample {results['token']!r}, camera {name}"
             image = read_image(camera["img_path"], where=where, size=camera.get("size"))
+            height, width = image.shape[:2]
             images.append(image)
-        raw_shapes = [image.shape[:2] for image in images]
-        shape = (max(rows for rows, _ in raw_shapes), max(cols for _, cols in raw_shapes))
+            raw_shapes.append((height, width))
+            max_height = max(max_height, height)
+            max_width = max(max_width, width)
+        shape = (max_height, max_width)
         converts = self.to_float32 and not self.on_device
         results["img"] = []
         for image in images:
@@ -122,7 +128,8 @@ class ScaleImages(BaseTransform):
             ValueError: If the images would have no pixel.
         """
         if self.size is not None:
-            return self._resize_to_size(results, (int(self.size[0]), int(self.size[1])))
+            width, height = self.size
+            return self._resize_to_size(results, size=(int(width), int(height)))
         height, width = shape_after_steps(results)
         size = self.output_size(width, height)
         by_area = False
@@ -142,8 +149,7 @@ class ScaleImages(BaseTransform):
             results["img"] = [mmcv.imresize(img, size, interpolation="area") for img in images]
         elif size != (width, height):
             take_step(results, self._resize_step(results, size))
-        for key in ("lidar2img", "img_aug_matrix"):
-            results[key] = [matrix @ m for m in results[key]]
+        _transform_pixels(results, matrix)
         results["img_shape"] = results["pad_shape"] = size[::-1]
         results["scale_factor"] = size[0] / width
         return results
@@ -209,12 +215,17 @@ class CropImages(BaseTransform):
         matrix = np.eye(4)
         matrix[1, 2] = -self.top
         take_step(results, CropTop(self.top))
-        for key in ("lidar2img", "img_aug_matrix"):
-            results[key] = [matrix @ m for m in results[key]]
+        _transform_pixels(results, matrix)
         raw_shapes = results["raw_shapes"]
         results["raw_shapes"] = [(rows - self.top, cols) for rows, cols in raw_shapes]
         results["img_shape"] = results["pad_shape"] = (height - self.top, width)
         return results
+
+
+def _transform_pixels(results: dict[str, Any], matrix: np.ndarray) -> None:
+    """Multiply the projections of all views by a transform of pixels. (4, 4)"""
+    for key in ("lidar2img", "img_aug_matrix"):
+        results[key] = [matrix @ projection for projection in results[key]]
 
 
 def _scaled_size(size: tuple[int, int], scale: float) -> tuple[int, int]:

@@ -117,7 +117,7 @@ def ends_meet(
     """
     extent = np.array([x_range[1] - x_range[0], y_range[1] - y_range[0]])
     first, last = (points[[0, -1], :2] - (x_range[0], y_range[0])) / extent
-    return bool(np.allclose(first, last, atol=1e-3))  # besides the default rtol=1e-5
+    return bool(np.allclose(first, last, atol=1e-3))  # with the default rtol=1e-5
 
 
 @TRANSFORMS.register_module()
