@@ -10,7 +10,7 @@ from gsmap.visualization.camera_projection import (
     NEAR_M,
     project_polygon,
     project_segments,
-    subdivided,
+    subdivide,
 )
 
 SIZE = (200, 100)
@@ -103,7 +103,7 @@ def test_polygon_out_of_sight_is_empty():
 
 def test_subdivided_keeps_vertices_and_bounds_the_step():
     line = np.array([[0.0, 0, 0], [2.5, 0, 1], [2.5, 0.4, 1]])
-    dense = subdivided(line, 1.0)
+    dense = subdivide(line, 1.0)
     np.testing.assert_allclose(dense[[0, 3, 4]], line)
     np.testing.assert_allclose(dense[1], [2.5 / 3, 0, 1 / 3])
     assert np.linalg.norm(np.diff(dense, axis=0), axis=1).max() <= 1.0

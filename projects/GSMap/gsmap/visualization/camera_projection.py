@@ -1,22 +1,24 @@
-"""Projection of polylines into pinhole images, cut at the near plane and the image's edges.
+"""Projection of polylines into pinhole images, cut at the near plane and the edges of the image.
 
-All cutting happens in homogeneous pixel coordinates (u w, v w, w), where every edge of the viewing
-frustum is a linear inequality and a straight line stays straight. So a line that runs behind the
-camera is cut instead of wrapping round, and no dense sampling is needed for a correct result.
+Lines are cut in homogeneous pixel coordinates (u w, v w, w), in which each plane of the viewing
+frustum is a linear inequality and straight lines remain straight. So a line that runs behind the
+camera is cut correctly, without dense sampling.
 """
 
 import numpy as np
 
-NEAR_M = 0.3  # smallest depth that is drawn
+NEAR_M = 0.3
+"""Smallest depth in metres of a visible point."""
+_NUM_PLANES = 5  # of the frustum
 
 
 def _homogeneous_px(points: np.ndarray, img_from_frame: np.ndarray) -> np.ndarray:
-    """Map points in metres (n, 3) to (u w, v w, w), where w is the depth in metres. (n, 3)"""
+    """Project points in metres (n, 3) to (u w, v w, w), where w is the depth in metres. (n, 3)"""
     return points @ img_from_frame[:3, :3].T + img_from_frame[:3, 3]
 
 
 def _frustum_values(points: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
-    """Signed distances to the five planes of the frustum, >= 0 inside. (n, 3) -> (5, n)"""
+    """Left sides of the five inequalities of the frustum, >= 0 inside. (n, 3) -> (5, n)"""
     width, height = size_px
     u, v, w = points.T
     return np.stack([w - NEAR_M, u, width * w - u, v, height * w - v])
@@ -25,29 +27,36 @@ def _frustum_values(points: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
 def project_segments(
     starts: np.ndarray, ends: np.ndarray, img_from_frame: np.ndarray, size_px: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Project straight segments into an image and keep the visible parts (Liang-Barsky clipping).
+    """Project straight segments and cut them to the image (Liang and Barsky, 1984).
 
     Args:
         starts: First end points in metres. (n, 3)
         ends: Second end points in metres. (n, 3)
         img_from_frame: Projection matrix, intrinsics times extrinsics. (4, 4)
-        size_px: Width and height of the image.
+        size_px: Width and height of the image in pixels.
 
     Returns:
-        The visible segments as pixel coordinates (m, 2, 2), the depth of their middle in metres
-        (m,), and the index of the segment that each came from (m,).
+        Visible parts of the segments in pixels (m, 2, 2), depth of their middle in metres (m,),
+        and index of the segment of each part (m,).
     """
-    first, last = (_homogeneous_px(points, img_from_frame) for points in (starts, ends))
-    f0, f1 = (_frustum_values(points, size_px) for points in (first, last))  # (5, n)
-    crossing = (f0 < 0) != (f1 < 0)
-    t = np.where(crossing, f0 / np.where(crossing, f0 - f1, 1.0), 0.0)
-    enter = np.where(crossing & (f0 < 0), t, 0.0).max(axis=0)  # (n,)
-    leave = np.where(crossing & (f1 < 0), t, 1.0).min(axis=0)
-    index = np.flatnonzero((enter < leave) & ~((f0 < 0) & (f1 < 0)).any(axis=0))
+    first = _homogeneous_px(starts, img_from_frame)
+    last = _homogeneous_px(ends, img_from_frame)
+    first_values = _frustum_values(first, size_px)  # (5, n)
+    last_values = _frustum_values(last, size_px)  # (5, n)
+    first_outside = first_values < 0
+    last_outside = last_values < 0
+    crosses = first_outside != last_outside
+    change = np.where(crosses, first_values - last_values, 1.0)
+    fraction = np.where(crosses, first_values / change, 0.0)
+    enter = np.where(crosses & first_outside, fraction, 0.0).max(axis=0)  # (n,)
+    leave = np.where(crosses & last_outside, fraction, 1.0).min(axis=0)  # (n,)
+    is_outside = (first_outside & last_outside).any(axis=0)
+    index = np.flatnonzero((enter < leave) & ~is_outside)
     direction = (last - first)[index]
-    at = np.stack([enter, leave], axis=1)[index, :, None]  # (m, 2, 1)
-    cut = first[index, None] + at * direction[:, None]  # (m, 2, 3)
-    return cut[..., :2] / cut[..., 2:], cut[..., 2].mean(axis=1), index
+    fractions = np.stack([enter, leave], axis=1)[index, :, None]  # (m, 2, 1)
+    visible = first[index, None] + fractions * direction[:, None]  # (m, 2, 3)
+    depth_m = visible[..., 2].mean(axis=1)
+    return visible[..., :2] / visible[..., 2:], depth_m, index
 
 
 def project_polygon(
@@ -56,33 +65,47 @@ def project_polygon(
     """Project a polygon and cut it to the image (Sutherland and Hodgman, 1974).
 
     Args:
-        ring: Vertices in metres; repeating the first one at the end is optional. (n, 3)
-        img_from_frame: Projection matrix. (4, 4)
-        size_px: Width and height of the image.
+        ring: Vertices in metres; the first one may be repeated at the end. (n, 3)
+        img_from_frame: Projection matrix, intrinsics times extrinsics. (4, 4)
+        size_px: Width and height of the image in pixels.
 
     Returns:
-        Pixel coordinates of the visible part, empty if there is none. (m, 2)
+        Visible part in pixels, empty if there is none. (m, 2)
     """
     points = _homogeneous_px(ring, img_from_frame)
-    for plane in range(5):
+    for plane in range(_NUM_PLANES):
         values = _frustum_values(points, size_px)[plane]
-        following, next_values = np.roll(points, -1, axis=0), np.roll(values, -1)
-        kept: list[np.ndarray] = []
-        for p, q, f0, f1 in zip(points, following, values, next_values, strict=True):
-            if f0 >= 0:
-                kept.append(p)
-            if (f0 < 0) != (f1 < 0):
-                kept.append(p + f0 / (f0 - f1) * (q - p))
-        if len(kept) < 3:
+        next_points = np.roll(points, -1, axis=0)
+        next_values = np.roll(values, -1)
+        cut_ring: list[np.ndarray] = []
+        for start, end, start_value, end_value in zip(
+            points, next_points, values, next_values, strict=True
+        ):
+            if start_value >= 0:
+                cut_ring.append(start)
+            if (start_value < 0) != (end_value < 0):
+                fraction = start_value / (start_value - end_value)
+                cut_ring.append(start + fraction * (end - start))
+        if len(cut_ring) < 3:
             return np.empty((0, 2))
-        points = np.stack(kept)
+        points = np.stack(cut_ring)
     return points[:, :2] / points[:, 2:]
 
 
-def subdivided(points: np.ndarray, step_m: float) -> np.ndarray:
-    """Insert vertices so that no segment is longer than a step. (n >= 1, D) metres -> (m, D)"""
-    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    counts = np.maximum(np.ceil(lengths / step_m).astype(int), 1)
-    parts = [i + np.arange(n) / n for i, n in enumerate(counts)]
-    position = np.concatenate([*parts, [len(points) - 1.0]])
-    return np.stack([np.interp(position, range(len(points)), xyz) for xyz in points.T], axis=1)
+def subdivide(points: np.ndarray, step_m: float) -> np.ndarray:
+    """Insert vertices into a polyline, so that no segment is longer than a step.
+
+    Args:
+        points: Vertices in metres. (n >= 1, D)
+        step_m: Largest length of a segment in metres.
+
+    Returns:
+        Vertices, among them the given ones. (m, D)
+    """
+    lengths_m = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    counts = np.maximum(np.ceil(lengths_m / step_m).astype(int), 1)
+    parts = [index + np.arange(count) / count for index, count in enumerate(counts)]
+    positions = np.concatenate([*parts, [len(points) - 1.0]])  # in vertices
+    vertices = np.arange(len(points))
+    columns = [np.interp(positions, vertices, column) for column in points.T]
+    return np.stack(columns, axis=1)

@@ -1,4 +1,4 @@
-"""Camera panels: a mosaic that mirrors the rig, and the map drawn over each image."""
+"""Camera panels: images arranged as on the vehicle, with the map drawn over them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,22 +19,23 @@ from gsmap.datasets.image_files import read_image
 from gsmap.structures.elements import MapElements
 from gsmap.structures.frames import FrameView, viewing_azimuth
 from gsmap.utils.errors import InputError
-from gsmap.visualization.camera_projection import project_polygon, project_segments, subdivided
+from gsmap.visualization.camera_projection import project_polygon, project_segments, subdivide
 from gsmap.visualization.style import MapStyle
 
-_STEP_M = 2.0  # a line's width follows its depth in steps of this length
-_WIDTH_STEP = 0.2  # widths differ by this share, so that lines are few paths
-_NOMINAL_SIZE_IN = 2.4  # on a panel of this size (root of its area) lines have the style's widths
+_STEP_M = 2.0  # largest length of a segment, which has one depth and so one line width
+_WIDTH_STEP = 0.2  # logarithm of the ratio of successive line widths; few widths make few paths
+_NOMINAL_SIZE_IN = 2.4  # root of the area of a panel on which line widths are not scaled
+_OPEN_PATHS: dict[str, Any] = {"facecolors": "none", "capstyle": "round", "joinstyle": "round"}
 
 
 @dataclass(frozen=True)
 class CameraView:
-    """One camera's image and projection.
+    """Image and projection of one camera.
 
     Args:
         name: Channel name, such as ``CAM_FRONT_LEFT``.
         image: RGB, 0 to 255. (h, w, 3) uint8
-        img_from_frame: Projection from the annotation frame to this image's pixels. (4, 4)
+        img_from_frame: Projection from metres in the annotation frame to pixels. (4, 4)
 
     Raises:
         ValueError: If the image has another shape or type.
@@ -45,7 +46,8 @@ class CameraView:
     img_from_frame: np.ndarray
 
     def __post_init__(self) -> None:
-        kind, shape = self.image.dtype, self.image.shape
+        kind = self.image.dtype
+        shape = self.image.shape
         if len(shape) != 3 or shape[2] != 3 or kind != np.uint8:
             raise InputError(
                 f"image of camera {self.name} must be RGB uint8 (h, w, 3), got {kind} {shape}."
@@ -53,7 +55,7 @@ class CameraView:
 
     @property
     def size_px(self) -> tuple[int, int]:
-        """Width and height of the image."""
+        """Width and height of the image in pixels."""
         return self.image.shape[1], self.image.shape[0]
 
 
@@ -61,7 +63,7 @@ Camera = TypeVar("Camera", CameraView, CameraRecord)
 
 
 def camera_title(name: str) -> str:
-    """Return a channel's name as a reader would write it."""
+    """Name of a channel in plain words."""
     words = name.lower().replace("_", " ").split()
     return " ".join(word for word in words if word not in ("cam", "ring", "camera"))
 
@@ -69,22 +71,25 @@ def camera_title(name: str) -> str:
 def camera_views(
     cameras: Sequence[CameraRecord], data_root: Path, token: str, grey: bool = False
 ) -> list[CameraView]:
-    """Pair the images of a sample's records with their projections.
+    """Read the images of the cameras of a sample.
 
     Args:
-        cameras: The cameras.
-        data_root: Folder that their paths start from.
-        token: The sample's, for messages.
-        grey: Whether an image that is missing or damaged is grey instead of an error.
+        cameras: Cameras of the sample.
+        data_root: Folder that image paths are relative to.
+        token: Token of the sample, for messages.
+        grey: Whether a missing or damaged image is replaced by a grey one.
+
+    Returns:
+        Images with their projections, in the order of the cameras.
 
     Raises:
-        BrokenSampleError: If an image is missing or damaged.
+        BrokenSampleError: If an image is missing or damaged, and ``grey`` is False.
     """
     views = []
     for camera in cameras:
-        path, where = data_root / camera.path, f"sample {token!r}, camera {camera.name}"
+        where = f"sample {token!r}, camera {camera.name}"
         try:
-            image = read_image(str(path), where)[..., ::-1]
+            image = read_image(str(data_root / camera.path), where)[..., ::-1]
         except BrokenSampleError:
             if not grey:
                 raise
@@ -94,25 +99,44 @@ def camera_views(
 
 
 def arrange_cameras(cameras: Sequence[Camera], view: FrameView) -> list[list[Camera]]:
-    """Arrange cameras as on the car, left to right: looking ahead in a row, looking back below.
+    """Arrange cameras as on the vehicle, from left to right.
 
-    A row without cameras is left out.
+    Args:
+        cameras: Cameras in any order.
+        view: Orientation of the annotation frame.
+
+    Returns:
+        A row of the cameras that look ahead and a row of the cameras that look back, without
+        empty rows.
     """
-    rows: tuple[list[Any], list[Any]] = [], []
+    looking_ahead: list[tuple[float, Camera]] = []  # position from the left, camera
+    looking_back: list[tuple[float, Camera]] = []
     for camera in cameras:
         azimuth = viewing_azimuth(camera.img_from_frame, view)
-        looks_back = abs(azimuth) > np.pi / 2 + 1e-3
-        rows[looks_back].append((azimuth % (2 * np.pi) if looks_back else -azimuth, camera))
-    return [[camera for _, camera in sorted(row, key=itemgetter(0))] for row in rows if row]
+        if abs(azimuth) > np.pi / 2 + 1e-3:
+            looking_back.append((azimuth % (2 * np.pi), camera))
+        else:
+            looking_ahead.append((-azimuth, camera))
+    rows = []
+    for row in (looking_ahead, looking_back):
+        if row:
+            row.sort(key=itemgetter(0))
+            rows.append([camera for _, camera in row])
+    return rows
 
 
 def _draw_areas(
     ax: Axes, elements: MapElements, camera: CameraView, view: FrameView, style: MapStyle
 ) -> None:
-    """Fill the closed elements faintly."""
-    closed = elements.select(np.array([style.is_closed(label) for label in elements.labels]))
-    rings = (view.lift(line) for line in closed.polylines)
-    shapes = [project_polygon(ring, camera.img_from_frame, camera.size_px) for ring in rings]
+    """Fill the areas of closed elements with a faint colour."""
+    is_closed = np.array([style.is_closed(label) for label in elements.labels])
+    closed = elements.select(is_closed)
+    shapes = []
+    for ring in closed.polylines:
+        shape = project_polygon(
+            view.lift(ring), img_from_frame=camera.img_from_frame, size_px=camera.size_px
+        )
+        shapes.append(shape)
     faces = mcolors.to_rgba_array(style.colours(closed.labels), 0.25)
     ax.add_collection(PolyCollection(shapes, facecolors=faces, edgecolors="none", zorder=3))
 
@@ -120,26 +144,40 @@ def _draw_areas(
 def _draw_polylines(
     ax: Axes, elements: MapElements, camera: CameraView, view: FrameView, style: MapStyle
 ) -> None:
-    """Draw the polylines, thinner with distance within what stays legible, on a dark edge."""
-    dense = [subdivided(view.lift(line), _STEP_M) for line in elements.polylines]
+    """Draw polylines on a dark edge, thinner with distance within legible limits."""
+    dense = [subdivide(view.lift(line), _STEP_M) for line in elements.polylines]
     starts = np.concatenate([line[:-1] for line in dense])
     ends = np.concatenate([line[1:] for line in dense])
-    owner = np.repeat(elements.labels, [len(line) - 1 for line in dense])
-    segments, depth_m, index = project_segments(starts, ends, camera.img_from_frame, camera.size_px)
+    segment_labels = np.repeat(elements.labels, [len(line) - 1 for line in dense])
+    segments, depth_m, index = project_segments(
+        starts, ends, img_from_frame=camera.img_from_frame, size_px=camera.size_px
+    )
     box = ax.get_window_extent()
     scale = np.sqrt(box.width * box.height) / ax.figure.dpi / _NOMINAL_SIZE_IN
     level = np.rint(0.6 * np.log(10 / np.maximum(depth_m, 0.1)) / _WIDTH_STEP).astype(int)
-    kinds, kind = np.unique(np.c_[owner[index], level], axis=0, return_inverse=True)
-    parts = [segments[kind == i] for i in range(len(kinds))]  # one path per class and width
-    codes = [Outline.MOVETO, Outline.LINETO]
-    paths = [Outline(np.concatenate(part), codes * len(part)) for part in parts]
+    # One path for each class and width.
+    keys = np.c_[segment_labels[index], level]
+    kinds, kind_of_segment = np.unique(keys, axis=0, return_inverse=True)
+    paths = []
+    for kind in range(len(kinds)):
+        parts = segments[kind_of_segment == kind]  # (m, 2, 2)
+        codes = [Outline.MOVETO, Outline.LINETO] * len(parts)
+        paths.append(Outline(np.concatenate(parts), codes))
     thinning = np.exp(_WIDTH_STEP * kinds[:, 1]).clip(0.45, 2.6)
     widths = scale * style.camera_line_pt * thinning
-    halo = mcolors.to_rgba(style.halo, 0.55)
-    rounded: dict[str, Any] = {"facecolors": "none", "capstyle": "round", "joinstyle": "round"}
-    for colour, extra, zorder in ((halo, 1.1, 4), (style.colours(kinds[:, 0]), 0.0, 5)):
-        line = {"edgecolors": colour, "linewidths": widths + extra * scale, "zorder": zorder}
-        ax.add_collection(PathCollection(paths, **line, **rounded))
+    edges = PathCollection(
+        paths,
+        edgecolors=mcolors.to_rgba(style.halo, 0.55),
+        linewidths=widths + 1.1 * scale,
+        **_OPEN_PATHS,
+    )
+    lines = PathCollection(
+        paths, edgecolors=style.colours(kinds[:, 0]), linewidths=widths, **_OPEN_PATHS
+    )
+    edges.set_zorder(4)
+    lines.set_zorder(5)
+    ax.add_collection(edges)
+    ax.add_collection(lines)
 
 
 def draw_camera(
@@ -150,15 +188,16 @@ def draw_camera(
     style: MapStyle,
     size_px: tuple[int, int],
 ) -> None:
-    """Draw one image with the map over it.
+    """Draw the image of a camera with the map over it.
 
     Args:
-        ax: Axes to fill; it has the image's aspect ratio.
+        ax: Axes with the aspect ratio of the image, which are filled.
         camera: Image and projection.
-        elements: Map elements, or None for the bare image.
-        view: Ground plane of the frame.
+        elements: Map elements in the annotation frame, or None for the image alone.
+        view: Ground plane of the annotation frame.
         style: Colours and widths.
-        size_px: Width and height of the axes on the canvas, to which the image is resampled.
+        size_px: Width and height of the axes on the canvas in pixels; the image is resampled to
+            them.
     """
     width, height = camera.size_px
     method = cv2.INTER_AREA if size_px[0] < width else cv2.INTER_CUBIC

@@ -1,4 +1,4 @@
-"""Films (H.264), and a drive as one: cameras, the maps of result files side by side, the truth."""
+"""Films of drives in H.264: cameras, the maps of result files side by side, the ground truth."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from fractions import Fraction
@@ -22,12 +22,13 @@ from gsmap.visualization.style import MapStyle, track_colours
 
 
 def write_film(path: str | Path, pictures: Iterable[np.ndarray], times_ns: Sequence[int]) -> None:
-    """Write pictures as a film (``.mp4``) in H.264, as fast as they were taken.
+    """Write pictures as a film in H.264 (``.mp4``) that plays in real time.
 
     Args:
         path: File to write.
-        pictures: RGB, all of one size; an odd row or column at the end is left out. (H, W, 3) uint8
-        times_ns: When they were taken, in nanoseconds.
+        pictures: RGB pictures of one size; an odd row or column at the end is dropped.
+            (H, W, 3) uint8
+        times_ns: Time of each picture in nanoseconds.
 
     Raises:
         RuntimeError: If ``av`` (PyAV) is missing.
@@ -40,10 +41,13 @@ def write_film(path: str | Path, pictures: Iterable[np.ndarray], times_ns: Seque
         for picture in pictures:
             if stream is None:
                 stream = film.add_stream("libx264", rate=rate, options={"crf": "20"})
-                stream.pix_fmt = "yuv420p"  # what every player takes, of even sizes
-                stream.height, stream.width = (size // 2 * 2 for size in picture.shape[:2])
-            shown = np.ascontiguousarray(picture[: stream.height, : stream.width])
-            film.mux(stream.encode(av.VideoFrame.from_ndarray(shown, format="rgb24")))
+                stream.pix_fmt = "yuv420p"  # every player supports it; sizes must be even
+                height, width, _ = picture.shape
+                stream.height = height // 2 * 2
+                stream.width = width // 2 * 2
+            pixels = np.ascontiguousarray(picture[: stream.height, : stream.width])
+            frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
+            film.mux(stream.encode(frame))
         if stream is not None:
             film.mux(stream.encode())
 
@@ -61,22 +65,23 @@ def write_drive_film(
 ) -> str:
     """Write a film of one drive: cameras with the first result, each result, the ground truth.
 
-    Elements of results with tracks (``track_id``) have their track's colour, so that one that stays
-    the same keeps it; without tracks, and in the cameras, colours are those of classes.
+    Elements of results with tracks (``track_id``) have one colour for each track. Elements without
+    tracks, and elements over the cameras, have the colours of their classes.
 
     Args:
         path: File to write.
         annotations: Annotation file.
-        results: Result files by the names that the film gives them.
-        scene: The drive; the annotation file's first one by default.
-        data_root: Folder that image paths start from; the annotation file's by default.
+        results: Result files by their names in the film.
+        scene: Name of the drive; by default the first one of the annotation file.
+        data_root: Folder that image paths are relative to; by default the folder of the annotation
+            file.
         score_thr: Smallest score of a drawn prediction, in [0, 1].
-        images: Whether to show the cameras.
+        images: Whether to draw the cameras.
         max_frames: Largest number of frames, from the start of the drive.
-        width_px: Width of the film.
+        width_px: Width of the film in pixels.
 
     Returns:
-        What was written, in words.
+        Summary of the film in words.
 
     Raises:
         FileNotFoundError: If a file does not exist.
@@ -91,21 +96,29 @@ def write_drive_film(
             f"{annotations} has no scene {scene!r}: give one of its {len(scenes)}, such as "
             f"{scenes[0]!r}."
         )
-    drives = {
-        name: [f for f in drive_frames(Path(file_), file, file.meta.classes) if f.scene == scene]
-        for name, file_ in results.items()
-    }
-    rows = {token: row for row, token in enumerate(file.column("token"))}
-    first = next(iter(drives.values()))[:max_frames]
-    chosen = [rows[frame.token] for frame in first]
-    times_ns = [file.column("timestamp_ns")[row] for row in chosen]
+    drives = {}
+    for name, result_path in results.items():
+        result_frames = drive_frames(Path(result_path), file, file.meta.classes)
+        drives[name] = [frame for frame in result_frames if frame.scene == scene]
+    row_of_token = {token: row for row, token in enumerate(file.column("token"))}
+    frames = next(iter(drives.values()))[:max_frames]
+    rows = [row_of_token[frame.token] for frame in frames]
+    all_times_ns = file.column("timestamp_ns")
+    times_ns = [all_times_ns[row] for row in rows]
     root = Path(annotations).parent if data_root is None else data_root
-    pictures = _pictures(file, chosen, drives, root if images else None, score_thr, width_px)
+    pictures = _draw_frames(
+        file,
+        rows=rows,
+        drives=drives,
+        root=root if images else None,
+        score_thr=score_thr,
+        width_px=width_px,
+    )
     write_film(path, pictures, times_ns)
-    return f"{scene}, {counted(len(chosen), 'frame')}: {path}"
+    return f"{scene}, {counted(len(rows), 'frame')}: {path}"
 
 
-def _pictures(
+def _draw_frames(
     file: AnnotationFile,
     rows: Sequence[int],
     drives: Mapping[str, Sequence[DriveFrame]],
@@ -113,31 +126,50 @@ def _pictures(
     score_thr: float,
     width_px: int,
 ) -> Iterator[np.ndarray]:
-    """Draw the frames of a drive one after another. (H, W, 3) each"""
-    meta, style = file.meta, MapStyle(file.meta.classes)
+    """Draw the frames of a drive, as RGB. each (H, W, 3) uint8
+
+    Args:
+        file: Annotation file.
+        rows: Indices of the samples of the drive.
+        drives: Frames of each result, by its name.
+        root: Folder that image paths are relative to, or None to leave cameras out.
+        score_thr: Smallest score of a drawn prediction, in [0, 1].
+        width_px: Width of the pictures in pixels.
+    """
+    meta = file.meta
+    style = MapStyle(meta.classes)
     start_ns = file[rows[0]].timestamp_ns
-    for number, row in enumerate(rows):
+    for index, row in enumerate(rows):
         sample = file[row]
-        panels = [_panel(name, frames[number], score_thr) for name, frames in drives.items()]
-        truth = next(iter(drives.values()))[number].truth
+        panels = []
+        for name, frames in drives.items():
+            panels.append(_result_panel(name, frame=frames[index], score_thr=score_thr))
+        elements_over_cameras = panels[0].elements
+        first_frames = next(iter(drives.values()))
+        panels.append(BEVPanel("Ground truth", first_frames[index].truth))
+        cameras = []
+        if root is not None:
+            cameras = camera_views(sample.cameras, root, sample.token)
+        view = frame_view(meta.frame, meta.ground_z_m)
         seconds = (sample.timestamp_ns - start_ns) / 1e9
         figure = compose_figure(
-            camera_views(sample.cameras, root, sample.token) if root is not None else [],
-            [*panels, BEVPanel("Ground truth", truth)],
-            BEVGrid(meta.x_range, meta.y_range),
-            frame_view(meta.frame, meta.ground_z_m).with_mounting(sample.ego_from_frame),
-            style,
-            panels[0].elements,
-            f"{sample.scene}, {seconds:.1f} s",
-            width_px,
+            cameras,
+            panels,
+            grid=BEVGrid(meta.x_range, meta.y_range),
+            view=view.with_mounting(sample.ego_from_frame),
+            style=style,
+            camera_elements=elements_over_cameras,
+            title=f"{sample.scene}, {seconds:.1f} s",
+            width_px=width_px,
         )
         yield figure_to_rgb(figure)
 
 
-def _panel(name: str, frame: DriveFrame, score_thr: float) -> BEVPanel:
-    """Show a result's predictions, coloured by track if they have any."""
-    kept = frame.predictions.confidence >= score_thr
-    found = frame.predictions.select(kept)
+def _result_panel(name: str, frame: DriveFrame, score_thr: float) -> BEVPanel:
+    """Panel of the predictions of a result, coloured by track if they have tracks."""
+    is_confident = frame.predictions.confidence >= score_thr
+    predictions = frame.predictions.select(is_confident)
     if frame.track_ids is None:
-        return BEVPanel(name, found)
-    return BEVPanel(f"{name}, tracks", found, colours=track_colours(frame.track_ids[kept]))
+        return BEVPanel(name, predictions)
+    colours = track_colours(frame.track_ids[is_confident])
+    return BEVPanel(f"{name}, tracks", predictions, colours=colours)

@@ -1,4 +1,4 @@
-"""Draws samples while a model is validated or tested."""
+"""Hook that draws samples in validation and testing."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,13 +16,15 @@ from gsmap.visualization.map_visualizer import MapVisualizer
 
 
 def _points(data_batch: Any, index: int) -> np.ndarray | None:
-    """Return the LiDAR points of one sample of a batch, if it has any. (n, >= 2)"""
-    clouds = data_batch.get("inputs", {}).get("points") if isinstance(data_batch, dict) else None
+    """LiDAR points of one sample of a batch, if it has any. (n, >= 2)"""
+    if not isinstance(data_batch, dict):
+        return None
+    clouds = data_batch.get("inputs", {}).get("points")
     return None if clouds is None else np.asarray(clouds[index].detach().cpu())
 
 
 def _visualizer(runner: Runner) -> MapVisualizer:
-    """Return the runner's visualizer, which must be ours."""
+    """Visualizer of the runner, which must be a ``MapVisualizer``."""
     if not isinstance(runner.visualizer, MapVisualizer):
         raise InputTypeError(
             "MapVisualizationHook needs visualizer=dict(type='MapVisualizer') in the config, "
@@ -34,15 +36,15 @@ def _visualizer(runner: Runner) -> MapVisualizer:
 @HOOKS.register_module()
 @dataclass(eq=False)
 class MapVisualizationHook(Hook):
-    """Draws predictions: to ``test_out_dir`` in testing, to the backends in validation.
+    """Draws predictions, into a folder in testing and to the visualizer's backends in validation.
 
-    Every rank draws its own samples in testing. In validation, rank 0 draws the same few samples
-    each time, so that TensorBoard's slider shows how each improves.
+    In testing, each rank draws its samples. In validation, rank 0 draws a few samples, equal
+    ones at each validation, so that the slider of TensorBoard shows their progress.
 
     Args:
         draw: Whether to draw at all.
         interval: In testing, draw every ``interval``-th sample of a rank.
-        num_val_samples: In validation, how many samples to draw.
+        num_val_samples: Number of samples that are drawn in validation.
         test_out_dir: Folder for the pictures of a test (``tools/test.py --show-dir``).
 
     Raises:
@@ -53,7 +55,7 @@ class MapVisualizationHook(Hook):
     interval: int = 1
     num_val_samples: int = 4
     test_out_dir: str | None = None
-    _seen: int = field(default=0, init=False)
+    _num_samples: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:
         if self.interval < 1:
@@ -62,7 +64,14 @@ class MapVisualizationHook(Hook):
     def after_val_iter(
         self, runner: Runner, batch_idx: int, data_batch: Any = None, outputs: Any = None
     ) -> None:
-        """Draw the first sample of a few evenly spaced batches to the backends."""
+        """Draw the first sample of a few evenly spaced batches to the backends.
+
+        Args:
+            runner: Runner of the validation.
+            batch_idx: Index of the batch.
+            data_batch: Batch of the data loader.
+            outputs: Samples with predictions.
+        """
         if not self.draw or not outputs or runner.rank != 0:
             return
         stride = max(len(runner.val_dataloader) // max(self.num_val_samples, 1), 1)
@@ -73,24 +82,36 @@ class MapVisualizationHook(Hook):
         _visualizer(runner).add_datasample(name, None, outputs[0], step=runner.iter, points=points)
 
     def before_test_epoch(self, runner: Runner) -> None:
-        """Start counting anew."""
-        self._seen = 0
+        """Reset the number of samples."""
+        self._num_samples = 0
 
     def after_test_iter(
         self, runner: Runner, batch_idx: int, data_batch: Any = None, outputs: Any = None
     ) -> None:
-        """Write the pictures of a batch to ``test_out_dir``."""
+        """Write the pictures of a batch to ``test_out_dir``.
+
+        Args:
+            runner: Runner of the test.
+            batch_idx: Index of the batch.
+            data_batch: Batch of the data loader.
+            outputs: Samples with predictions.
+        """
         if not self.draw or self.test_out_dir is None:
             return
         for index, sample in enumerate(outputs or ()):
-            if self._seen % self.interval == 0:
+            if self._num_samples % self.interval == 0:
                 points = _points(data_batch, index)
                 figure = _visualizer(runner).draw_sample(sample, points=points)
                 save_figure(figure, Path(self.test_out_dir) / sample_name(sample.metainfo, ".jpg"))
-            self._seen += 1
+            self._num_samples += 1
 
     def after_test_epoch(self, runner: Runner, metrics: dict[str, float] | None = None) -> None:
-        """Say where the pictures are."""
-        if self._seen:
-            count = -(-self._seen // self.interval)
+        """Log the number of pictures and their folder.
+
+        Args:
+            runner: Runner of the test.
+            metrics: Metrics of the test.
+        """
+        if self._num_samples:
+            count = -(-self._num_samples // self.interval)
             runner.logger.info(f"{count} pictures of predictions are in {self.test_out_dir}.")

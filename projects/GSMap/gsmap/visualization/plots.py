@@ -1,4 +1,4 @@
-"""Plots: panels in one style, precision over recall of a result."""
+"""Plots of results, of uncertainty and of robustness, in one style."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -13,12 +13,20 @@ from gsmap.evaluation.core.average_precision import precision_recall, reliabilit
 from gsmap.evaluation.core.report import MetricReport
 from gsmap.visualization.style import MapStyle
 
-_LINE: dict[str, Any] = {"linewidth": 1.3, "markersize": 3}
-WIDTH_IN = 7.5  # so that text of 7.5 points stays legible where a plot is shown 800 px wide
+WIDTH_IN = 7.5
+"""Width of figures in inches: text of 7.5 points is legible in a plot 800 px wide."""
 
 
 def panel_grid(rows: int, columns: int) -> tuple[Figure, np.ndarray]:
-    """Return a figure and its panels. (rows, columns)"""
+    """Create a figure with a grid of panels.
+
+    Args:
+        rows: Number of rows.
+        columns: Number of columns.
+
+    Returns:
+        Figure and its axes. (rows, columns)
+    """
     height_in = rows * min(2.8, 0.3 + WIDTH_IN / columns)
     figure = Figure(figsize=(WIDTH_IN, height_in), dpi=200, layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False)
@@ -32,15 +40,15 @@ def finish_panel(
     colour: str = "black",
     legend: Mapping[str, Any] | None = None,
 ) -> None:
-    """Set what all plots share.
+    """Set the title, the labels and the style of a panel.
 
     Args:
-        ax: The finished plot.
-        title: Its title, at the left.
-        x_label: What is along x, with its unit.
-        y_label: What is along y, with its unit.
+        ax: Axes with all data.
+        title: Title, at the left.
+        x_label: Quantity along x, with its unit.
+        y_label: Quantity along y, with its unit.
         colour: Colour of the title.
-        legend: Options of its legend, such as where it stands.
+        legend: Options of the legend, such as its location.
     """
     ax.set_title(title, fontsize=9, loc="left", color=colour)
     ax.set_xlabel(x_label, fontsize=8)
@@ -51,89 +59,142 @@ def finish_panel(
     ax.spines[["top", "right"]].set_visible(False)
     if ax.get_legend_handles_labels()[0]:
         ax.legend(
-            **{"fontsize": 7.5, "frameon": False, "handlelength": 1.4, "borderaxespad": 0.2},
-            **(legend or {}),
+            fontsize=7.5, frameon=False, handlelength=1.4, borderaxespad=0.2, **(legend or {})
         )
 
 
-def finish_shares(ax: Axes, *options: Any) -> None:
-    """Finish a panel whose axes both run from 0 to 1, with the options of ``finish_panel``."""
+def finish_shares(ax: Axes, title: str, x_label: str, y_label: str, colour: str = "black") -> None:
+    """Set the title, the labels and the style of a panel whose axes run from 0 to 1.
+
+    Args:
+        ax: Axes with all data.
+        title: Title, at the left.
+        x_label: Quantity along x.
+        y_label: Quantity along y.
+        colour: Colour of the title.
+    """
     ax.set(xlim=(0, 1), ylim=(0, 1.02), xticks=(0, 0.5, 1), yticks=(0, 0.5, 1))
-    finish_panel(ax, *options)
+    finish_panel(ax, title, x_label=x_label, y_label=y_label, colour=colour)
 
 
 def plot_result(reports: Sequence[MetricReport]) -> Figure:
-    """Draw a row per metric of a result: precision over recall of each class, and the calibration.
+    """Plot precision over recall of each class and the calibration, in a row per metric.
 
-    Lines have the colours of their classes, those of stricter thresholds paler.
+    Lines have the colours of their classes, paler for stricter thresholds.
+
+    Args:
+        reports: Reports of one result, one per metric.
+
+    Returns:
+        Figure.
     """
     style = MapStyle(tuple(reports[0].detections))
     figure, axes = panel_grid(len(reports), len(style.classes) + 1)
     for row, report in zip(axes, reports, strict=True):
+        calibration_panel = row[-1]
+        # The last threshold is the loosest distance, but the strictest overlap.
         loosest = -1 if report.by_distance else 0
-        row[-1].plot([0, 1], [0, 1], color=style.grid, linewidth=1)
-        for label, (name, found) in enumerate(report.detections.items()):
-            count = len(found.thresholds)
-            for i, (threshold, hits) in enumerate(zip(found.thresholds, found.hits.T, strict=True)):
+        calibration_panel.plot([0, 1], [0, 1], color=style.grid, linewidth=1)
+        for label, (name, detections) in enumerate(report.detections.items()):
+            panel = row[label]
+            colour = style.colour(label)
+            num_thresholds = len(detections.thresholds)
+            for index, threshold in enumerate(detections.thresholds):
+                rank = index + 1 if report.by_distance else num_thresholds - index
                 ap = 100 * report.metrics[f"{report.name}/{name}/AP@{threshold}"]
-                opacity = 0.3 + 0.7 * (i + 1 if loosest else count - i) / count
-                curve = precision_recall(hits, found.num_gts)
-                line = {"color": style.colour(label), "alpha": opacity, "linewidth": 1.3}
-                row[label].plot(*curve, label=f"{threshold:g}: {ap:.1f}", **line)
-            y_label = "" if label else f"{report.name}: precision"
-            finish_shares(row[label], style.title(label), "recall", y_label, style.colour(label))
-            score, share, _ = reliability(found.scores, found.hits[:, loosest])
-            row[-1].plot(score, share, "o-", markersize=3, color=style.colour(label))
-        finish_shares(row[-1], "calibration", "score", "share of hits")
+                recall, precision = precision_recall(detections.hits[:, index], detections.num_gts)
+                panel.plot(
+                    recall,
+                    precision,
+                    label=f"{threshold:g}: {ap:.1f}",
+                    color=colour,
+                    alpha=0.3 + 0.7 * rank / num_thresholds,
+                    linewidth=1.3,
+                )
+            finish_shares(
+                panel,
+                style.title(label),
+                x_label="recall",
+                y_label="" if label else f"{report.name}: precision",
+                colour=colour,
+            )
+            score, share, _ = reliability(detections.scores, detections.hits[:, loosest])
+            calibration_panel.plot(score, share, "o-", markersize=3, color=colour)
+        finish_shares(calibration_panel, "calibration", x_label="score", y_label="share of hits")
     return figure
 
 
 def plot_uncertainty(vertices: Vertices, classes: Sequence[str], law: str = "normal") -> Figure:
-    """Draw a row for errors along and across: coverage of intervals, and sparsification.
+    """Plot coverage of intervals and sparsification, in a row each for errors along and across.
 
-    Sparsification shows the mean error in metres of what is left when the vertices of the largest
-    sigma are taken away, and below it, pale, of the largest errors.
+    Sparsification is the mean error of the remaining vertices when those with the largest sigma
+    are removed. The pale curve below it is the optimum, by the largest errors.
 
     Args:
         vertices: Matched vertices.
-        classes: Names of the classes.
-        law: What the errors are distributed by, ``normal`` or ``laplace``.
+        classes: Class names in label order.
+        law: Distribution of the errors, ``normal`` or ``laplace``.
+
+    Returns:
+        Figure.
     """
     style = MapStyle(tuple(classes))
     figure, axes = panel_grid(len(AXES), 2)
     for axis, (name, (left, right)) in enumerate(zip(AXES, axes, strict=True)):
         left.plot([0, 1], [0, 1], color=style.grid, linewidth=1)
         for label, title in enumerate(classes):
-            own = vertices.of(vertices.labels == label)
-            if not len(own.labels):
+            of_class = vertices.of(vertices.labels == label)
+            if not len(of_class.labels):
                 continue
-            errors, sigmas = own.errors[:, axis], own.sigmas[:, axis]
-            line = {"color": style.colour(label), "linewidth": 1.3}
-            left.plot(LEVELS, coverage(errors, sigmas, law), label=title, **line)
-            taken = 1 - np.arange(1, len(errors) + 1) / len(errors)
-            right.plot(taken, sparsification(errors, errors), alpha=0.3, **line)
-            right.plot(taken, sparsification(errors, sigmas), **line)
-        finish_shares(left, f"reliability {name}, {law} law", "interval", "share of errors")
+            errors = of_class.errors[:, axis]
+            sigmas = of_class.sigmas[:, axis]
+            colour = style.colour(label)
+            covered = coverage(errors, sigmas, law)
+            left.plot(LEVELS, covered, label=title, color=colour, linewidth=1.3)
+            removed = 1 - np.arange(1, len(errors) + 1) / len(errors)
+            optimum = sparsification(errors, errors)
+            right.plot(removed, optimum, alpha=0.3, color=colour, linewidth=1.3)
+            by_sigma = sparsification(errors, sigmas)
+            right.plot(removed, by_sigma, color=colour, linewidth=1.3)
+        finish_shares(
+            left, f"reliability {name}, {law} law", x_label="interval", y_label="share of errors"
+        )
         right.set(xlim=(0, 1), ylim=(0, None))
-        finish_panel(right, f"sparsification {name}", "share taken away", "mean error (m)")
+        finish_panel(
+            right,
+            f"sparsification {name}",
+            x_label="share taken away",
+            y_label="mean error (m)",
+        )
     return figure
 
 
 def plot_severities(
     values: Mapping[str, Sequence[float]], clean: float, severities: Sequence[int]
 ) -> Figure:
-    """Draw the AP over the severity of each corruption.
+    """Plot the AP over the severity of each corruption.
 
     Args:
-        values: APs of each corruption, in percent.
-        clean: AP without any, in percent.
-        severities: Of the columns of ``values``.
+        values: APs of each corruption, in percent. each (S,)
+        clean: AP without corruption, in percent.
+        severities: Severity of each column of ``values``. (S,)
+
+    Returns:
+        Figure.
     """
     figure, axes = panel_grid(1, 1)
     ax = axes[0, 0]
-    for number, (kind, aps) in enumerate(values.items()):
-        ax.plot([0, *severities], [clean, *aps], "o-", color=f"C{number}", label=kind, **_LINE)
+    for index, (name, aps) in enumerate(values.items()):
+        ax.plot(
+            [0, *severities],
+            [clean, *aps],
+            "o-",
+            color=f"C{index}",
+            label=name,
+            linewidth=1.3,
+            markersize=3,
+        )
     ax.set_ylim(0, None)
     legend = {"loc": "center left", "bbox_to_anchor": (1, 0.5)}
-    finish_panel(ax, "corruptions", "severity", "AP_chamfer (%)", legend=legend)
+    finish_panel(ax, "corruptions", x_label="severity", y_label="AP_chamfer (%)", legend=legend)
     return figure

@@ -1,4 +1,4 @@
-"""Colours and widths that all pictures share."""
+"""Colours and widths of map elements in all pictures."""
 
 from collections.abc import Iterable, Sequence
 from colorsys import hsv_to_rgb
@@ -19,11 +19,11 @@ CLASS_TITLES = {
     "boundary": "road boundary",
     "centerline": "centre line",
 }
-# Where predictions are coloured by what they match instead of by class.
+# Colours of predictions (hit, false) and ground truth (found, missed) by their matches.
 MATCH_COLOURS = {"hit": "#00A39A", "false": "#FF3B30", "found": "#8E8E93", "missed": "#AF52DE"}
 TRUTH_OPACITY = {"found": 0.4, "missed": 0.75}
-FALSE_DASHES = (0, (3, 1.5))  # as matplotlib has them
-# Of runs and methods in plots; none is a class's or a match's colour.
+FALSE_DASHES = (0, (3, 1.5))  # a line style of matplotlib
+# Colours of runs and methods in plots, distinct from the colours of classes and matches.
 RUN_COLOURS = (
     "#34495E",
     "#E0457B",
@@ -34,34 +34,45 @@ RUN_COLOURS = (
     "#7F1D1D",
     "#000000",
 )
-_HUE_STEP = (5**0.5 - 1) / 2  # golden section: no two of a dozen successive hues are alike
+_HUE_STEP = (5**0.5 - 1) / 2  # golden section, so that a dozen successive hues are distinct
+_TRACK_VALUES = (0.85, 0.6)  # brightness in HSV, by turns for six tracks each
 
 
 def track_colours(tracks: Iterable[int]) -> list[str]:
-    """Return a colour for each track, always the same for a number; grey for -1, no track. (N,)"""
-    values = [0.85, 0.6]
-    return [
-        to_hex(hsv_to_rgb(track * _HUE_STEP % 1, 0.85, values[track // 6 % 2]))
-        if track >= 0
-        else MATCH_COLOURS["found"]
-        for track in tracks
-    ]
+    """Assign a colour to each track, which depends on its number alone.
+
+    Args:
+        tracks: Numbers of the tracks, -1 for elements without a track. (N,)
+
+    Returns:
+        Colours ``#rrggbb``, grey for -1. (N,)
+    """
+    colours = []
+    for track in tracks:
+        if track < 0:
+            colours.append(MATCH_COLOURS["found"])
+            continue
+        hue = track * _HUE_STEP % 1
+        value = _TRACK_VALUES[track // 6 % 2]
+        colours.append(to_hex(hsv_to_rgb(hue, 0.85, value)))
+    return colours
 
 
 @dataclass(frozen=True)
 class MapStyle:
-    """How map elements are drawn.
+    """Colours and widths of map elements.
 
     Args:
         classes: Class names in label order.
         bev_line_pt: Line width in bird's-eye view, in points.
-        camera_line_pt: Line width over an image 10 m away, in points; nearer is thicker.
-        halo: Colour of the edge that keeps lines legible over an image.
+        camera_line_pt: Line width over an image 10 m away, in points. Nearer lines are
+            thicker.
+        halo: Colour of the edges of lines over an image, which keep them legible.
         ink: Colour of titles.
         muted: Colour of labels and notes.
         ground: Background of bird's-eye views.
-        grid: Colour of their metric grid.
-        spare: Colours for classes that ``CLASS_COLOURS`` does not name, in the order of labels.
+        grid: Colour of the metric grid of bird's-eye views.
+        spare: Colours of classes without an entry in ``CLASS_COLOURS``, by label.
     """
 
     classes: Sequence[str] = ("divider", "ped_crossing", "boundary")
@@ -75,18 +86,18 @@ class MapStyle:
     spare: Sequence[str] = ("#AF52DE", "#FF3B30", "#5AC8FA", "#A2845E", "#FF2D92", "#34495E")
 
     def colour(self, label: int) -> str:
-        """Return the colour of a class: the same for a class name in every data set."""
+        """Colour of a class. Named classes have one colour in all data sets."""
         return CLASS_COLOURS.get(self.classes[label], self.spare[label % len(self.spare)])
 
     def colours(self, labels: Iterable[int]) -> list[str]:
-        """Return the colours of elements by their class index. (N,)"""
+        """Colours of elements by their class index. (N,)"""
         return [self.colour(label) for label in labels]
 
     def title(self, label: int) -> str:
-        """Return the class name as a reader would write it."""
+        """Class name in plain words."""
         name = self.classes[label]
         return CLASS_TITLES.get(name, name.replace("_", " "))
 
     def is_closed(self, label: int) -> bool:
-        """Whether elements of the class enclose an area, which is filled faintly."""
+        """Whether elements of a class enclose an area, which is filled with a faint colour."""
         return self.classes[label] in AREA_CLASSES
