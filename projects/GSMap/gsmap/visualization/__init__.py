@@ -1,6 +1,6 @@
 """Pictures of maps over cameras and in bird's-eye view.
 
-``MapVisualizer`` and ``MapVisualizationHook`` need OpenMMLab; the others not even torch.
+``MapVisualizer`` and ``MapVisualizationHook`` need OpenMMLab; the other names need no torch.
 """
 
 from gsmap.utils.lazy import lazy_names

@@ -58,6 +58,12 @@ class CameraView:
         """Width and height of the image in pixels."""
         return self.image.shape[1], self.image.shape[0]
 
+    @property
+    def aspect(self) -> float:
+        """Width over height of the image."""
+        width, height = self.size_px
+        return width / height
+
 
 Camera = TypeVar("Camera", CameraView, CameraRecord)
 
@@ -145,12 +151,20 @@ def _draw_polylines(
     ax: Axes, elements: MapElements, camera: CameraView, view: FrameView, style: MapStyle
 ) -> None:
     """Draw polylines on a dark edge, thinner with distance within legible limits."""
-    dense = [subdivide(view.lift(line), _STEP_M) for line in elements.polylines]
-    starts = np.concatenate([line[:-1] for line in dense])
-    ends = np.concatenate([line[1:] for line in dense])
-    segment_labels = np.repeat(elements.labels, [len(line) - 1 for line in dense])
+    starts = []
+    ends = []
+    num_segments = []
+    for line in elements.polylines:
+        dense = subdivide(view.lift(line), _STEP_M)
+        starts.append(dense[:-1])
+        ends.append(dense[1:])
+        num_segments.append(len(dense) - 1)
+    segment_labels = np.repeat(elements.labels, num_segments)
     segments, depth_m, index = project_segments(
-        starts, ends, img_from_frame=camera.img_from_frame, size_px=camera.size_px
+        np.concatenate(starts),
+        np.concatenate(ends),
+        img_from_frame=camera.img_from_frame,
+        size_px=camera.size_px,
     )
     box = ax.get_window_extent()
     scale = np.sqrt(box.width * box.height) / ax.figure.dpi / _NOMINAL_SIZE_IN

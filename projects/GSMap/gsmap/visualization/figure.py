@@ -226,7 +226,7 @@ def compose_figure(
     rows = arrange_cameras(cameras, view)
     camera_aspects = []
     for row in rows:
-        camera_aspects.append([camera.size_px[0] / camera.size_px[1] for camera in row])
+        camera_aspects.append([camera.aspect for camera in row])
     left, right, low, high = display_extent(grid, view)
     panel_aspect = (right - left) / (high - low)
     camera_boxes, panel_boxes, bottom = _layout(
@@ -261,13 +261,14 @@ def figure_to_rgb(figure: Figure) -> np.ndarray:
 
 
 def sample_title(metainfo: Mapping[str, Any]) -> str:
-    """Format the title of a sample from the known ones of its scene, time and token.
+    """Format the title of a sample: its scene, time and token.
 
     Args:
         metainfo: Metadata with ``scene``, ``seconds`` since the start of the scene, and ``token``.
+            Missing entries are left out.
 
     Returns:
-        Title, empty if nothing is known.
+        Title, which may be empty.
     """
     seconds = metainfo.get("seconds")
     parts = [str(metainfo.get("scene") or "")]

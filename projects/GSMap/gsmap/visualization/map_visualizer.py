@@ -1,4 +1,4 @@
-"""MMEngine's visualizer for vectorized maps."""
+"""MMEngine visualizer of vectorized maps."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -25,27 +25,38 @@ from gsmap.visualization.figure import compose_figure, figure_to_rgb, sample_tit
 from gsmap.visualization.style import MapStyle
 
 PANELS = ("ground_truth", "prediction", "matches", "gaussians", "rasters")
-RASTER_SIZE = (400, 200)  # rows and columns of rendered masks
+"""Names of the bird's-eye views, in their order in a picture."""
+RASTER_SIZE = (400, 200)
+"""Rows and columns of rendered masks."""
 
 
 def images_from_inputs(images: torch.Tensor) -> list[np.ndarray]:
-    """Turn a pipeline's images back into pictures.
+    """Convert images of a pipeline to pictures.
 
-    BGR, 0 to 255, before normalisation (V, 3, H, W) -> RGB, V x (H, W, 3) uint8
+    Args:
+        images: BGR, 0 to 255, before normalisation. (V, 3, H, W)
+
+    Returns:
+        RGB. V x (H, W, 3) uint8
 
     Raises:
         ValueError: If the shape is wrong.
     """
     if images.ndim != 4 or images.shape[1] != 3:
         raise InputError(f"images must have shape (V, 3, H, W), got {tuple(images.shape)}.")
-    pixels = images.flip(1).permute(0, 2, 3, 1).float().round().clamp(0, 255).to(torch.uint8)
+    rgb = images.flip(1).permute(0, 2, 3, 1)  # (V, H, W, 3)
+    pixels = rgb.float().round().clamp(0, 255).to(torch.uint8)
     return list(pixels.cpu().numpy())
 
 
 def ground_truth_elements(data_sample: Any) -> MapElements | None:
-    """Read a ``Det3DDataSample``'s ground truth, at full resolution, or else its training targets.
+    """Read the ground truth of a sample at full resolution, or else its training targets.
 
-    It is None if neither ``eval_ann_info`` nor ``gt_instances_3d`` is known.
+    Args:
+        data_sample: A ``Det3DDataSample``.
+
+    Returns:
+        Elements, or None if the sample has neither ``eval_ann_info`` nor ``gt_instances_3d``.
     """
     info = data_sample.metainfo.get("eval_ann_info")
     if info is not None:
@@ -55,36 +66,41 @@ def ground_truth_elements(data_sample: Any) -> MapElements | None:
 
 
 def predicted_elements(data_sample: Any) -> MapElements | None:
-    """Read a ``Det3DDataSample``'s predictions, the most confident last, to be drawn on top.
+    """Read the predictions of a sample.
 
-    It is None if there are no ``pred_instances_3d``.
+    Args:
+        data_sample: A ``Det3DDataSample``.
+
+    Returns:
+        Elements by rising score, so that the most confident one is drawn last, or None if the
+        sample has no ``pred_instances_3d``.
     """
     instances = getattr(data_sample, "pred_instances_3d", ())
     if "pts" not in instances:
         return None
-    found = elements_of_predictions(instances)
-    return found.select(np.argsort(found.confidence, kind="stable"))
+    elements = elements_of_predictions(instances)
+    return elements.select(np.argsort(elements.confidence, kind="stable"))
 
 
 @VISUALIZERS.register_module()
 class MapVisualizer(Visualizer):
     """Draws samples: the map over the cameras, and bird's-eye views of truth and prediction.
 
-    Extent, classes and frame come from the data set's ``metainfo`` (``dataset_meta``, which the
-    runner sets). The prediction is drawn over the cameras, or else the ground truth.
+    Extent, classes and frame come from the ``metainfo`` of the data set (``dataset_meta``, which
+    the runner sets). The cameras show the prediction, or else the ground truth.
 
     Args:
-        ground_z_m: Level ground at this z of the frame. By default the ground follows the sensor's
-            mounting (``lidar2ego`` of the sample), or else the height that the annotation file
-            has, or the frame's usual one.
-        score_thr: Smallest score of a drawn prediction.
-        panels: Which bird's-eye views to draw, of ``PANELS``; those that a sample has no data
-            for are left out.
+        name: Name of the visualizer in MMEngine.
+        ground_z_m: Height of the level ground in the annotation frame, in metres. By default, the
+            ground follows from the mounting of the sensor (``lidar2ego`` of the sample), or else
+            from the height in the annotation file, or from the usual height of the frame.
+        score_thr: Smallest score of a drawn prediction, in [0, 1].
+        panels: Bird's-eye views to draw, of ``PANELS``. Views without data are left out.
         match_m: Largest Chamfer distance of a hit in ``matches``, in metres, as in AP_chamfer.
-        show_order: Whether to mark the start and direction of elements.
-        width_px: Width of the picture.
+        show_order: Whether to mark the start and the direction of elements.
+        width_px: Width of the picture in pixels.
         style: Other options of ``MapStyle``, by name.
-        **kwargs: Options of mmengine's ``Visualizer``: ``vis_backends``, ``save_dir``.
+        **kwargs: Options of MMEngine's ``Visualizer``: ``vis_backends``, ``save_dir``.
 
     Raises:
         ValueError: If a panel is not known.
@@ -118,24 +134,34 @@ class MapVisualizer(Visualizer):
     def grid(self) -> BEVGrid:
         """Extent of the map and size of its rendered masks."""
         meta = self.dataset_meta or {}
-        x_range, y_range = meta.get("x_range", (-15.0, 15.0)), meta.get("y_range", (-30.0, 30.0))
-        return BEVGrid(x_range, y_range, *RASTER_SIZE)
+        rows, columns = RASTER_SIZE
+        return BEVGrid(
+            meta.get("x_range", (-15.0, 15.0)), meta.get("y_range", (-30.0, 30.0)), rows, columns
+        )
 
     @property
     def style(self) -> MapStyle:
-        """Colours and widths, with the data set's classes."""
+        """Colours and widths, with the classes of the data set."""
         classes = (self.dataset_meta or {}).get("classes", MapStyle.classes)
         return MapStyle(**{"classes": tuple(classes), **self.style_options})
 
     def frame_view(self, metainfo: dict) -> FrameView:
-        """Return orientation and ground plane for a sample with this meta data."""
-        frame = (self.dataset_meta or {}).get("frame", "lidar")
+        """Create the orientation and the ground plane of a sample.
+
+        Args:
+            metainfo: Metadata of the sample, with ``lidar2ego`` if it is known.
+
+        Raises:
+            ValueError: If the annotation frame is not known.
+        """
+        meta = self.dataset_meta or {}
+        frame = meta.get("frame", "lidar")
         if frame not in FRAME_VIEWS:
             raise InputError(
                 f"No view is known for frame {frame!r}, only for {sorted(FRAME_VIEWS)}; "
                 "add one to gsmap.structures.frames.FRAME_VIEWS."
             )
-        view = frame_view(frame, (self.dataset_meta or {}).get("ground_z_m"))
+        view = frame_view(frame, meta.get("ground_z_m"))
         if self.ground_z_m is not None:
             return replace(view, ground=(0.0, 0.0, self.ground_z_m))
         return view.with_mounting(metainfo.get("lidar2ego"))
@@ -143,10 +169,17 @@ class MapVisualizer(Visualizer):
     def cameras(
         self, metainfo: dict, images: Sequence[np.ndarray] | None = None
     ) -> list[CameraView]:
-        """Pair a sample's images with their projections; a camera whose path is None is left out.
+        """Pair the images of a sample with their projections.
 
-        ``images`` are RGB in the geometry that the model sees (after augmentation); None reads the
-        original files, if there are any, and takes the augmentation out of the projections.
+        Args:
+            metainfo: Metadata of the sample: ``lidar2img``, ``img_path``, ``cam_names`` and
+                ``img_aug_matrix``.
+            images: RGB images in the geometry of the model input (after augmentation). By default,
+                the original files are read, and the augmentation is removed from the projections.
+                V x (h, w, 3) uint8
+
+        Returns:
+            Cameras without those whose path is None; none if there are neither images nor paths.
 
         Raises:
             ValueError: If the numbers of images and projections disagree, or a file is missing or
@@ -157,58 +190,88 @@ class MapVisualizer(Visualizer):
             return []
         projections = np.asarray(metainfo["lidar2img"], dtype=np.float64)  # (V, 4, 4)
         names = metainfo.get("cam_names") or [f"camera {i}" for i in range(len(projections))]
-        found: list[Any] = list(images or ())
-        if images is None:
+        pictures: list[np.ndarray | None] = []
+        if images is not None:
+            pictures += images
+        else:
             if metainfo.get("img_aug_matrix") is not None:
-                unscaled = np.linalg.inv(np.asarray(metainfo["img_aug_matrix"], np.float64))
-                projections = unscaled @ projections
+                augmentation = np.asarray(metainfo["img_aug_matrix"], np.float64)
+                projections = np.linalg.inv(augmentation) @ projections
             where = f"sample {metainfo.get('token')!r}"
-            found = [None if p is None else read_image(p, where)[..., ::-1] for p in paths or ()]
-        if len(found) != len(projections):
+            for path in paths or ():
+                pictures.append(None if path is None else read_image(path, where)[..., ::-1])
+        if len(pictures) != len(projections):
             raise InputError(
-                f"A sample has {len(found)} images, but {len(projections)} projections."
+                f"A sample has {len(pictures)} images, but {len(projections)} projections."
             )
-        triples = zip(names, found, projections, strict=True)
-        return [CameraView(*triple) for triple in triples if triple[1] is not None]
+        views = []
+        for name, picture, projection in zip(names, pictures, projections, strict=True):
+            if picture is not None:
+                views.append(CameraView(name, picture, projection))
+        return views
 
     def _bev_panels(
         self,
         truth: MapElements | None,
-        found: MapElements | None,
+        predictions: MapElements | None,
         points: np.ndarray | None,
         note: str,
     ) -> list[BEVPanel]:
-        """Choose the bird's-eye views that the sample has data for."""
+        """Create the chosen bird's-eye views that the sample has data for.
+
+        Args:
+            truth: Ground truth, if it is known.
+            predictions: Predictions, if there are any.
+            points: LiDAR points in metres, drawn as faint dots. (n, >= 2)
+            note: Text of panels without predictions.
+        """
         panels = {}
-        both: dict[str, Any] = {"order": self.show_order, "points": points}
         if truth is not None:
-            panels["ground_truth"] = BEVPanel("Ground truth", truth, **both)
-        if found is not None:
-            title = "Prediction"
-            panels["prediction"] = BEVPanel(title, found, note, vertices=True, scores=True, **both)
-        if found is not None and truth is not None and "matches" in self.panels:
-            rules = ChamferConfig(tuple(self.style.classes), (self.match_m,))
-            matched, hits = match_chamfer(found, truth, rules), np.full(len(found), -1)
-            hits[matched.pred_index] = matched.matched_gt[:, 0]
-            title = f"Hits within {self.match_m:g} m"
-            panels["matches"] = BEVPanel(title, found, note, truth=truth, hits=hits)
-        if found is not None and found.has_gaussians:
-            title = "Gaussians (1\N{GREEK SMALL LETTER SIGMA})"
-            panels["gaussians"] = BEVPanel(title, found, note, lines=False, gaussians=True)
-            if "rasters" in self.panels:
-                masks = self._render_masks(found) if len(found) else None
-                title = "Rendered masks"
-                panels["rasters"] = BEVPanel(title, found, note, lines=False, rasters=masks)
+            panels["ground_truth"] = BEVPanel(
+                "Ground truth", truth, order=self.show_order, points=points
+            )
+        if predictions is not None:
+            panels["prediction"] = BEVPanel(
+                "Prediction",
+                predictions,
+                note=note,
+                vertices=True,
+                order=self.show_order,
+                scores=True,
+                points=points,
+            )
+            if truth is not None and "matches" in self.panels:
+                hits = self._find_hits(predictions, truth)
+                title = f"Hits within {self.match_m:g} m"
+                panels["matches"] = BEVPanel(title, predictions, note=note, truth=truth, hits=hits)
+            if predictions.has_gaussians:
+                title = "Gaussians (1\N{GREEK SMALL LETTER SIGMA})"
+                panels["gaussians"] = BEVPanel(
+                    title, predictions, note=note, lines=False, gaussians=True
+                )
+                if "rasters" in self.panels:
+                    masks = self._render_masks(predictions) if len(predictions) else None
+                    panels["rasters"] = BEVPanel(
+                        "Rendered masks", predictions, note=note, lines=False, rasters=masks
+                    )
         return [panel for name, panel in panels.items() if name in self.panels]
 
+    def _find_hits(self, predictions: MapElements, truth: MapElements) -> np.ndarray:
+        """Index of the ground truth that each prediction hits, or -1. (N,)"""
+        config = ChamferConfig(tuple(self.style.classes), (self.match_m,))
+        matches = match_chamfer(predictions, truth, config)
+        hits = np.full(len(predictions), -1)
+        hits[matches.pred_index] = matches.matched_gt[:, 0]
+        return hits
+
     def _render_masks(self, elements: MapElements) -> np.ndarray:
-        """Render every element's Gaussians to occupancy in [0, 1] (GSMap Eq. 6). (N, H, W)"""
+        """Render the Gaussians of each element to occupancy in [0, 1] (GSMap Eq. 6). (N, H, W)"""
         means, scales, rotations = (
             torch.as_tensor(values, dtype=torch.float32).unflatten(0, (len(elements), -1))
             for values in (elements.points[:, :2], elements.scales, elements.rotations)
         )
         with torch.no_grad():
-            return render_gaussians(means, scales, rotations, self.grid).numpy()
+            return render_gaussians(means, scales, rotations, grid=self.grid).numpy()
 
     def draw_sample(
         self,
@@ -220,10 +283,15 @@ class MapVisualizer(Visualizer):
         """Compose the picture of one sample.
 
         Args:
-            data_sample: A ``Det3DDataSample`` as ``docs/architecture.md`` describes it.
-            images: RGB images after augmentation; None reads the original files. V x (h, w, 3)
-            score_thr: Smallest drawn score instead of the visualizer's own.
-            points: LiDAR points in metres of the frame, drawn as faint dots. (n, >= 2)
+            data_sample: A ``Det3DDataSample`` as described in ``docs/architecture.md``.
+            images: RGB images after augmentation; by default the original files are read.
+                V x (h, w, 3) uint8
+            score_thr: Smallest score of a drawn prediction, in [0, 1]; by default ``score_thr`` of
+                the visualizer.
+            points: LiDAR points in metres in the annotation frame, drawn as faint dots. (n, >= 2)
+
+        Returns:
+            Figure, not rendered yet.
 
         Raises:
             ValueError: If the sample has neither images nor a map.
@@ -231,17 +299,19 @@ class MapVisualizer(Visualizer):
         meta = data_sample.metainfo
         truth = ground_truth_elements(data_sample)
         threshold = self.score_thr if score_thr is None else score_thr
-        found, note = predicted_elements(data_sample), "no elements"
-        if found:
-            note = f"no score reaches {threshold:g}\n(highest {found.confidence.max():.2g})"
-            found = found.select(found.confidence >= threshold)
+        predictions = predicted_elements(data_sample)
+        note = "no elements"
+        if predictions:
+            highest = predictions.confidence.max()
+            note = f"no score reaches {threshold:g}\n(highest {highest:.2g})"
+            predictions = predictions.select(predictions.confidence >= threshold)
         return compose_figure(
             self.cameras(meta, images),
-            self._bev_panels(truth, found, points, note),
-            self.grid,
-            self.frame_view(meta),
-            self.style,
-            camera_elements=truth if found is None else found,
+            self._bev_panels(truth, predictions=predictions, points=points, note=note),
+            grid=self.grid,
+            view=self.frame_view(meta),
+            style=self.style,
+            camera_elements=truth if predictions is None else predictions,
             title=sample_title(meta),
             width_px=self.width_px,
         )
@@ -255,9 +325,14 @@ class MapVisualizer(Visualizer):
         step: int = 0,
         points: np.ndarray | None = None,
     ) -> None:
-        """Draw one sample, as `draw_sample` does, to the backends (TensorBoard, ``vis_data``).
+        """Draw one sample to the backends (TensorBoard, ``vis_data``).
 
-        ``name`` is its tag there, ``step`` the training step.
+        Args:
+            name: Tag of the picture in the backends.
+            image: RGB images after augmentation, as in `draw_sample`. V x (h, w, 3) uint8
+            data_sample: A ``Det3DDataSample`` as described in ``docs/architecture.md``.
+            step: Training step.
+            points: LiDAR points in metres in the annotation frame, drawn as faint dots. (n, >= 2)
         """
         figure = self.draw_sample(data_sample, image, points=points)
         self.add_image(name, figure_to_rgb(figure), step)

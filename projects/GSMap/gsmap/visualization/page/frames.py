@@ -1,7 +1,8 @@
-"""Frames for the page: chosen samples with their map in centimetres, cameras and thumbnails."""
+"""Frames of the report page: choice of samples, maps in centimetres, cameras and thumbnails."""
 
 import base64
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -24,90 +25,118 @@ _JPEG_QUALITY = 70
 def choose_frames(
     tokens: Sequence[str], max_frames: int, results: Sequence[ScoredResult], score_thr: float
 ) -> list[int]:
-    """Choose samples: three quarters evenly, and of the others those with the lowest F1.
+    """Choose samples for the page.
 
-    Of two results, they are those in which F1 differs most.
+    Without results, they are evenly spread. With one result, three quarters are evenly spread and
+    the others have the lowest F1. With two results, the others have the largest difference in F1.
 
     Args:
-        tokens: All samples, in order.
-        max_frames: How many to choose at most.
-        results: None, one or two; without any all samples are chosen evenly.
-        score_thr: Smallest score that F1 counts.
+        tokens: Tokens of all samples, in order.
+        max_frames: Largest number of chosen samples.
+        results: No, one or two results.
+        score_thr: Smallest score of a prediction that counts in F1.
 
     Returns:
-        Indices, ascending.
+        Indices of the samples, ascending.
     """
     if len(tokens) <= max_frames:
         return list(range(len(tokens)))
-    even = max_frames - max_frames // 4 if results else max_frames
-    chosen = set(np.linspace(0, len(tokens) - 1, even).round().astype(int).tolist())
+    num_even = max_frames - max_frames // 4 if results else max_frames
+    even = np.linspace(0, len(tokens) - 1, num_even).round().astype(int)
+    chosen = set(even.tolist())
     if results:
-        f1 = np.array([[result.f1(token, score_thr) for token in tokens] for result in results])
-        order = np.argsort(f1[0] if len(f1) == 1 else -abs(f1[0] - f1[1]), kind="stable")
-        worst = (i for i in order.tolist() if i not in chosen)
-        chosen.update(i for i, _ in zip(worst, range(max_frames - even), strict=False))
+        f1 = []
+        for result in results:
+            f1.append(np.array([result.f1(token, score_thr) for token in tokens]))
+        ranking = f1[0] if len(f1) == 1 else -abs(f1[0] - f1[1])
+        num_chosen = len(chosen) + max_frames - num_even
+        for index in np.argsort(ranking, kind="stable").tolist():
+            if len(chosen) == num_chosen:
+                break
+            chosen.add(index)
     return sorted(chosen)
 
 
 def _centimetres(points: np.ndarray, view: FrameView) -> list[int]:
-    """Return (right, ahead) of each point, one after another, in whole centimetres."""
-    return np.rint(100 * view.display_from_frame(points)).astype(int).ravel().tolist()
+    """Convert points (n, 2) to (right, ahead) in whole centimetres, flattened. -> (2 n,)"""
+    centimetres = np.rint(100 * view.display_from_frame(points)).astype(int)
+    return centimetres.ravel().tolist()
 
 
 def truth_of(sample: MapSample, view: FrameView) -> list[dict[str, Any]]:
-    """Return a sample's ground truth: class ``c`` and points ``p`` in centimetres."""
+    """Convert the ground truth of a sample to plain values.
+
+    Args:
+        sample: Sample of the annotation file.
+        view: Orientation of the annotation frame.
+
+    Returns:
+        Class ``c`` and points ``p`` in centimetres of each element.
+    """
     elements = elements_of_instances(sample.instances or [])
-    return [{"c": label, "p": _centimetres(line, view)} for line, label, _ in elements.rows]
+    entries = []
+    for line, label, _ in elements.rows:
+        entries.append({"c": label, "p": _centimetres(line, view)})
+    return entries
 
 
 def found_of(token: str, result: ScoredResult, view: FrameView) -> list[dict[str, Any]]:
-    """Return a sample's predictions that AP_raster does not drop, in descending order of score.
+    """Convert the predictions of a sample to plain values, by falling score.
+
+    Predictions with scores too small for AP_raster are dropped.
 
     Args:
-        token: The sample.
+        token: Token of the sample.
         result: Predictions and their matches.
-        view: Turns the annotation frame to the display.
+        view: Orientation of the annotation frame.
 
     Returns:
-        Per prediction its class ``c``, score ``s``, points ``p``, the index of the ground truth
-        that it hits within 1 m or -1, and, if it has Gaussians, sigma along both axes in
-        centimetres and the angle in the display in degrees per point, ``g``.
+        For each prediction, its class ``c``, score ``s``, points ``p`` in centimetres and ``hit``,
+        the index of the ground truth that it hits within 1 m, or -1. With Gaussians, also ``g``:
+        for each point, sigma along both axes in centimetres and the angle in the display in
+        degrees.
     """
-    matches, hits = result.matches[token], result.hits(token)
-    kept = matches.scores >= MIN_SCORE
-    if not kept.any():
+    matches = result.matches[token]
+    is_shown = matches.scores >= MIN_SCORE
+    if not is_shown.any():
         return []
-    elements = result.predictions[token].select(matches.pred_index[kept])
-    rows = zip(elements.rows, hits[kept].tolist(), strict=True)
-    found = [
-        {"c": label, "s": round(score, 6), "hit": hit, "p": _centimetres(line, view)}
-        for (line, label, score), hit in rows
-    ]
+    elements = result.predictions[token].select(matches.pred_index[is_shown])
+    hits = result.hits(token)[is_shown].tolist()
+    entries: list[dict[str, Any]] = []
+    for (line, label, score), hit in zip(elements.rows, hits, strict=True):
+        points = _centimetres(line, view)
+        entries.append({"c": label, "s": round(score, 6), "hit": hit, "p": points})
     if elements.scales is not None and elements.rotations is not None:
-        degrees = np.degrees(elements.rotations + view.display_turn_rad)[:, None]
-        values = np.rint(np.hstack([100 * elements.scales, degrees])).astype(int)  # (M, 3)
-        for entry, a, b in zip(found, elements.offsets, elements.offsets[1:], strict=False):
-            entry["g"] = values[a:b].ravel().tolist()
-    return found
+        degrees = np.degrees(elements.rotations + view.display_turn_rad)
+        columns = np.column_stack([100 * elements.scales, degrees])
+        gaussians = np.rint(columns).astype(int)  # (M, 3)
+        for entry, (start, end) in zip(entries, pairwise(elements.offsets), strict=True):
+            entry["g"] = gaussians[start:end].ravel().tolist()
+    return entries
 
 
 def _img_from_display(camera: CameraRecord, view: FrameView) -> np.ndarray:
-    """Return the homography from (right, ahead, 1) on the ground, in metres, to pixels. (3, 3)"""
+    """Homography from (right, ahead, 1) on the ground, in metres, to pixels. (3, 3)"""
     a, b, c = view.ground
-    axes = np.eye(3) if view.forward == "y" else np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    frame_from_display = np.eye(3)
+    if view.forward == "x":
+        frame_from_display = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
     lift = np.array([[1, 0, 0], [0, 1, 0], [a, b, c], [0, 0, 1]])  # (x, y, 1) -> (x, y, z, 1)
-    return camera.img_from_frame[:3] @ lift @ axes
+    return camera.img_from_frame[:3] @ lift @ frame_from_display
 
 
 def thumbnail(path: Path, width_px: int) -> str:
-    """Return an image as a small JPEG in a data URI.
+    """Read an image and encode it as a small JPEG in a data URI.
 
     Args:
-        path: The image file.
-        width_px: Largest width.
+        path: Image file.
+        width_px: Largest width in pixels; wider images are reduced to it.
+
+    Returns:
+        Data URI.
 
     Raises:
-        ValueError: If there is no image, or it is damaged.
+        ValueError: If the image is missing or damaged.
     """
     try:
         image = read_image(str(path), "page")
@@ -118,8 +147,8 @@ def thumbnail(path: Path, width_px: int) -> str:
         ) from error
     height, width = image.shape[:2]
     if width > width_px:
-        size = (width_px, max(round(height * width_px / width), 1))
-        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        height_px = max(round(height * width_px / width), 1)
+        image = cv2.resize(image, (width_px, height_px), interpolation=cv2.INTER_AREA)
     content = base64.b64encode(encode_jpeg(image, _JPEG_QUALITY))
     return f"data:image/jpeg;base64,{content.decode()}"
 
@@ -127,28 +156,35 @@ def thumbnail(path: Path, width_px: int) -> str:
 def cameras_of(
     sample: MapSample, view: FrameView, data_root: Path, width_px: int
 ) -> list[list[dict[str, Any]]]:
-    """Return a sample's cameras in rows, as they stand on the car.
+    """Convert the cameras of a sample to plain values, in rows as on the vehicle.
 
     Args:
-        sample: The sample.
-        view: Its ground and orientation.
-        data_root: Folder that image paths start from.
-        width_px: Largest width of the images, twice that of the camera ahead; 0 leaves them out.
+        sample: Sample of the annotation file.
+        view: Orientation and ground plane of the annotation frame.
+        data_root: Folder that image paths are relative to.
+        width_px: Largest width of the images in pixels, doubled for the camera that looks ahead;
+            0 leaves images out.
+
+    Returns:
+        For each camera, its ``title``, ``size`` in pixels, homography ``matrix`` from metres on
+        the ground in the display to pixels, (9,), and image ``src`` as a data URI.
 
     Raises:
-        ValueError: If an image cannot be read.
+        ValueError: If an image is missing or damaged.
     """
     rows: list[list[dict[str, Any]]] = []
     for row in arrange_cameras(sample.cameras, view):
         entries = []
-        for camera in row:
+        for index, camera in enumerate(row):
             matrix = _img_from_display(camera, view)
-            title, size = camera_title(camera.name), [camera.width, camera.height]
-            entry: dict[str, Any] = {"title": title, "size": size}
-            entry["matrix"] = [float(f"{value:.6g}") for value in matrix.ravel()]
-            ahead = not rows and camera is row[len(row) // 2]
-            largest_px = width_px * (2 if ahead else 1)
-            entry["src"] = thumbnail(data_root / camera.path, largest_px) if width_px else ""
+            looks_ahead = not rows and index == len(row) // 2
+            largest_px = 2 * width_px if looks_ahead else width_px
+            entry = {
+                "title": camera_title(camera.name),
+                "size": [camera.width, camera.height],
+                "matrix": [float(f"{value:.6g}") for value in matrix.ravel()],
+                "src": thumbnail(data_root / camera.path, largest_px) if width_px else "",
+            }
             entries.append(entry)
         rows.append(entries)
     return rows

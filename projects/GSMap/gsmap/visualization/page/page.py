@@ -1,4 +1,4 @@
-"""The report page: everything that it shows as one value, and the HTML file that shows it."""
+"""Report page: its data as plain values, and the HTML file that displays them."""
 
 import base64
 import hashlib
@@ -26,7 +26,7 @@ from gsmap.utils.files import write_text
 from gsmap.utils.words import counted
 from gsmap.visualization.bev_view import display_extent
 from gsmap.visualization.page.frames import cameras_of, choose_frames, found_of, truth_of
-from gsmap.visualization.page.scores import MATCH_M, ScoredResult, score_result, scored_by_distance
+from gsmap.visualization.page.scores import MATCH_M, ScoredResult, score_by_distance, score_result
 from gsmap.visualization.page.tables import (
     Table,
     class_tables,
@@ -39,25 +39,26 @@ from gsmap.visualization.page.tables import (
 from gsmap.visualization.style import MATCH_COLOURS, MapStyle
 
 _GENERATOR = b'<meta name="generator" content="gsmap">'
-_HEAD_BYTES = 4096  # of a page, within which it names its generator
+_HEAD_BYTES = 4096  # of a page, which contain its generator
 
 
 @dataclass(frozen=True)
 class PageOptions:
-    """What goes onto the page.
+    """Content of the report page.
 
     Args:
-        data_root: Folder that image paths start from; the annotation file's by default.
+        data_root: Folder that image paths are relative to; by default the folder of the annotation
+            file.
         max_frames: Largest number of frames.
-        score_thr: Where the slider of the score starts, in [0, 1].
-        image_width: Largest width of the images in pixels, twice that of the camera ahead, which is
-            drawn large; 0 leaves them out.
-        allow_mismatch: Samples without results count as without predictions, results without
-            ground truth are left out; otherwise both are errors.
-        by: Parts of the samples that have their AP in a table, as `read_groups` takes them.
+        score_thr: Initial value of the slider of the score, in [0, 1].
+        image_width: Largest width of the images in pixels, doubled for the camera that looks
+            ahead, which is drawn large; 0 leaves images out.
+        allow_mismatch: Whether samples without results count as samples without predictions, and
+            results without ground truth are ignored; otherwise both are errors.
+        by: Groups of samples with separate AP, as in `read_groups`.
         allow_other_split: Whether models may be of another split than the annotation file.
-        law: Distribution of the errors that Gaussians tell of; by default that of each result's
-            calibration, or the normal one.
+        law: Distribution of the errors of vertices with Gaussians, ``normal`` or ``laplace``; by
+            default the one of the calibration of each result, or the normal one.
 
     Raises:
         ValueError: If a value is out of its range.
@@ -83,63 +84,84 @@ class PageOptions:
 def page_data(
     annotations: str | Path, results: Mapping[str, str | Path], options: PageOptions
 ) -> dict[str, Any]:
-    """Gather all that the page shows.
+    """Collect the data of the page.
 
     Args:
         annotations: Annotation file.
-        results: None, one or two result files by the names that the page gives them; without any
-            the page shows ground truth and cameras alone.
-        options: What goes onto the page.
+        results: No, one or two result files by their names on the page. Without any, the page has
+            ground truth and cameras alone.
+        options: Content of the page.
 
     Returns:
-        Plain values, as ``page.js`` reads them.
+        Plain values, the input of ``page.js``.
 
     Raises:
         FileNotFoundError: If a file does not exist.
         ValueError: If a file is malformed, or does not fit the others.
     """
     file = AnnotationFile(annotations)
-    meta, style = file.meta, MapStyle(file.meta.classes)
+    meta = file.meta
+    style = MapStyle(meta.classes)
     view = frame_view(meta.frame, meta.ground_z_m)
-    truth = read_ground_truth(annotations, meta.classes)[0] if results else {}
-    rules = options.allow_mismatch, options.allow_other_split, options.law
-    scored = [score_result(name, path, truth, meta, *rules) for name, path in results.items()]
-    tokens, seconds = file.column("token"), file.seconds_into_scene
-    chosen = choose_frames(tokens, options.max_frames, scored, options.score_thr)
+    truth: Mapping[str, MapElements] = {}
+    if results:
+        truth, _ = read_ground_truth(annotations, meta.classes)
+    scored = []
+    for name, path in results.items():
+        result = score_result(
+            name,
+            path,
+            truth=truth,
+            meta=meta,
+            allow_mismatch=options.allow_mismatch,
+            allow_other_split=options.allow_other_split,
+            law=options.law,
+        )
+        scored.append(result)
+    tokens = file.column("token")
+    seconds = file.seconds_into_scene
+    chosen = choose_frames(
+        tokens, max_frames=options.max_frames, results=scored, score_thr=options.score_thr
+    )
     root = Path(annotations).parent if options.data_root is None else options.data_root
     frames = []
     for index in chosen:
         sample = file[index]
-        tilted = view.with_mounting(sample.ego_from_frame)
-        frames.append(
-            {
-                "token": sample.token,
-                "title": _title(sample.scene, seconds[index]),
-                "scene": sample.scene,
-                "place": sample.map_name,
-                "truth": truth_of(sample, view),
-                "found": [found_of(sample.token, result, view) for result in scored],
-                "cameras": cameras_of(sample, tilted, root, options.image_width),
-            }
-        )
-    notes = [f"{result.name}: {note}" for result in scored for note in result.notes]
+        sample_view = view.with_mounting(sample.ego_from_frame)
+        cameras = cameras_of(sample, view=sample_view, data_root=root, width_px=options.image_width)
+        predictions = []
+        for result in scored:
+            predictions.append(found_of(sample.token, result=result, view=view))
+        frame = {
+            "token": sample.token,
+            "title": _frame_title(sample.scene, seconds[index]),
+            "scene": sample.scene,
+            "place": sample.map_name,
+            "truth": truth_of(sample, view),
+            "found": predictions,
+            "cameras": cameras,
+        }
+        frames.append(frame)
+    notes = []
+    for result in scored:
+        for note in result.notes:
+            notes.append(f"{result.name}: {note}")
     if len(chosen) < len(tokens):
-        how = "evenly spread"
-        if scored:
-            rest = options.max_frames // 4
-            which = f"the {rest} worst of {scored[0].name}"
-            if len(scored) == 2:
-                which = f"{rest} in which both results differ most"
-            how = f"{len(chosen) - rest} evenly spread and {which}"
-        notes.append(f"The page shows {len(chosen)} of {len(tokens)} frames: {how}.")
+        choice = _describe_choice(scored, num_chosen=len(chosen), max_frames=options.max_frames)
+        notes.append(f"The page shows {len(chosen)} of {len(tokens)} frames: {choice}.")
+    classes = []
+    for label in range(len(meta.classes)):
+        colour = style.colour(label)
+        is_area = style.is_closed(label)
+        classes.append({"title": style.title(label), "colour": colour, "area": is_area})
+    tables: list[Table] = []
+    if scored:
+        tables = _tables(scored, truth=truth, style=style, file=file, options=options)
     return {
         "title": f"{meta.dataset} {meta.split}: {' and '.join(results) or 'ground truth'}",
         "notes": notes,
         "samples": len(tokens),
-        "classes": [
-            {"title": style.title(i), "colour": style.colour(i), "area": style.is_closed(i)}
-            for i in range(len(meta.classes))
-        ],
+        "classes": classes,
         "match_colours": MATCH_COLOURS,
         "extent": display_extent(BEVGrid(meta.x_range, meta.y_range), view),
         "vehicle": view.vehicle_m,
@@ -147,15 +169,26 @@ def page_data(
         "min_score": MIN_SCORE,
         "score": options.score_thr,
         "results": [result.name for result in scored],
-        "tables": _tables(scored, truth, style, file, options) if scored else [],
+        "tables": tables,
         "curves": curves(scored, style) if scored else [],
         "reliability": reliability_curves(scored, truth, style),
         "frames": frames,
     }
 
 
-def _title(scene: str, seconds: float) -> str:
-    """Return what the page calls a sample."""
+def _describe_choice(scored: Sequence[ScoredResult], num_chosen: int, max_frames: int) -> str:
+    """Describe the rule by which frames were chosen (``choose_frames``)."""
+    if not scored:
+        return "evenly spread"
+    num_worst = max_frames // 4
+    worst = f"the {num_worst} worst of {scored[0].name}"
+    if len(scored) == 2:
+        worst = f"{num_worst} in which both results differ most"
+    return f"{num_chosen - num_worst} evenly spread and {worst}"
+
+
+def _frame_title(scene: str, seconds: float) -> str:
+    """Title of a frame on the page."""
     return f"{scene}, {seconds:.1f} s"
 
 
@@ -166,68 +199,95 @@ def _tables(
     file: AnnotationFile,
     options: PageOptions,
 ) -> list[Table]:
-    """Return the tables of one or two results, with intervals where there are several scenes."""
+    """Tables of one or two results, with intervals if there are several scenes.
+
+    Args:
+        scored: One or two results.
+        truth: Ground truth of each sample, by token.
+        style: Class names.
+        file: Annotation file.
+        options: Content of the page.
+    """
     scene_of = dict(zip(file.column("token"), file.column("scene"), strict=True))
-    resamples = Resamples(scene_of) if len(set(scene_of.values())) > 1 else None
+    has_scenes = len(set(scene_of.values())) > 1
+    resamples = Resamples(scene_of) if has_scenes else None
     tables = [summary_table(scored, resamples), *class_tables(scored, style)]
     if options.by == DISTANCE:
-        near_and_far = [scored_by_distance(result, truth, file.meta) for result in scored]
-        groups = distance_groups(near_and_far[0].reports[0].tokens)
-        tables += group_tables(near_and_far, groups, DISTANCE)
+        in_bands = [score_by_distance(result, truth=truth, meta=file.meta) for result in scored]
+        groups = distance_groups(in_bands[0].reports[0].tokens)
+        tables += group_tables(in_bands, groups=groups, by=DISTANCE)
     elif options.by:
         groups = read_groups(file.path, options.by)
-        tables += group_tables(scored, groups, Path(options.by).name)
+        tables += group_tables(scored, groups=groups, by=Path(options.by).name)
     if len(scored) == 2:
-        pairs = zip(scene_of.items(), file.seconds_into_scene, strict=True)
-        titles = {token: _title(scene, seconds) for (token, scene), seconds in pairs}
-        tables.append(difference_table(scored, titles, options.score_thr))
+        titles = {}
+        for (token, scene), seconds in zip(scene_of.items(), file.seconds_into_scene, strict=True):
+            titles[token] = _frame_title(scene, seconds)
+        tables.append(difference_table(scored, titles=titles, score_thr=options.score_thr))
     return tables
 
 
 def page_html(data: Mapping[str, Any]) -> str:
-    """Return the page: one file that fetches nothing and runs no script but its own.
+    """Create the page: one HTML file that loads no other file and runs no script but its own.
 
     Args:
-        data: From ``page_data``. Its texts are strangers' input: they stand in a block of JSON
-            without a single ``<``, and the script shows them as text.
+        data: Data from ``page_data``. Its texts are untrusted. They are in a block of JSON without
+            ``<``, and the script displays them as text.
+
+    Returns:
+        HTML.
     """
-    parts = {
-        name: files("gsmap.visualization.page").joinpath(f"page.{name}").read_text("utf-8")
-        for name in ("html", "css", "js")
-    }
-    frames, images = [], []
-    for frame in data["frames"]:  # its images stand apart and are read when it is opened
-        rows = [
-            [{k: v for k, v in each.items() if k != "src"} for each in row]
-            for row in frame["cameras"]
-        ]
+    folder = files("gsmap.visualization.page")
+    template = Template(folder.joinpath("page.html").read_text("utf-8"))
+    style = folder.joinpath("page.css").read_text("utf-8")
+    script = folder.joinpath("page.js").read_text("utf-8")
+    # Images are in blocks of their frames, which are parsed when a frame is opened.
+    frames = []
+    image_blocks = []
+    for frame in data["frames"]:
+        rows = []
+        sources = []
+        for row in frame["cameras"]:
+            cameras = []
+            for camera in row:
+                camera_without_image = dict(camera)
+                sources.append(camera_without_image.pop("src"))
+                cameras.append(camera_without_image)
+            rows.append(cameras)
         frames.append({**frame, "cameras": rows})
-        images.append([each["src"] for row in frame["cameras"] for each in row])
-    style, script = (f"'sha256-{_digest(parts[name])}'" for name in ("css", "js"))
-    return Template(parts["html"]).substitute(
-        policy=f"default-src 'none'; img-src data:; style-src {style}; script-src {script}; "
-        "base-uri 'none'; form-action 'none'",  # which default-src does not cover
+        block = _json_block(sources)
+        image_blocks.append(f'<script type="application/json" class="images">{block}</script>')
+    rules = [
+        "default-src 'none'",
+        "img-src data:",
+        f"style-src 'sha256-{_digest(style)}'",
+        f"script-src 'sha256-{_digest(script)}'",
+        "base-uri 'none'",  # this rule and the next one are not covered by default-src
+        "form-action 'none'",
+    ]
+    return template.substitute(
+        policy="; ".join(rules),
         title=html.escape(str(data["title"])),
-        style=parts["css"],
-        script=parts["js"],
-        data=_block({**data, "frames": frames}),
-        images="".join(
-            f'<script type="application/json" class="images">{_block(i)}</script>' for i in images
-        ),
+        style=style,
+        script=script,
+        data=_json_block({**data, "frames": frames}),
+        images="".join(image_blocks),
     )
 
 
-def _block(value: Any) -> str:
-    """Return JSON that cannot end the element it stands in."""
-    return json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+def _json_block(value: Any) -> str:
+    """Encode a value as JSON that cannot close the HTML element around it."""
+    text = json.dumps(value, separators=(",", ":"), allow_nan=False)
+    return text.replace("<", "\\u003c")
 
 
 def _digest(text: str) -> str:
+    """SHA-256 of a text in base64, as in content security policies."""
     return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
 
 
 def is_own_page(path: Path) -> bool:
-    """Whether a file is a page that `write_page` has written."""
+    """Whether a file was written by `write_page`."""
     with path.open("rb") as file:
         return _GENERATOR in file.read(_HEAD_BYTES)
 
@@ -236,11 +296,11 @@ def write_page(path: str | Path, data: Mapping[str, Any]) -> str:
     """Write the page.
 
     Args:
-        path: The HTML file; parent folders are made.
-        data: From ``page_data``.
+        path: HTML file to write; parent folders are created.
+        data: Data from ``page_data``.
 
     Returns:
-        What was written, in words, with its size.
+        Summary of the page in words, with its size.
     """
     text = page_html(data)
     write_text(path, text)

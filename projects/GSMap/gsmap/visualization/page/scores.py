@@ -1,4 +1,4 @@
-"""A result file scored for the page, with the matches of each sample."""
+"""Scores of result files for the report page, with the matches of each sample."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -23,21 +23,21 @@ from gsmap.utils.model_facts import law_of
 from gsmap.utils.split_lists import require_results_of
 
 MATCH_M = 1.0
-"""Chamfer distance in metres within which the page calls a prediction a hit."""
-_COLUMN = CHAMFER_THRESHOLDS.index(MATCH_M)
+"""Largest Chamfer distance in metres of a hit on the page."""
+_HIT_COLUMN = CHAMFER_THRESHOLDS.index(MATCH_M)
 
 
 @dataclass(frozen=True)
 class ScoredResult:
-    """One result file.
+    """Predictions and scores of one result file.
 
     Args:
-        name: What the page calls it.
+        name: Name of the result on the page.
         predictions: Elements of each sample, by token.
-        matches: Their matches by Chamfer distance, by token.
-        reports: One report per metric.
-        notes: What the reader should know of the samples.
-        law: Distribution of the errors that its Gaussians tell of.
+        matches: Matches of each sample by Chamfer distance, by token.
+        reports: Report of each metric.
+        notes: Remarks on the samples for the reader.
+        law: Distribution of the errors of vertices with Gaussians, ``normal`` or ``laplace``.
     """
 
     name: str
@@ -48,15 +48,26 @@ class ScoredResult:
     law: str
 
     def hits(self, token: str) -> IntArray:
-        """Return the ground truth that each counted prediction hits within 1 m, or -1. (N,)"""
-        return self.matches[token].matched_gt[:, _COLUMN]
+        """Index of the ground truth that each counted prediction hits within 1 m, or -1. (N,)"""
+        return self.matches[token].matched_gt[:, _HIT_COLUMN]
 
     def f1(self, token: str, score_thr: float) -> float:
-        """Return F1 of a sample's predictions of at least ``score_thr``; 1 if there is nothing."""
+        """Compute F1 of a sample.
+
+        Args:
+            token: Token of the sample.
+            score_thr: Smallest score of a prediction that counts.
+
+        Returns:
+            F1 in [0, 1], which is 1 if there are neither predictions nor ground truth.
+        """
         matches = self.matches[token]
-        kept = matches.scores >= score_thr
-        total = int(kept.sum()) + int(matches.num_gts.sum())
-        return 2 * int((self.hits(token)[kept] >= 0).sum()) / total if total else 1.0
+        is_counted = matches.scores >= score_thr
+        total = int(is_counted.sum()) + int(matches.num_gts.sum())
+        if total == 0:
+            return 1.0
+        num_hits = int((self.hits(token)[is_counted] >= 0).sum())
+        return 2 * num_hits / total
 
 
 def score_result(
@@ -71,57 +82,82 @@ def score_result(
     """Score a result file with the rules of ``tools/evaluate.py``.
 
     Args:
-        name: What the page calls it.
+        name: Name of the result on the page.
         path: Results in MapTR's JSON form, with or without Gaussians.
         truth: Ground truth of each sample, by token.
-        meta: Classes and range.
-        allow_mismatch: As in ``mismatch_notes``.
+        meta: Metadata of the annotation file.
+        allow_mismatch: Whether samples may differ from the ground truth, as in ``mismatch_notes``.
         allow_other_split: Whether the model may be of another split than the ground truth.
-        law: Distribution of the errors; None for that of the model's calibration, or the normal.
+        law: Distribution of the errors; by default the one of the calibration of the model, or
+            the normal one.
+
+    Returns:
+        Predictions, matches and reports.
 
     Raises:
         FileNotFoundError: If the file does not exist.
-        ValueError: If it is malformed, or its samples or its split are not the ground truth's.
+        ValueError: If the file is malformed, or its samples or its split disagree with the ground
+            truth.
     """
     file = SampleFile(path, RESULTS_KEY, meta.classes, gaussians=True)
-    predictions, others = {token: found for token, found, _ in file}, file.ignored
+    predictions = {}
+    for token, elements, _ in file:
+        predictions[token] = elements
     if not allow_other_split:
         require_results_of(meta.split_list, file.about, path)
     try:
         notes = mismatch_notes(predictions, truth, allow_mismatch)
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error
-    if others.pop(THREE_D, 0):
+    num_ignored = dict(file.ignored)  # predictions by class
+    if num_ignored.pop(THREE_D, 0):
         notes.append("some predictions have heights, which no figure here counts")
-    notes += [f"{n} predictions of class {c!r} are not scored" for c, n in sorted(others.items())]
-    evaluator, nothing = _evaluator(meta), MapElements.from_polylines()
-    found = [evaluator.match(t, predictions.get(t, nothing), gt) for t, gt in truth.items()]
-    chamfer = [cast(FrameMatches, sample["chamfer"]) for sample in found]
-    matches = {frame.token: frame for frame in chamfer}
-    reports, law = evaluator.reports(found), law or law_of(file.about)
-    return ScoredResult(name, predictions, matches, reports, notes, law)
+    for class_name, count in sorted(num_ignored.items()):
+        notes.append(f"{count} predictions of class {class_name!r} are not scored")
+    evaluator = _create_evaluator(meta)
+    nothing = MapElements.from_polylines()
+    sample_values = []
+    matches = {}
+    for token, true_elements in truth.items():
+        values = evaluator.match(token, predictions.get(token, nothing), true_elements)
+        chamfer = cast(FrameMatches, values["chamfer"])
+        sample_values.append(values)
+        matches[chamfer.token] = chamfer
+    return ScoredResult(
+        name,
+        predictions=predictions,
+        matches=matches,
+        reports=evaluator.reports(sample_values),
+        notes=notes,
+        law=law or law_of(file.about),
+    )
 
 
-def scored_by_distance(
+def score_by_distance(
     result: ScoredResult, truth: Mapping[str, MapElements], meta: AnnotationMeta
 ) -> ScoredResult:
-    """Return a result whose reports are of the map in bands of distances from the vehicle.
+    """Score a result in bands of the distance from the vehicle.
 
     Args:
-        result: A scored result file.
+        result: Scored result file.
         truth: Ground truth of each sample, by token.
-        meta: Classes and range.
+        meta: Metadata of the annotation file.
+
+    Returns:
+        Result whose reports have a sample for each band of each sample.
     """
-    evaluator, nothing = _evaluator(meta), MapElements.from_polylines()
-    samples = (
-        Sample(token, result.predictions.get(token, nothing), gt) for token, gt in truth.items()
-    )
-    areas = [label for label, name in enumerate(meta.classes) if name in AREA_CLASSES]
-    found = (evaluator.match(*pieces) for pieces in cut_by_distance(samples, areas))
-    return replace(result, reports=evaluator.reports(found))
+    evaluator = _create_evaluator(meta)
+    nothing = MapElements.from_polylines()
+    samples = []
+    for token, true_elements in truth.items():
+        predictions = result.predictions.get(token, nothing)
+        samples.append(Sample(token, predictions, true_elements))
+    area_labels = [label for label, name in enumerate(meta.classes) if name in AREA_CLASSES]
+    matches = (evaluator.match(*piece) for piece in cut_by_distance(samples, area_labels))
+    return replace(result, reports=evaluator.reports(matches))
 
 
-def _evaluator(meta: AnnotationMeta) -> MapEvaluator:
-    """Return the metrics of the page."""
+def _create_evaluator(meta: AnnotationMeta) -> MapEvaluator:
+    """Evaluator with the metrics of the page."""
     grid = BEVGrid(meta.x_range, meta.y_range)
     return MapEvaluator(ChamferConfig(meta.classes), RasterConfig(meta.classes, grid))

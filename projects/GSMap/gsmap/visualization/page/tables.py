@@ -1,4 +1,4 @@
-"""Tables and curves of scored results, as the page shows them."""
+"""Tables and curves of results on the report page."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -26,53 +26,76 @@ from gsmap.visualization.page.scores import ScoredResult
 from gsmap.visualization.style import MapStyle
 
 Table = dict[str, Any]
-_CURVE_POINTS = 120
-_DIFFERENCES = 12  # samples in which two results differ most
-_UNITS = {"chamfer": "m", "raster": "IoU"}
+_MAX_CURVE_POINTS = 120
+_MAX_DIFFERENCES = 12  # samples in the table of differences
+_UNITS = {"chamfer": "m", "raster": "IoU"}  # of thresholds
 
 
-def _figure(value: float, factor: float = 100, digits: int = 1) -> str:
-    """Write a figure, by default in percent; a dash where it does not exist."""
+def _format_value(value: float, factor: float = 100, digits: int = 1) -> str:
+    """Format a value, by default in percent; a dash if it is undefined."""
     return "\N{EN DASH}" if value == UNDEFINED else f"{factor * value:.{digits}f}"
 
 
 def summary_table(results: Sequence[ScoredResult], resamples: Resamples | None = None) -> Table:
-    """Return the means over the classes: a row per figure, a column per result.
+    """Create the table of the means over the classes, with a row per figure.
 
     Args:
         results: One result, or two with their difference in a last column.
-        resamples: Scenes to compute intervals of 95 % from; None shows none.
+        resamples: Resamples of the scenes for intervals of 95 %, or None for no intervals.
+
+    Returns:
+        Table with a column per result.
     """
-    reports = [result.reports for result in results]
-    of_each: list[Mapping[str, Interval]] = [{} for _ in results]
-    of_difference: Mapping[str, Interval] = {}
-    if resamples is not None:
-        of_each = [ap_intervals(of_result, resamples) for of_result in reports]
-        if len(results) == 2:
-            of_difference = ap_differences(reports[1], reports[0], resamples)
-    metrics = [flat_metrics(result.reports) for result in results]
-    keys = {f"mAP_{report.name} (%)": f"{report.name}/mAP" for report in results[0].reports}
-    for threshold in CHAMFER_THRESHOLDS:
-        keys[f"AP_chamfer at {threshold} m (%)"] = f"chamfer/AP@{threshold}"
-    head = ["mean over classes", *(result.name for result in results)]
-    columns = [
-        [_figure(figures[key]) + _range(intervals.get(key)) for key in keys.values()]
-        for figures, intervals in zip(metrics, of_each, strict=True)
-    ]
-    rows = [[title, *cells] for title, *cells in zip(keys, *columns, strict=True)]
+    head = ["mean over classes"]
+    columns = []  # values and intervals of each result
+    for result in results:
+        intervals: Mapping[str, Interval] = {}
+        if resamples is not None:
+            intervals = ap_intervals(result.reports, resamples)
+        head.append(result.name)
+        columns.append((flat_metrics(result.reports), intervals))
+    key_of_title = _summary_keys(results[0].reports)
+    rows = []
+    for title, key in key_of_title.items():
+        cells = []
+        for values, intervals in columns:
+            cells.append(_format_value(values[key]) + _format_interval(intervals.get(key)))
+        rows.append([title, *cells])
     if len(results) == 2:
-        head.append(f"{results[1].name} minus {results[0].name}")
-        for row, key in zip(rows, keys.values(), strict=True):
-            first, second = (m[key] for m in metrics)
-            known = UNDEFINED not in (first, second)
-            difference = f"{100 * (second - first):+.1f}" if known else _figure(UNDEFINED)
-            row.append(difference + _range(of_difference.get(key), "+"))
-    caption = "Summary" + (", intervals of 95 % over scenes" if resamples else "")
+        first, second = results
+        head.append(f"{second.name} minus {first.name}")
+        intervals = {}
+        if resamples is not None:
+            intervals = ap_differences(second.reports, first.reports, resamples)
+        (first_values, _), (second_values, _) = columns
+        for row, key in zip(rows, key_of_title.values(), strict=True):
+            difference = _format_difference(first_values[key], second_values[key])
+            row.append(difference + _format_interval(intervals.get(key), sign="+"))
+    caption = "Summary"
+    if resamples is not None:
+        caption += ", intervals of 95 % over scenes"
     return {"caption": caption, "head": head, "rows": rows}
 
 
-def _range(interval: Interval | None, sign: str = "") -> str:
-    """Write an interval behind its figure, in percent; nothing where it does not exist."""
+def _summary_keys(reports: Sequence[MetricReport]) -> dict[str, str]:
+    """Metric key of each row of the summary, by title."""
+    key_of_title = {}
+    for report in reports:
+        key_of_title[f"mAP_{report.name} (%)"] = f"{report.name}/mAP"
+    for threshold in CHAMFER_THRESHOLDS:
+        key_of_title[f"AP_chamfer at {threshold} m (%)"] = f"chamfer/AP@{threshold}"
+    return key_of_title
+
+
+def _format_difference(first: float, second: float) -> str:
+    """Format second minus first in percent; a dash if one of them is undefined."""
+    if UNDEFINED in (first, second):
+        return _format_value(UNDEFINED)
+    return f"{100 * (second - first):+.1f}"
+
+
+def _format_interval(interval: Interval | None, sign: str = "") -> str:
+    """Format an interval in percent, to follow its value; empty if it is undefined."""
     if interval is None or UNDEFINED in (interval.value, interval.low, interval.high):
         return ""
     return f" ({100 * interval.low:{sign}.1f} to {100 * interval.high:{sign}.1f})"
@@ -81,40 +104,53 @@ def _range(interval: Interval | None, sign: str = "") -> str:
 def difference_table(
     results: Sequence[ScoredResult], titles: Mapping[str, str], score_thr: float
 ) -> Table:
-    """Return the samples in which two results differ most in F1, the largest difference first.
+    """Create the table of the samples with the largest differences in F1, in falling order.
 
     Args:
         results: Two results.
-        titles: What the page calls each sample, by token.
-        score_thr: Smallest score that F1 counts.
+        titles: Title of each sample on the page, by token.
+        score_thr: Smallest score of a prediction that counts in F1.
+
+    Returns:
+        Table with a row per sample.
     """
+    first_result, second_result = results
+    f1_of_samples = []
+    for token in titles:
+        first = first_result.f1(token, score_thr)
+        second = second_result.f1(token, score_thr)
+        if first != second:
+            f1_of_samples.append((token, first, second))
+    f1_of_samples.sort(key=lambda row: -abs(row[2] - row[1]))
     rows = []
-    for token, title in titles.items():
-        first, second = (result.f1(token, score_thr) for result in results)
-        rows.append((abs(second - first), [title, token, first, second, second - first]))
-    rows.sort(key=lambda row: -row[0])
-    shown = [
-        [title, token, f"{first:.2f}", f"{second:.2f}", f"{difference:+.2f}"]
-        for apart, (title, token, first, second, difference) in rows[:_DIFFERENCES]
-        if apart > 0
+    for token, first, second in f1_of_samples[:_MAX_DIFFERENCES]:
+        difference = f"{second - first:+.2f}"
+        rows.append([titles[token], token, f"{first:.2f}", f"{second:.2f}", difference])
+    head = [
+        "sample",
+        "token",
+        f"F1 of {first_result.name}",
+        f"F1 of {second_result.name}",
+        "difference",
     ]
-    head = ["sample", "token", *(f"F1 of {result.name}" for result in results), "difference"]
-    return {
-        "caption": f"Where they differ most, from score {score_thr:g}",
-        "head": head,
-        "rows": shown,
-    }
+    caption = f"Where they differ most, from score {score_thr:g}"
+    return {"caption": caption, "head": head, "rows": rows}
 
 
 def _columns(report: MetricReport, class_name: str) -> list[tuple[str, str, float, int]]:
-    """Return heading, key, factor and digits of the columns, as in ``format_table``."""
-    keys = report.detections[class_name].thresholds
-    chamfer, unit = report.name == "chamfer", _UNITS[report.name]
-    loosest = keys[-1 if chamfer else 0]
-    error = ("mean error (m)", f"error_m@{loosest}", 1, 2) if chamfer else ("mIoU", "mIoU", 1, 3)
+    """Heading, metric key, factor and digits of each column, as in ``format_table``."""
+    thresholds = report.detections[class_name].thresholds
+    unit = _UNITS[report.name]
+    if report.name == "chamfer":
+        loosest = thresholds[-1]
+        error = ("mean error (m)", f"error_m@{loosest}", 1, 2)
+    else:
+        loosest = thresholds[0]
+        error = ("mIoU", "mIoU", 1, 3)
+    ap_columns = [(f"at {value} {unit}", f"AP@{value}", 100, 1) for value in thresholds]
     return [
         ("AP (%)", "AP", 100, 1),
-        *((f"at {key} {unit}", f"AP@{key}", 100, 1) for key in keys),
+        *ap_columns,
         (f"recall at {loosest} {unit} (%)", f"recall@{loosest}", 100, 1),
         error,
         (f"calibration error at {loosest} {unit}", f"calibration_error@{loosest}", 1, 3),
@@ -124,116 +160,177 @@ def _columns(report: MetricReport, class_name: str) -> list[tuple[str, str, floa
 
 
 def class_tables(results: Sequence[ScoredResult], style: MapStyle) -> list[Table]:
-    """Return a table per metric and group of classes: a row per class and result."""
-    tables, several = [], len(results) > 1
+    """Create a table per metric and group of classes, with a row per class and result.
+
+    Args:
+        results: One or two results.
+        style: Class names.
+
+    Returns:
+        Tables in the order of the metrics.
+    """
+    tables = []
+    has_several = len(results) > 1
     for index, report in enumerate(results[0].reports):
         for group, names in report.groups.items():
             columns = _columns(report, names[0])
             rows = []
             for name in names:
+                title = style.title(style.classes.index(name))
                 for result in results:
-                    figures = result.reports[index].metrics
-                    title = style.title(style.classes.index(name))
-                    values = [
-                        _figure(figures[f"{report.name}/{name}/{key}"], factor, digits)
-                        for _, key, factor, digits in columns
-                    ]
-                    rows.append([title, *([result.name] if several else []), *values])
-            what = f", {group} classes" if len(report.groups) > 1 else ""
-            named = ["class", *(["result"] if several else [])]
-            head = [*named, *(column[0] for column in columns)]
-            tables.append({"caption": f"AP_{report.name}{what}", "head": head, "rows": rows})
+                    metrics = result.reports[index].metrics
+                    row = [title, result.name] if has_several else [title]
+                    for _, key, factor, digits in columns:
+                        value = metrics[f"{report.name}/{name}/{key}"]
+                        row.append(_format_value(value, factor=factor, digits=digits))
+                    rows.append(row)
+            head = ["class", "result"] if has_several else ["class"]
+            head += [heading for heading, _, _, _ in columns]
+            caption = f"AP_{report.name}"
+            if len(report.groups) > 1:
+                caption += f", {group} classes"
+            tables.append({"caption": caption, "head": head, "rows": rows})
     return tables
 
 
 def curves(results: Sequence[ScoredResult], style: MapStyle) -> list[dict[str, Any]]:
-    """Return a panel per metric and class: AP and (recall, precision) per threshold and result."""
+    """Create a panel per metric and class, with a line per threshold.
+
+    Args:
+        results: One or two results.
+        style: Class names.
+
+    Returns:
+        Panels with the AP and the points (recall, precision) of each result.
+    """
     panels = []
     for index, report in enumerate(results[0].reports):
+        reports = [result.reports[index] for result in results]
         for name, detections in report.detections.items():
-            found = [result.reports[index] for result in results]
             lines = []
-            for t, threshold in enumerate(detections.thresholds):
+            for column, threshold in enumerate(detections.thresholds):
                 key = f"{report.name}/{name}/AP@{threshold}"
-                ap = [_figure(each.metrics[key]) for each in found]
-                points = [_thinned(each.detections[name], t) for each in found]
+                aps = []
+                points = []
+                for each in reports:
+                    aps.append(_format_value(each.metrics[key]))
+                    points.append(_curve_points(each.detections[name], column))
                 label = f"{threshold} {_UNITS[report.name]}"
-                lines.append({"label": label, "ap": ap, "points": points})
-            panel = {"metric": f"AP_{report.name}", "class": style.classes.index(name)}
-            panels.append(panel | {"lines": lines})
+                lines.append({"label": label, "ap": aps, "points": points})
+            class_index = style.classes.index(name)
+            panels.append({"metric": f"AP_{report.name}", "class": class_index, "lines": lines})
     return panels
 
 
 def reliability_curves(
     results: Sequence[ScoredResult], truth: Mapping[str, MapElements], style: MapStyle
 ) -> list[dict[str, Any]]:
-    """Return a panel per class: the share of errors within intervals of each result's law.
+    """Create a panel per class: the shares of errors within intervals of the law of each result.
 
     Args:
-        results: One result or two; those without Gaussians have no curve.
+        results: Any number of results; results without Gaussians have no curve.
         truth: Ground truth of each sample, by token.
-        style: Names of the classes.
+        style: Class names.
+
+    Returns:
+        Panels of the classes with a curve. Each has lines for errors along and across.
     """
-    found = [_vertices(result, truth, style) for result in results]
-    laws = " | ".join(dict.fromkeys(r.law for r, each in zip(results, found, strict=True) if each))
+    vertices_of_results = [
+        _matched_vertices(result, truth=truth, style=style) for result in results
+    ]
+    laws: dict[str, None] = {}  # an ordered set
+    for result, vertices in zip(results, vertices_of_results, strict=True):
+        if vertices:
+            laws[result.law] = None
     panels = []
     for label in range(len(style.classes)):
-        own = [each.of(each.labels == label) if each else None for each in found]
         lines = []
-        for axis, name in enumerate(AXES):
-            shares: list[float] = []
+        for axis, axis_name in enumerate(AXES):
+            shares: list[str] = []
             points: list[list[list[float]]] = []
-            for result, each in zip(results, own, strict=True):
-                if each is None or not len(each.labels):
-                    shares.append(UNDEFINED)
-                    points.append([])
-                    continue
-                errors, sigmas = each.errors[:, axis], each.sigmas[:, axis]
-                width = half_widths(result.law, COVERED)[0]
-                shares.append(float((errors <= width * sigmas).mean()))
-                curve = reliability(errors, sigmas, result.law)
-                points.append(np.stack([LEVELS, curve], 1).round(3).tolist())
-            title = f"{name}, in the interval of 68.3 % ({laws} law)"
-            label_ap = {"label": title, "ap": [_figure(s) for s in shares]}
-            lines.append(label_ap | {"points": points})
-        if any(map(any, (line["points"] for line in lines))):
+            for result, vertices in zip(results, vertices_of_results, strict=True):
+                share, curve = _reliability(result.law, vertices, label=label, axis=axis)
+                shares.append(_format_value(share))
+                points.append(curve)
+            title = f"{axis_name}, in the interval of 68.3 % ({' | '.join(laws)} law)"
+            lines.append({"label": title, "ap": shares, "points": points})
+        if any(any(line["points"]) for line in lines):
             panels.append({"metric": "Gaussians", "class": label, "lines": lines})
     return panels
 
 
-def _vertices(
+def _reliability(
+    law: str, vertices: Vertices | None, label: int, axis: int
+) -> tuple[float, list[list[float]]]:
+    """Measure the reliability of one class in one direction.
+
+    Args:
+        law: Distribution of the errors.
+        vertices: Matched vertices of a result, or None.
+        label: Index of the class.
+        axis: Index of the direction in ``AXES``.
+
+    Returns:
+        Share of errors in the interval of 68.3 %, and (level, share) of intervals of all levels;
+        undefined and empty without vertices.
+    """
+    if vertices is None:
+        return UNDEFINED, []
+    of_class = vertices.of(vertices.labels == label)
+    if not len(of_class.labels):
+        return UNDEFINED, []
+    errors = of_class.errors[:, axis]
+    sigmas = of_class.sigmas[:, axis]
+    half_width = half_widths(law, COVERED)[0]
+    share = float((errors <= half_width * sigmas).mean())
+    points = np.stack([LEVELS, reliability(errors, sigmas, law)], axis=1)
+    return share, points.round(3).tolist()
+
+
+def _matched_vertices(
     result: ScoredResult, truth: Mapping[str, MapElements], style: MapStyle
 ) -> Vertices | None:
-    """Return the vertices of matched predictions, or None without Gaussians or matches."""
-    some = [elements for elements in result.predictions.values() if len(elements)]
-    matched = any((matches.matched_gt >= 0).any() for matches in result.matches.values())
-    if not matched or any(elements.scales is None for elements in some):
+    """Vertices of matched predictions, or None without Gaussians or matches."""
+    for elements in result.predictions.values():
+        if len(elements) and elements.scales is None:
+            return None
+    has_match = any((matches.matched_gt >= 0).any() for matches in result.matches.values())
+    if not has_match:
         return None
-    predictions = result.predictions
-    pairs = (Sample(t, predictions[t], gt) for t, gt in truth.items() if t in predictions)
-    return matched_vertices(pairs, ChamferConfig(tuple(style.classes)))
+    samples = []
+    for token, true_elements in truth.items():
+        if token in result.predictions:
+            samples.append(Sample(token, result.predictions[token], true_elements))
+    return matched_vertices(samples, ChamferConfig(tuple(style.classes)))
 
 
 def group_tables(results: Sequence[ScoredResult], groups: Groups, by: str) -> list[Table]:
-    """Return a table per result: AP in percent of each group of samples.
+    """Create a table per result: AP in percent of each group of samples.
 
     Args:
-        results: One result or two.
-        groups: Of the samples.
-        by: What they are, for the caption.
+        results: One or two results.
+        groups: Groups of the samples.
+        by: Name of the grouping, for the caption.
+
+    Returns:
+        Tables in the order of the results.
     """
     tables = []
     for result in results:
-        head, rows = group_table(result.reports, groups, ap_by_group(result.reports, groups))
-        what = f", {result.name}" if len(results) > 1 else ""
-        tables.append({"caption": f"AP (%) by {by}{what}", "head": head, "rows": rows})
+        ap = ap_by_group(result.reports, groups)
+        head, rows = group_table(result.reports, groups, ap)
+        caption = f"AP (%) by {by}"
+        if len(results) > 1:
+            caption += f", {result.name}"
+        tables.append({"caption": caption, "head": head, "rows": rows})
     return tables
 
 
-def _thinned(found: ClassDetections, column: int) -> list[list[float]]:
-    """Return recall and precision at some ranks, at most ``_CURVE_POINTS``."""
-    hits = found.hits[:, column]
-    pairs = np.stack(precision_recall(hits, found.num_gts), axis=1).round(3)
-    if len(pairs) > _CURVE_POINTS:
-        pairs = pairs[np.linspace(0, len(pairs) - 1, _CURVE_POINTS).astype(int)]
-    return pairs.tolist()
+def _curve_points(detections: ClassDetections, column: int) -> list[list[float]]:
+    """Recall and precision at evenly spread ranks, for the threshold of a column of the hits."""
+    recall, precision = precision_recall(detections.hits[:, column], detections.num_gts)
+    points = np.stack([recall, precision], axis=1).round(3)
+    if len(points) > _MAX_CURVE_POINTS:
+        ranks = np.linspace(0, len(points) - 1, _MAX_CURVE_POINTS).astype(int)
+        points = points[ranks]
+    return points.tolist()
