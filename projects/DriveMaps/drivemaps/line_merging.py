@@ -25,10 +25,13 @@ _MAX_TURN_DEG = 30.0  # largest angle between two lines that are matched
 _STEP_M = 1.0  # largest distance between vertices while lines are merged
 _CHUNK_SIZE = 2000  # vertices that are matched at once; memory grows with it
 _NUM_ROUNDS = 3  # times that all vertices move to the mean
-_MOST_M = 250_000.0  # a class of a drive may have so much length,
-_MOST_PER_FRAME_M = 5_000.0  # and so much more for each frame
-_MOST_PAIRS = 2 * 10**7  # pairs of a vertex and a segment near it
-_MOST_PAIRS_PER_FRAME = 16  # pairs per vertex and frame, if that allows more
+# Limits of the work: total length of the lines of a class, a constant plus a part per frame.
+_MOST_M = 250_000.0
+_MOST_PER_FRAME_M = 5_000.0
+# Pairs of a vertex and a segment near it: the larger one of a constant and a number per vertex and
+# frame.
+_MOST_PAIRS = 2 * 10**7
+_MOST_PAIRS_PER_FRAME = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +205,7 @@ def _match_vertices(lines: _DenseLines, normals: FloatArray) -> _Matches:
         At most one match per vertex and frame, ordered by vertex.
 
     Raises:
-        InputError: If more vertices and segments than ``_MOST_PAIRS`` are near each other.
+        InputError: If too many pairs of a vertex and a segment are near each other.
     """
     points = lines.points
     starts = points[lines.segment_starts]
@@ -273,6 +276,7 @@ def _match_pairs(
     vertex = lines.points[vertices]
     start = lines.points[segments] - vertex
     end = lines.points[segments + 1] - vertex
+    # Positions along the line of the vertex; the segment crosses the normal at position 0.
     start_along = start[:, 1] * normal[:, 0] - start[:, 0] * normal[:, 1]
     end_along = end[:, 1] * normal[:, 0] - end[:, 0] * normal[:, 1]
     extent = end_along - start_along  # of the segment along the line of the vertex, in metres
@@ -286,18 +290,26 @@ def _match_pairs(
 
 
 def _select_matches(lines: _DenseLines, candidates: _Matches) -> _Matches:
-    """Select the nearest match of each vertex in each other frame, ordered by vertex and frame."""
+    """Select the nearest match of each vertex in each other frame, ordered by vertex and frame.
+
+    A candidate in the frame of the vertex is a rival: the next line on its side of the vertex.
+    Matches beyond half the distance of a rival are dropped.
+
+    Args:
+        lines: Lines of all frames.
+        candidates: Matches of some vertices, also within one frame.
+    """
     vertices = candidates.vertices
     in_one_frame = lines.frames[vertices] == lines.frames[candidates.segments]
-    unambiguous = ~in_one_frame
+    is_selected = ~in_one_frame
     distinct, rows = np.unique(vertices, return_inverse=True)
     for side in (1.0, -1.0):  # left and right
         distances = side * candidates.distances
         is_rival = in_one_frame & (distances >= 0.0)
-        rival_m = np.full(len(distinct), np.inf)
-        np.minimum.at(rival_m, rows[is_rival], distances[is_rival])
-        unambiguous &= distances <= rival_m[rows] / 2.0
-    matches = candidates.select(unambiguous)
+        nearest_rival_m = np.full(len(distinct), np.inf)
+        np.minimum.at(nearest_rival_m, rows[is_rival], distances[is_rival])
+        is_selected &= distances <= nearest_rival_m[rows] / 2.0
+    matches = candidates.select(is_selected)
     frames = lines.frames[matches.segments]
     order = np.lexsort((matches.segments, np.abs(matches.distances), frames, matches.vertices))
     matches = matches.select(order)
