@@ -53,7 +53,10 @@ def check_topics(
     Raises:
         ValueError: If a camera lacks camera info, or a topic is missing or of another type.
     """
-    lacking = [name for name, (_, info) in topics.items() if needs_info and not info]
+    lacking = []
+    for name, (_, info) in topics.items():
+        if needs_info and not info:
+            lacking.append(name)
     if lacking:
         raise InputError(
             f"--topics names no camera info of {', '.join(lacking)}: NAME=IMAGE_TOPIC,INFO_TOPIC, "
@@ -85,7 +88,7 @@ def image_topics(kinds: Mapping[str, str]) -> dict[str, str]:
             while len(parts) > 2 and parts[-1] in _GENERIC:
                 parts.pop()
             topic_of.setdefault("/".join(parts), topic)
-    names = [base.rsplit("/", 1)[-1] for base in topic_of]
+    names = [base.rsplit("/", maxsplit=1)[-1] for base in topic_of]
     if len(set(names)) < len(names):
         names = [base.strip("/").replace("/", "_") for base in topic_of]
     if len(set(names)) < len(names):
@@ -111,7 +114,7 @@ def camera_topics(kinds: Mapping[str, str], listing: str) -> dict[str, tuple[str
     candidates = {}
     kinds_with_info = {}
     for topic, kind in kinds.items():
-        candidates[topic] = _candidate_infos(topic, infos)
+        candidates[topic] = _candidate_infos(topic, infos=infos)
         if candidates[topic]:
             kinds_with_info[topic] = kind
     cameras = image_topics(kinds_with_info)
@@ -152,11 +155,14 @@ def _candidate_infos(topic: str, infos: Sequence[str]) -> list[str]:
     """
     nearest = None
     for info in infos:
-        namespace = info.rsplit("/", 1)[0]
+        namespace = info.rsplit("/", maxsplit=1)[0]
         if topic.startswith(f"{namespace}/") and (nearest is None or len(namespace) > len(nearest)):
             nearest = namespace
-    neighbours = [info for info in infos if info.rsplit("/", 1)[0] == nearest]
-    if len(neighbours) < 2:
-        return neighbours
-    matching_infos = [info for info in neighbours if _words(info) == _words(topic)]
+    neighbours = []
+    matching_infos = []
+    for info in infos:
+        if info.rsplit("/", maxsplit=1)[0] == nearest:
+            neighbours.append(info)
+            if _words(info) == _words(topic):
+                matching_infos.append(info)
     return matching_infos or neighbours

@@ -50,8 +50,8 @@ def import_bounded(name: str) -> ModuleType:
         RuntimeError: If the module is not installed; the message names the extra.
     """
     for part in _DECOMPRESSING[name]:
-        _bound(import_extra(part, "bags"))
-    return import_extra(name, "bags")
+        _bound(import_extra(part, extra="bags"))
+    return import_extra(name, extra="bags")
 
 
 def _bound(module: Any) -> None:
@@ -107,7 +107,7 @@ def _bounded_stream(open_stream: Callable[[BytesIO], Any]) -> Callable[..., byte
     def decompress(data: bytes, *_: object) -> bytes:
         limit = _count_packed(len(data))
         with open_stream(BytesIO(data)) as file:
-            return _count_unpacked(file.read(limit + 1), limit)
+            return _count_unpacked(file.read(limit + 1), limit=limit)
 
     return decompress
 
@@ -117,7 +117,7 @@ def _bounded_lz4(unbounded: Callable[..., bytes]) -> Callable[..., bytes]:
 
     def decompress(data: bytes, *options: object) -> bytes:
         limit = _count_packed(len(data))
-        return _count_unpacked(unbounded(data, *options), limit)
+        return _count_unpacked(unbounded(data, *options), limit=limit)
 
     return decompress
 

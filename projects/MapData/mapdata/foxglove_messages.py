@@ -17,9 +17,9 @@ def foxglove_parser(name: str, descriptors: bytes) -> Callable[[bytes], Any]:
     Returns:
         Function from the content of a message to an object with the fields of ROS.
     """
-    descriptor_pb2 = import_extra("google.protobuf.descriptor_pb2", "bags")
-    pool = import_extra("google.protobuf.descriptor_pool", "bags").DescriptorPool()
-    factory = import_extra("google.protobuf.message_factory", "bags")
+    descriptor_pb2 = import_extra("google.protobuf.descriptor_pb2", extra="bags")
+    pool = import_extra("google.protobuf.descriptor_pool", extra="bags").DescriptorPool()
+    factory = import_extra("google.protobuf.message_factory", extra="bags")
     for file in descriptor_pb2.FileDescriptorSet.FromString(descriptors).file:
         pool.Add(file)
     message_class = factory.GetMessageClass(pool.FindMessageTypeByName(name))

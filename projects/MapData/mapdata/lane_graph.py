@@ -65,13 +65,13 @@ class LanePaths:
                 raise InputError(f"polylines[{i}] must have shape (n >= 2, 3), got {line.shape}.")
             if not np.isfinite(line).all():
                 raise InputError(f"polylines[{i}] holds NaN or infinity.")
-        rounded = np.round(np.concatenate([np.empty((0, 3)), *polylines]), ROUND_DECIMALS)
+        rounded = np.round(np.concatenate([np.empty((0, 3)), *polylines]), decimals=ROUND_DECIMALS)
         self._points, nodes, uses = np.unique(
             rounded, axis=0, return_inverse=True, return_counts=True
         )  # (nodes, 3)
         ends = np.cumsum(list(map(len, polylines)), dtype=np.int64)
         lanes = [lane.tolist() for lane in np.split(nodes, ends)[:-1]]
-        self._edges = [_fold_points(lane, uses) for lane in lanes]
+        self._edges = [_fold_points(lane, uses=uses) for lane in lanes]
         # For each lane its links: the two lanes, and (start point id, edge).
         self._links: list[list[tuple[int, int, tuple[int, Edge]]]] = []
         for lane_links in links:
@@ -104,7 +104,8 @@ class LanePaths:
         graph = self._subgraph(key)
         targets: set[int] = set()
         for edges in graph.values():
-            targets.update(end for _, end in edges)
+            for _, end in edges:
+                targets.add(end)
         paths: list[list[int]] = []
         for node, edges in graph.items():
             if not edges or node in targets:
@@ -124,7 +125,7 @@ class LanePaths:
         points = self._points[np.array(nodes, dtype=np.int64)]
         lines = shapely.linestrings(points, indices=np.array(path_of_node, dtype=np.int64))
         self._last_key = key
-        self._last_lines = shapely.simplify(lines, SIMPLIFY_TOLERANCE_M)
+        self._last_lines = shapely.simplify(lines, tolerance=SIMPLIFY_TOLERANCE_M)
         return self._last_lines
 
     def _subgraph(self, lanes: Sequence[int]) -> dict[int, list[Edge]]:

@@ -169,12 +169,12 @@ class OutlineIndex:
         self._owners = np.array(owners, np.int64)
         self._tree = shapely.STRtree([shapely.LineString(points) for points in self._chunks])
 
-    def cut(self, patch: LocalPatch, margin_m: float) -> list[np.ndarray]:
-        """Cut the rings with a patch that is shrunk by ``margin_m`` on each side.
+    def clip(self, patch: LocalPatch, margin_m: float) -> list[np.ndarray]:
+        """Clip the rings to a patch that is shrunk by ``margin_m`` on each side.
 
         Args:
             patch: The patch.
-            margin_m: Distance of the cut from the sides of the patch, in metres.
+            margin_m: Distance of the clipping rectangle from the sides of the patch, in metres.
 
         Returns:
             Parts inside, in the patch's frame, in metres; a ring that is wholly inside stays

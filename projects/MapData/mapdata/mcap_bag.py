@@ -133,7 +133,7 @@ def _read_channels(file: Any) -> tuple[dict[int, Any], dict[int, Any], dict[int,
     if summary is not None and summary.channels:
         counts = summary.statistics.channel_message_counts if summary.statistics else {}
         return summary.channels, summary.schemas, counts
-    records = import_extra("mcap.records", "bags")
+    records = import_extra("mcap.records", extra="bags")
     channels = {}
     schemas = {}
     message_counts = Counter[int]()

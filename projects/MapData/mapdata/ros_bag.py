@@ -46,7 +46,7 @@ class RosTypes:
     """
 
     def __init__(self) -> None:
-        self._typesys = import_extra("rosbags.typesys", "bags")
+        self._typesys = import_extra("rosbags.typesys", extra="bags")
         self._common_store = self._empty_store()
         self._field_count = 0
 
@@ -136,7 +136,7 @@ class RosTypes:
 @cache
 def _standard_store() -> Any:
     """Types of ROS 2 Humble."""
-    typesys = import_extra("rosbags.typesys", "bags")
+    typesys = import_extra("rosbags.typesys", extra="bags")
     return typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
 
 

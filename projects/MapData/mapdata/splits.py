@@ -34,7 +34,7 @@ class SplitList:
     @cached_property
     def identity(self) -> str:
         """Name and digest of the list, for annotation files."""
-        return list_identity(self.name, self.scenes)
+        return list_identity(self.name, scenes=self.scenes)
 
     def missing_note(self, missing: Collection[str], total: int, where: str, allowed: bool) -> str:
         """Note on missing scenes.
@@ -98,7 +98,7 @@ def published_split(name: str, dataset: str) -> SplitList:
                 scenes[part] = []
                 for group in groups:
                     scenes[part] += lists["scenes"][group]
-            return SplitList(name, scenes, complete=True)
+            return SplitList(name, scenes=scenes, complete=True)
     known = ", ".join(split_names(dataset))
     raise InputError(f"there is no split {name!r} of {dataset}: name one of {known}.")
 
@@ -126,7 +126,7 @@ def read_split_file(path: Path) -> SplitList:
         raise InputError(f"{str(error).rstrip('.')}; a split file is JSON like {_FORM}.") from error
     if not isinstance(splits, dict) or not all(map(_is_list_of_names, splits.values())):
         raise InputError(f"split file {path} must look like {_FORM}.")
-    return SplitList(file_name(path.stem)[:100], splits)
+    return SplitList(name=file_name(path.stem)[:100], scenes=splits)
 
 
 def _is_list_of_names(value: Any) -> bool:
@@ -162,7 +162,7 @@ def requested_split(options: Any, dataset: str) -> SplitList | None:
     if options.split_name and options.split_file:
         raise InputError("name either --split-name or --split-file.")
     if options.split_name:
-        return published_split(options.split_name, dataset)
+        return published_split(options.split_name, dataset=dataset)
     return read_split_file(options.split_file) if options.split_file else None
 
 

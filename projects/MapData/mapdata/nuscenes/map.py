@@ -259,7 +259,7 @@ class NuScenesLocalMap:
     def _polylines(self, name: str, patch: LocalPatch) -> list[Points]:
         """Vertices of one class inside the patch, in metres, annotation frame. Each (n, 2)."""
         if name == "boundary":
-            return self._outlines.cut(patch, OUTLINE_MARGIN_M)
+            return self._outlines.clip(patch, OUTLINE_MARGIN_M)
         if name == CROSSING and self._crossings != UNITED:
             return self._open_crossings(patch)
         if name in self._areas:
