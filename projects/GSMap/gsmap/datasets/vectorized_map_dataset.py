@@ -160,7 +160,7 @@ class VectorizedMapDataset(BaseDataset):
             print_log(
                 f"{self.ann_file} is of an earlier version and has no checksum: damage to it may "
                 f"go unnoticed until you {self.annotations.remedy}",
-                "current",
+                logger="current",
             )
         for name in _METAINFO_OF_FILE:
             self._metainfo[name] = getattr(self.annotations.meta, name)
@@ -172,9 +172,9 @@ class VectorizedMapDataset(BaseDataset):
         return [{"row": row, "image_row": row} for row in range(len(self.annotations))]
 
     def _ground_from_first_frame(self) -> list[list[float]] | None:
-        """Return the transform from the first sample's frame to the ground, None if unknown. (4, 4)
+        """Return the transform in metres from the frame of the first sample to the ground. (4, 4)
 
-        The transform depends on the height of the road or on the mounting of the LiDAR.
+        It is None if neither the height of the road nor the mounting of the LiDAR is known.
         """
         if not len(self.annotations):
             return None
@@ -187,7 +187,11 @@ class VectorizedMapDataset(BaseDataset):
         return ground_from_frame(sample, frame=frame, ground_z_m=ground_z_m).tolist()
 
     def _first_rig(self) -> dict[str, list[float]]:
-        """Return width, height, fx, fy, cx and cy in pixels of the first sample's cameras."""
+        """Return the intrinsics of the cameras of the first sample, by the name of the camera.
+
+        Returns:
+            Width, height, fx, fy, cx and cy in pixels for each camera.
+        """
         rig = {}
         cameras = self.annotations[0].cameras if len(self.annotations) else []
         for camera in cameras:
@@ -264,6 +268,7 @@ class VectorizedMapDataset(BaseDataset):
         self.full_init()
         names = self.annotations.column("scene")
         times_ns = self.annotations.column("timestamp_ns")
+        # Time and index of each sample, by the name of the scene.
         samples: dict[str, list[tuple[int, int]]] = {}
         for index in range(len(self)):
             row = super().get_data_info(index)["row"]
@@ -275,7 +280,7 @@ class VectorizedMapDataset(BaseDataset):
         return scenes
 
     def scaled_image_size(self) -> tuple[int, int]:
-        """Return width and height of the first sample's images after scaling, in pixels."""
+        """Return the width and height of scaled images in pixels, from the first sample."""
         widths = []
         heights = []
         for camera in self.sample(0).cameras:
@@ -303,8 +308,8 @@ class VectorizedMapDataset(BaseDataset):
             Dictionary with the keys of mmdet3d's multi-view pipelines (``images``,
             ``lidar_points``, ``lidar_sweeps``, ``timestamp``), the keys of the packed metainfo,
             ``dim``, ``map_instances``, which are the elements at full resolution with ``dim``
-            coordinates per point in metres, and ``map_heights``, the heights of their points in
-            metres, K x (n,), or None for a file without heights.
+            coordinates per point in metres, and ``map_heights``, the heights of the n points of
+            each element in metres, (n,), or None for a file without heights.
 
         Raises:
             BrokenSampleError: If the sample lacks a camera of ``cameras``.

@@ -164,7 +164,7 @@ def _are_polylines(lists: pa.ListArray, _: np.ndarray, meta: AnnotationMeta) -> 
     return are_good
 
 
-_MAX_TRANSLATION_M = 1e8  # several times the circumference of the Earth
+_MAX_TRANSLATION_M = 1e8  # 2.5 times the circumference of the Earth
 _TRANSFORM = (
     _are_transforms,
     " is no rigid transform: it must be finite, with a rotation, a translation within 100,000 km "
