@@ -11,8 +11,8 @@ from gsmap.datasets.annotations.record import AnnotationMeta, MapInstance, MapSa
 from gsmap.evaluation.analysis.consistency import (
     ConsistencyConfig,
     DriveFrame,
-    by_scene,
     consistency,
+    group_by_scene,
     jitter,
     make_tracks,
     track_drive,
@@ -70,7 +70,7 @@ def test_tracks_equal_maptrackers(golden):
     """Numbers may differ: tracks are paired, both ways."""
     expected = golden["expected"]
     wanted = {entry["token"]: entry for entry in expected["pred_tracks"]}
-    for scene in by_scene(golden_frames(golden)):
+    for scene in group_by_scene(golden_frames(golden)):
         truths = make_tracks([with_lines(f, f.truth) for f in scene], CONFIG, 1, 1e-2)
         numbers = expected["gt_track_ids"][scene[0].scene]
         pairs = set()

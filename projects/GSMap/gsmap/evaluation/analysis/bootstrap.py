@@ -1,8 +1,8 @@
-"""Intervals of AP: scenes are drawn again and again, the matches of their samples stay.
+"""Confidence intervals of AP by the bootstrap over scenes.
 
-A resample has as many scenes as there are, each as often as it was drawn. Its AP is that of a file
-with copies of the samples, and no line is compared again. (Equal scores of one sample have no order
-there: here the copies of each prediction stand in a row.)
+A resample draws as many scenes with replacement as the data set has. Its AP equals the AP of a file
+with copies of the samples, in which the copies of each prediction have consecutive ranks. Matches
+of samples are computed once.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,24 +12,24 @@ from typing import Protocol
 import numpy as np
 from numba import njit
 
-import gsmap.utils.compilation  # noqa: F401 - says that kernels are compiled
+import gsmap.utils.compilation  # noqa: F401 - reports that kernels are compiled
 from gsmap.evaluation.core.report import UNDEFINED, MetricReport
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray
 from gsmap.utils.errors import InputError
 
-_RECALL_POINTS = np.linspace(0.0, 1.0, 101)
-_SPACING = np.spacing(1.0)  # that COCO adds to a denominator
-_LEVELS = (2.5, 97.5)  # percentiles of an interval of 95 %
+_RECALL_POINTS = np.linspace(0.0, 1.0, num=101)
+_SPACING = np.spacing(1.0)  # COCO adds it to a denominator
+_PERCENTILES = (2.5, 97.5)  # of an interval of 95 %
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A figure with its interval of 95 %; or a difference of two.
+    """Figure, or difference of two figures, with its interval of 95 %.
 
     Args:
-        value: The figure of all scenes.
-        low: 2.5th percentile of the resamples.
-        high: 97.5th percentile.
+        value: Figure over all scenes.
+        low: 2.5th percentile over the resamples.
+        high: 97.5th percentile over the resamples.
     """
 
     value: float
@@ -38,23 +38,23 @@ class Interval:
 
 
 class Weights(Protocol):
-    """Says how often each of some parts of the samples counts."""
+    """Weights of parts of the samples, in each of B resamples."""
 
     def draw(self, tokens: Sequence[str]) -> tuple[IntArray, FloatArray]:
-        """Return the part of each sample (S,), and how often each part counts. (B, parts)"""
+        """Return the part of each sample (S,), and the number of copies of each part (B, parts)."""
 
 
 @dataclass(frozen=True)
 class Resamples:
-    """Scenes drawn with replacement.
+    """Resamples of the scenes, drawn with replacement.
 
     Args:
         scene_of: Scene of each sample, by token.
-        count: Number of resamples.
-        seed: Of the drawing; the same makes the same resamples of the same scenes.
+        count: Number of resamples B, >= 2.
+        seed: Seed of the random numbers, >= 0; equal seeds draw equal resamples.
 
     Raises:
-        ValueError: If there are fewer than two scenes or resamples.
+        ValueError: If there are fewer than two scenes or resamples, or the seed is negative.
     """
 
     scene_of: Mapping[str, str]
@@ -62,56 +62,76 @@ class Resamples:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        scenes = len(set(self.scene_of.values()))
-        if scenes < 2 or self.count < 2 or self.seed < 0:
+        num_scenes = len(set(self.scene_of.values()))
+        if num_scenes < 2 or self.count < 2 or self.seed < 0:
             raise InputError(
                 "intervals need two scenes, two resamples and a seed >= 0 at least, got "
-                f"{scenes}, {self.count} and {self.seed}."
+                f"{num_scenes}, {self.count} and {self.seed}."
             )
 
     def draw(self, tokens: Sequence[str]) -> tuple[IntArray, FloatArray]:
-        """Return the scene of each sample (S,), and how often each scene is drawn. (B, scenes)"""
-        if missing := next((token for token in tokens if token not in self.scene_of), None):
-            raise InputError(f"the scene of sample {missing!r} is not known.")
-        scenes = [self.scene_of[token] for token in tokens]
-        names, numbers = np.unique(np.array(scenes, str), return_inverse=True)
-        shares = np.full(len(names), 1 / len(names))
+        """Draw scenes for each resample.
+
+        Args:
+            tokens: Tokens of the samples. (S,)
+
+        Returns:
+            Index of the scene of each sample (S,), and number of copies of each scene (B, scenes).
+
+        Raises:
+            ValueError: If the scene of a sample is unknown.
+        """
+        scenes = []
+        for token in tokens:
+            if token not in self.scene_of:
+                raise InputError(f"the scene of sample {token!r} is not known.")
+            scenes.append(self.scene_of[token])
+        names, scene_index = np.unique(np.array(scenes, dtype=str), return_inverse=True)
+        num_scenes = len(names)
+        probabilities = np.full(num_scenes, fill_value=1 / num_scenes)
         rng = np.random.default_rng(self.seed)
-        return numbers, rng.multinomial(len(names), shares, self.count).astype(np.float64)
+        copies = rng.multinomial(num_scenes, pvals=probabilities, size=self.count)
+        return scene_index, copies.astype(np.float64)
 
 
 @njit(cache=True)
 def _weighted_ap(
     hits: IntArray, copies: FloatArray, counted: FloatArray, total: float, interpolated: bool
 ) -> float:
-    """Return the AP of predictions of which each has some copies.
+    """Compute the AP of predictions with copies.
 
-    From the lowest score on, the precision envelope is the largest precision so far.
+    The loop starts at the lowest score, where the precision envelope is the largest precision so
+    far.
 
     Args:
-        hits: The predictions that match, in descending order of score. (H,)
-        copies: Copies of each prediction. (N,)
-        counted: Copies of all predictions up to each. (N,)
+        hits: Indices of the predictions that match, in descending order of score. (H,)
+        copies: Number of copies of each prediction. (N,)
+        counted: Number of copies of all predictions up to each. (N,)
         total: Number of ground truths, > 0.
-        interpolated: Whether AP is the mean at 101 recalls, else the area.
+        interpolated: Whether AP is the mean at 101 recalls; the area otherwise.
     """
-    found, envelope, ap = 0.0, 0.0, 0.0
+    true_positives = 0.0
     for i in hits:
-        found += copies[i]
+        true_positives += copies[i]
     point = len(_RECALL_POINTS) - 1
-    while _RECALL_POINTS[point] > found / total:
+    while _RECALL_POINTS[point] > true_positives / total:
         point -= 1
+    envelope = 0.0
+    ap = 0.0
     for i in hits[::-1]:
         if copies[i] == 0:
             continue
-        envelope = max(envelope, found / (counted[i] + _SPACING if interpolated else counted[i]))
-        found -= copies[i]
+        denominator = counted[i] + _SPACING if interpolated else counted[i]
+        envelope = max(envelope, true_positives / denominator)
+        true_positives -= copies[i]
         if not interpolated:
             ap += envelope * copies[i] / total
-        while interpolated and _RECALL_POINTS[point] > found / total:
+        while interpolated and _RECALL_POINTS[point] > true_positives / total:
             ap += envelope
             point -= 1
-    return (ap + envelope) / len(_RECALL_POINTS) if interpolated else ap  # that of recall 0 is left
+    if interpolated:
+        return (ap + envelope) / len(_RECALL_POINTS)  # the last envelope is at recall 0
+    return ap
 
 
 @njit(cache=True)
@@ -123,147 +143,211 @@ def _aps(
     gts: FloatArray,
     interpolated: bool,
 ) -> FloatArray:
-    """Return the AP of each resample and threshold; arguments as in ``resampled_aps``. (B, T)
+    """Compute ``resampled_aps`` from the indices of the hits.
 
-    ``rows`` are the hits of one threshold after another, ``ends`` where each ends.
+    Args:
+        rows: Indices of the hits at all thresholds, concatenated. (H,)
+        ends: End of each threshold in ``rows``. (T,)
+        scene: Scene of each prediction. (N,)
+        drawn: Number of copies of each scene. (B, S)
+        gts: Number of ground truths of each scene. (S,)
+        interpolated: Whether AP is the mean at 101 recalls; the area otherwise.
+
+    Returns:
+        AP; NaN without ground truths. (B, T)
     """
     aps = np.full((len(drawn), len(ends)), np.nan)
-    copies, counted = np.empty(len(scene)), np.empty(len(scene))
+    copies = np.empty(len(scene))
+    counted = np.empty(len(scene))
     for b in range(len(drawn)):
-        total, so_far = (drawn[b] * gts).sum(), 0.0
+        total = (drawn[b] * gts).sum()
+        if not total > 0:
+            continue
+        sum_of_copies = 0.0
         for i in range(len(scene)):
             copies[i] = drawn[b, scene[i]]
-            so_far += copies[i]
-            counted[i] = so_far
-        for t in range(len(ends) if total > 0 else 0):
-            hits = rows[ends[t - 1] if t else 0 : ends[t]]
-            aps[b, t] = _weighted_ap(hits, copies, counted, total, interpolated)
+            sum_of_copies += copies[i]
+            counted[i] = sum_of_copies
+        start = 0
+        for t in range(len(ends)):
+            hits = rows[start : ends[t]]
+            start = ends[t]
+            aps[b, t] = _weighted_ap(
+                hits, copies=copies, counted=counted, total=total, interpolated=interpolated
+            )
     return aps
 
 
 def resampled_aps(
     hits: BoolArray, scene: IntArray, drawn: FloatArray, gts: FloatArray, interpolated: bool
 ) -> FloatArray:
-    """Return the AP of each resample and threshold, NaN without ground truths. (B, T)
+    """Compute the AP of each resample at each threshold.
 
     Args:
         hits: Whether each prediction matches, in descending order of score. (N, T)
         scene: Scene of each prediction. (N,)
-        drawn: How often each scene is drawn. (B, S)
+        drawn: Number of copies of each scene. (B, S)
         gts: Number of ground truths of each scene. (S,)
-        interpolated: Whether AP is the mean at 101 recalls, else the area.
+        interpolated: Whether AP is the mean at 101 recalls; the area otherwise.
+
+    Returns:
+        AP; NaN without ground truths. (B, T)
     """
-    ends, rows = np.cumsum(hits.sum(axis=0)), np.nonzero(hits.T)[1]
-    return _aps(rows, ends, scene, drawn, gts, interpolated)
+    ends = np.cumsum(hits.sum(axis=0))
+    rows = np.nonzero(hits.T)[1]
+    return _aps(rows, ends=ends, scene=scene, drawn=drawn, gts=gts, interpolated=interpolated)
 
 
 def resampled_figures(report: MetricReport, resamples: Weights) -> dict[str, FloatArray]:
-    """Return every AP of a metric in each resample, by its flat key; NaN where there is none. (B,)
+    """Compute every AP of a metric in each resample.
 
-    A report without ranked predictions has none.
+    Args:
+        report: Report of the metric over all samples.
+        resamples: Weights of the samples in each of B resamples.
+
+    Returns:
+        AP by its flat key, NaN where it does not exist (B,); empty for a metric that ranks no
+        predictions.
     """
     if not report.detections:
         return {}
     scenes, drawn = resamples.draw(report.tokens)
-    by_area, per_sample = report.by_distance, report.sample_aps
-    of_class: dict[str, FloatArray] = {}
+    interpolated = not report.by_distance
+    class_aps: dict[str, FloatArray] = {}
     figures: dict[str, FloatArray] = {}
-    for name, found in report.detections.items():
-        if per_sample:
-            aps = _mean_of_samples(per_sample[name], scenes, drawn)
+    for name, ranked in report.detections.items():
+        if report.sample_aps:
+            aps = _mean_of_samples(report.sample_aps[name], scenes=scenes, drawn=drawn)
         else:
-            gts = np.bincount(scenes, found.gts_of_sample, drawn.shape[1]).astype(np.float64)
-            aps = resampled_aps(found.hits, scenes[found.samples], drawn, gts, not by_area)
-        of_class[name] = aps
-        zeros = by_area and not per_sample  # as the metric takes an absent class
-        known = np.nan_to_num(aps) if zeros else aps
-        for t, threshold in enumerate(found.thresholds):
-            figures[f"{name}/AP@{threshold}"] = known[:, t]
-        figures[f"{name}/AP"] = known.mean(axis=1)
+            gts = np.bincount(scenes, weights=ranked.gts_of_sample, minlength=drawn.shape[1])
+            aps = resampled_aps(
+                ranked.hits,
+                scene=scenes[ranked.samples],
+                drawn=drawn,
+                gts=gts.astype(np.float64),
+                interpolated=interpolated,
+            )
+        class_aps[name] = aps
+        if report.by_distance and not report.sample_aps:
+            aps = np.nan_to_num(aps)  # AP_chamfer of an absent class is 0
+        for t, threshold in enumerate(ranked.thresholds):
+            figures[f"{name}/AP@{threshold}"] = aps[:, t]
+        figures[f"{name}/AP"] = aps.mean(axis=1)
     for group, names in report.groups.items():
-        prefix = "" if by_area else f"{group}/"
-        means = _mean([of_class[name] for name in names])
+        prefix = f"{group}/" if interpolated else ""
+        means = _mean([class_aps[name] for name in names])
         for t, threshold in enumerate(report.detections[names[0]].thresholds):
             figures[f"{prefix}AP@{threshold}"] = means[:, t]
-        if not by_area:
+        if interpolated:
             figures[f"{prefix}AP"] = _mean([figures[f"{name}/AP"] for name in names])
-    figures["mAP"] = _mean([aps.mean(axis=1) for aps in of_class.values()])
+    figures["mAP"] = _mean([aps.mean(axis=1) for aps in class_aps.values()])
     return {f"{report.name}/{key}": values for key, values in figures.items()}
 
 
 def _mean_of_samples(aps: FloatArray, scenes: IntArray, drawn: FloatArray) -> FloatArray:
-    """Return the mean AP of the samples in each resample: aps (S, T), scenes (S,) -> (B, T)"""
-    known = ~np.isnan(aps)
-    sums, counts = np.zeros((2, drawn.shape[1], aps.shape[1]))
-    np.add.at(sums, scenes, np.where(known, aps, 0.0))
-    np.add.at(counts, scenes, known)
-    with np.errstate(invalid="ignore"):  # 0 / 0: NaN, as none of the drawn samples counts
+    """Compute the mean AP over the samples of each resample.
+
+    Args:
+        aps: AP of each sample, NaN where it does not count. (S, T)
+        scenes: Scene of each sample. (S,)
+        drawn: Number of copies of each scene. (B, scenes)
+
+    Returns:
+        Mean AP; NaN if no sample of the resample counts. (B, T)
+    """
+    is_known = ~np.isnan(aps)
+    num_scenes = drawn.shape[1]
+    sums = np.zeros((num_scenes, aps.shape[1]))
+    counts = np.zeros((num_scenes, aps.shape[1]))
+    np.add.at(sums, scenes, np.where(is_known, aps, 0.0))
+    np.add.at(counts, scenes, is_known)
+    with np.errstate(invalid="ignore"):  # 0 / 0 is NaN
         return np.asarray((drawn @ sums) / (drawn @ counts))
 
 
 def _mean(values: Sequence[FloatArray]) -> FloatArray:
-    """Return the mean of those that are known; NaN without any."""
-    known = ~np.isnan(values)
-    counts = known.sum(axis=0)
-    total = np.where(known, values, 0.0).sum(axis=0)
+    """Compute the mean over the first axis of the values that are not NaN; NaN without any."""
+    is_known = ~np.isnan(values)
+    counts = is_known.sum(axis=0)
+    total = np.where(is_known, values, 0.0).sum(axis=0)
     return np.where(counts > 0, total / np.maximum(counts, 1), np.nan)
 
 
 def _interval(value: float, values: FloatArray) -> Interval:
-    """Return a figure with the interval of its resamples, of those that have it."""
+    """Create the interval of a figure from its values in the resamples, NaN where undefined."""
     known = values[~np.isnan(values)]
-    low, high = np.percentile(known, _LEVELS) if len(known) else (UNDEFINED, UNDEFINED)
-    return Interval(value, float(low), float(high))
+    if not len(known):
+        return Interval(value, low=UNDEFINED, high=UNDEFINED)
+    low, high = np.percentile(known, _PERCENTILES)
+    return Interval(value, low=float(low), high=float(high))
 
 
 def ap_intervals(reports: Sequence[MetricReport], resamples: Resamples) -> dict[str, Interval]:
-    """Return every AP with its interval of 95 %, by its flat key."""
-    return {
-        key: _interval(report.metrics[key], values)
-        for report in reports
-        for key, values in resampled_figures(report, resamples).items()
-    }
+    """Compute the interval of 95 % of every AP.
+
+    Args:
+        reports: Reports of all metrics over all samples.
+        resamples: Resamples of the scenes.
+
+    Returns:
+        Intervals by flat key.
+    """
+    intervals = {}
+    for report in reports:
+        for key, values in resampled_figures(report, resamples).items():
+            intervals[key] = _interval(report.metrics[key], values)
+    return intervals
 
 
 def ap_differences(
     first: Sequence[MetricReport], second: Sequence[MetricReport], resamples: Resamples
 ) -> dict[str, Interval]:
-    """Return what the first result has more than the second, in every AP, with its interval.
+    """Compute the interval of 95 % of the difference of every AP, first minus second.
 
-    Each resample has the same scenes for both, so what makes scenes hard or easy for both takes no
-    part.
+    A resample draws equal scenes for both results, so that the difficulty of the scenes cancels.
 
     Args:
-        first: A result's figures, a metric each.
-        second: Another result's figures, of the same samples.
-        resamples: The scenes of every resample.
+        first: Reports of all metrics of the first result.
+        second: Reports of all metrics of the second result, over equal samples.
+        resamples: Resamples of the scenes.
+
+    Returns:
+        Intervals by flat key, of the figures that both results have.
 
     Raises:
-        ValueError: If they are of other metrics or samples.
+        ValueError: If metrics or samples of the results differ.
     """
-    if [(r.name, list(r.tokens)) for r in first] != [(r.name, list(r.tokens)) for r in second]:
+    first_content = [(report.name, list(report.tokens)) for report in first]
+    second_content = [(report.name, list(report.tokens)) for report in second]
+    if first_content != second_content:
         raise InputError("two results can be compared on the same samples and metrics only.")
-    found = {}
-    for one, other in zip(first, second, strict=True):
-        ours, theirs = (resampled_figures(report, resamples) for report in (one, other))
-        for key, values in ours.items():
-            if UNDEFINED not in (one.metrics[key], other.metrics[key]):
-                difference = one.metrics[key] - other.metrics[key]
-                found[key] = _interval(difference, values - theirs[key])
-    return found
+    intervals = {}
+    for first_report, second_report in zip(first, second, strict=True):
+        first_figures = resampled_figures(first_report, resamples)
+        second_figures = resampled_figures(second_report, resamples)
+        for key, values in first_figures.items():
+            first_value = first_report.metrics[key]
+            second_value = second_report.metrics[key]
+            if UNDEFINED not in (first_value, second_value):
+                difference = first_value - second_value
+                intervals[key] = _interval(difference, values=values - second_figures[key])
+    return intervals
 
 
 def format_intervals(intervals: Mapping[str, Interval], title: str, signed: bool = False) -> str:
-    """Return a table: a row per figure, with its interval.
+    """Format a table with a row per figure and its interval.
 
     Args:
-        intervals: Value and interval of every figure, by its key.
-        title: What the columns are of.
-        signed: Whether values above 0 have a plus: of differences.
+        intervals: Intervals by key.
+        title: First line of the table.
+        signed: Whether values above 0 have a plus sign, for differences.
     """
-    width, sign = max(map(len, intervals), default=0), "+" if signed else ""
-    rows = [
-        f"{key:<{width}}  {i.value:{sign}.4f}  {i.low:{sign}.4f} to {i.high:{sign}.4f}"
-        for key, i in intervals.items()
-    ]
-    return "\n".join([title, *rows])
+    width = max(map(len, intervals), default=0)
+    form = "+.4f" if signed else ".4f"
+    rows = [title]
+    for key, interval in intervals.items():
+        value = format(interval.value, form)
+        low = format(interval.low, form)
+        high = format(interval.high, form)
+        rows.append(f"{key:<{width}}  {value}  {low} to {high}")
+    return "\n".join(rows)

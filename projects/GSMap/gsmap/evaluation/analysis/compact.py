@@ -1,4 +1,4 @@
-"""Result files of few numbers: Bezier curves in place of points, within an error in metres."""
+"""Compact result files with Bezier curves in place of points, within an error in metres."""
 
 from collections.abc import Mapping
 from itertools import pairwise
@@ -19,11 +19,18 @@ from gsmap.utils.errors import InputError
 
 _DECIMALS = 3  # control points are written in whole millimetres
 _ROUNDING_M = 0.001
-_REPLACED = ("pts", "pts_num", "gaussian_scales", "gaussian_rotations")
+_POINT_KEYS = ("pts", "pts_num", "gaussian_scales", "gaussian_rotations")
 
 
 class Compaction(NamedTuple):
-    """Numbers of elements, of their vertices and control points, and the largest error."""
+    """Size of a result file before and after the compaction.
+
+    Args:
+        elements: Number of elements that have become curves.
+        vertices: Number of their vertices.
+        controls: Number of their control points.
+        largest_m: Largest distance of a curve from its line, in metres.
+    """
 
     elements: int
     vertices: int
@@ -34,59 +41,77 @@ class Compaction(NamedTuple):
 def compact_results(
     results: Path, out: Path, degree: int = 3, max_error_m: float = 0.1
 ) -> Compaction:
-    """Write a result file again with piecewise Bezier curves, which every reader here takes.
+    """Write a result file with piecewise Bezier curves, which all readers of GSMap accept.
 
-    Vectors keep their other entries, but for Gaussians, which belong to vertices. A vector of one
-    point stays as it is.
+    Vectors keep their other entries, except Gaussians, which belong to vertices. A vector of one
+    point is not changed.
 
     Args:
-        results: The result file.
-        out: The file to write.
-        degree: Of the curves, 1 to 5.
+        results: Path of the result file.
+        out: Path of the file to write.
+        degree: Degree of the curves, in [1, 5].
         max_error_m: Largest distance of a curve from its line in the plane, in metres; more than
-            the millimetre to which control points are rounded.
+            0.001, to which control points are rounded.
+
+    Returns:
+        Size of the file before and after, and the largest error.
 
     Raises:
         FileNotFoundError: If the result file does not exist.
-        ValueError: If it is malformed, or a setting is out of range.
+        ValueError: If the file is malformed, or a setting is out of range.
     """
     if max_error_m <= _ROUNDING_M:
         raise InputError(f"the error must be more than {_ROUNDING_M} m, got {max_error_m}.")
-    file, samples = SampleFile(results, RESULTS_KEY, ()), []
-    total = Compaction(0, 0, 0, 0.0)
+    file = SampleFile(results, key=RESULTS_KEY, classes=())
+    samples = []
+    num_elements = 0
+    num_vertices = 0
+    num_controls = 0
+    largest_m = 0.0
     for item, token, elements, _ in file.raw():
         vectors = []
         for vector, points in zip(item["vectors"], elements.polylines, strict=True):
-            if len(points) > 1:
-                joints = fit_joints(points, degree, max_error_m - _ROUNDING_M)
-                controls = controls_between(points, joints, degree).round(_DECIMALS)
-                vector = _with_curve(vector, controls, degree)
-                total = _added(total, points, controls, _error(points, joints, controls, degree))
-            vectors.append(vector)
+            if len(points) < 2:
+                vectors.append(vector)
+                continue
+            joints = fit_joints(points, degree, max_error_m - _ROUNDING_M)
+            controls = controls_between(points, joints, degree).round(_DECIMALS)
+            vectors.append(_replace_points(vector, controls=controls, degree=degree))
+            error_m = _largest_error(points, joints=joints, controls=controls, degree=degree)
+            num_elements += 1
+            num_vertices += len(points)
+            num_controls += len(controls)
+            largest_m = max(largest_m, error_m)
         samples.append((token, vectors))
-    write_results(out, samples, {**file.about, "bezier_max_error_m": max_error_m})
-    return total
-
-
-def _with_curve(vector: Mapping[str, Any], controls: FloatArray, degree: int) -> dict[str, Any]:
-    """Return a vector with a curve in place of its points."""
-    kept = {key: value for key, value in vector.items() if key not in _REPLACED}
-    return {**kept, BEZIER: {"degree": degree, "pts": np.asarray(controls).tolist()}}
-
-
-def _error(points: FloatArray, joints: list[int], controls: FloatArray, degree: int) -> float:
-    """Return the largest distance of a curve's pieces from their parts of a line, in metres."""
-    return max(
-        largest_deviation(
-            points[a : b + 1], curve_points(controls[i * degree : (i + 1) * degree + 1], degree)
-        )
-        for i, (a, b) in enumerate(pairwise(joints))
-    )
-
-
-def _added(total: Compaction, points: FloatArray, controls: FloatArray, error: float) -> Compaction:
-    """Count an element."""
-    largest = max(total.largest_m, error)
+    meta = {**file.about, "bezier_max_error_m": max_error_m}
+    write_results(out, samples=samples, meta=meta)
     return Compaction(
-        total.elements + 1, total.vertices + len(points), total.controls + len(controls), largest
+        elements=num_elements, vertices=num_vertices, controls=num_controls, largest_m=largest_m
     )
+
+
+def _replace_points(vector: Mapping[str, Any], controls: FloatArray, degree: int) -> dict[str, Any]:
+    """Replace the points of a vector by a curve."""
+    entries = {key: value for key, value in vector.items() if key not in _POINT_KEYS}
+    entries[BEZIER] = {"degree": degree, "pts": np.asarray(controls).tolist()}
+    return entries
+
+
+def _largest_error(
+    points: FloatArray, joints: list[int], controls: FloatArray, degree: int
+) -> float:
+    """Compute the largest distance in metres of the pieces of a curve from their parts of a line.
+
+    Args:
+        points: Vertices of the line in metres. (n, D)
+        joints: Indices of the vertices at which pieces begin and end.
+        controls: Control points of all pieces; neighbours have one in common. (m, D)
+        degree: Degree of the curve.
+    """
+    errors = []
+    for piece, (start, end) in enumerate(pairwise(joints)):
+        first_control = piece * degree
+        piece_controls = controls[first_control : first_control + degree + 1]
+        curve = curve_points(piece_controls, degree=degree)
+        errors.append(largest_deviation(points[start : end + 1], curve))
+    return max(errors)

@@ -1,8 +1,8 @@
 """Consistency over the frames of a drive: tracks, C-mAP of MapTracker, jitter of vertices.
 
-The rules are those of MapTracker's released tools, which differ from AP_chamfer: predictions of
-score 0.4 or less are left out, a frame without ground truth of a class does not count for it, lines
-have 200 points, and no strips must touch.
+Rules are equal to MapTracker's released tools and differ from AP_chamfer: predictions with a score
+of 0.4 or less are left out, a frame without ground truth of a class does not count for the class,
+lines have 200 points, and strips need not touch.
 """
 
 from collections.abc import Iterable, Sequence
@@ -22,8 +22,12 @@ from gsmap.structures.polylines import resample_all
 from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.errors import InputError
 
-TRACK_POINTS, CHAMFER_POINTS = 20, 200
-_LONG_PX, _SHORT_PX, _LINE_PX, _SMALL_PX = 200, 100, 3, 20
+TRACK_POINTS = 20
+CHAMFER_POINTS = 200
+_LONG_PX = 200
+_SHORT_PX = 100
+_LINE_PX = 3
+_SMALL_PX = 20
 _SIMPLIFY_M = 0.2
 
 
@@ -33,13 +37,14 @@ class ConsistencyConfig:
 
     Args:
         classes: Names of the classes; a label is an index into them.
-        grid: The map's extent.
-        filled_classes: Labels that are drawn as areas when tracks are made.
+        grid: Extent of the map in metres.
+        filled_classes: Labels of the classes that are drawn as areas to create tracks.
         thresholds: Largest Chamfer distances of a match, in metres.
-        min_score: Predictions must have a higher score.
-        look_back: Earlier frames in which a predicted track may continue.
-        min_iou: Smallest overlap, exclusive, of two predictions of a track.
-        min_truth_iou: The same for ground truth, whose tracks continue from the frame before.
+        min_score: Score that predictions must exceed, in [0, 1].
+        look_back: Number of earlier frames from which a predicted track may continue, >= 1.
+        min_iou: IoU that neighbouring predictions of a track must exceed.
+        min_truth_iou: IoU that neighbouring ground truths of a track must exceed; their tracks
+            continue from the previous frame alone.
 
     Raises:
         ValueError: If a value is out of its range.
@@ -66,16 +71,18 @@ class ConsistencyConfig:
 
 @dataclass
 class DriveFrame:
-    """A frame of a drive; frames of a scene are given in the order of their times.
+    """Frame of a drive; the frames of a scene are in the order of their times.
 
     Args:
-        token: Its name.
-        scene: Name of its scene.
-        pose: From the annotation frame to the world. (4, 4)
-        predictions: What the model predicts.
-        truth: What is annotated.
-        track_ids: Track of each prediction, of one scene and class, -1 for none; None to make
+        token: Name of the frame.
+        scene: Name of the scene.
+        pose: Transform from the annotation frame to the world, in metres. (4, 4)
+        predictions: Predicted elements, in metres in the annotation frame. N in number.
+        truth: Annotated elements, in metres in the annotation frame.
+        track_ids: Track of each prediction within scene and class, -1 for none; None to create
             tracks. (N,)
+        lines: Lines to track, in metres in the annotation frame (`with_lines`). (n, 20, 2)
+        labels: Class index of each line to track. (n,)
     """
 
     token: str
@@ -88,27 +95,37 @@ class DriveFrame:
     labels: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
 
 
-def _resampled(elements: MapElements, num_points: int) -> FloatArray:
-    """Return all lines in the plane, at equal arc length. (N, P, 2)"""
-    return resample_all(elements.points[:, :2].astype(np.float64), elements.offsets, num_points)
+def _resample(elements: MapElements, num_points: int) -> FloatArray:
+    """Resample all lines at equal arc length in the plane. (N, P, 2)"""
+    points = elements.points[:, :2].astype(np.float64)
+    return resample_all(points, elements.offsets, num_points=num_points)
 
 
 def draw_line(line: FloatArray, filled: bool, grid: BEVGrid) -> BoolArray:
-    """Draw a line as MapTracker's tracks see it: an area, or 3 pixels wide. (P, 2) -> (h, w)
+    """Draw a line to a mask, as MapTracker does to create tracks.
 
-    The longer side has 200 pixels; what covers less than 20 pixels is made thicker.
+    Lines are 3 pixels wide. A mask of fewer than 20 pixels is dilated.
+
+    Args:
+        line: Vertices in metres. (P, 2)
+        filled: Whether the line is drawn as an area.
+        grid: Extent of the map in metres; its longer side has 200 pixels, the other 100.
+
+    Returns:
+        Mask. (h, w)
     """
-    along_x = grid.extent_m[0] >= grid.extent_m[1]
-    width, height = (_LONG_PX, _SHORT_PX) if along_x else (_SHORT_PX, _LONG_PX)
+    x_m, y_m = grid.extent_m
+    width = _LONG_PX if x_m >= y_m else _SHORT_PX
+    height = _SHORT_PX if x_m >= y_m else _LONG_PX
     norm = np.clip(grid.norm_from_metres(line), 0.0, 1.0)
     pixels = (norm * (width, height)).astype(np.int32)
-    mask = np.zeros((height, width), np.uint8)
+    mask = np.zeros((height, width), dtype=np.uint8)
     if filled:
-        cv2.fillPoly(mask, [pixels], (1,))
+        cv2.fillPoly(mask, [pixels], color=(1,))
     else:
         cv2.polylines(mask, [pixels], isClosed=False, color=(1,), thickness=_LINE_PX)
     if mask.sum() < _SMALL_PX:
-        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, ksize=(7, 7))
         return cv2.dilate(mask, kernel).astype(bool)
     return mask.astype(bool)
 
@@ -116,205 +133,323 @@ def draw_line(line: FloatArray, filled: bool, grid: BEVGrid) -> BoolArray:
 def overlaps(
     now: Sequence[FloatArray], before: Sequence[FloatArray], filled: bool, grid: BEVGrid
 ) -> FloatArray:
-    """Return the IoU of lines now with earlier ones that were moved here. (N, M)"""
+    """Compute the IoU of the masks of current and earlier lines.
+
+    Args:
+        now: Current lines in metres. N x (P, 2)
+        before: Earlier lines in metres in the current frame. M x (P, 2)
+        filled: Whether lines are drawn as areas.
+        grid: Extent of the map in metres.
+
+    Returns:
+        IoU in [0, 1]. (N, M)
+    """
     if not len(now) or not len(before):
         return np.zeros((len(now), len(before)))
-    first, second = (
-        np.stack([draw_line(line, filled, grid).ravel() for line in lines])
-        for lines in (now, before)
-    )
-    shared = first.astype(np.float64) @ second.T
-    return shared / np.maximum(first.sum(1)[:, None] + second.sum(1) - shared, 1)
+    now_masks = _draw_lines(now, filled=filled, grid=grid)
+    before_masks = _draw_lines(before, filled=filled, grid=grid)
+    intersections = now_masks.astype(np.float64) @ before_masks.T
+    area_sums = now_masks.sum(axis=1)[:, None] + before_masks.sum(axis=1)
+    return intersections / np.maximum(area_sums - intersections, 1)
 
 
-def moved(lines: FloatArray, now_from_then: FloatArray) -> FloatArray:
-    """Move lines in the plane by the vehicle's motion (4, 4). (N, P, 2) -> (N, P, 2)"""
+def _draw_lines(lines: Sequence[FloatArray], filled: bool, grid: BEVGrid) -> BoolArray:
+    """Draw each line to a flat mask. (N, h * w)"""
+    return np.stack([draw_line(line, filled=filled, grid=grid).ravel() for line in lines])
+
+
+def transform_lines(lines: FloatArray, now_from_then: FloatArray) -> FloatArray:
+    """Transform lines of an earlier frame to the current frame, in the plane.
+
+    Args:
+        lines: Lines in metres in the earlier frame. (N, P, 2)
+        now_from_then: Transform from the earlier to the current frame, in metres. (4, 4)
+
+    Returns:
+        Lines in metres in the current frame. (N, P, 2)
+    """
     return lines @ now_from_then[:2, :2].T + now_from_then[:2, 3]
 
 
 def partners(
     now: DriveFrame, then: DriveFrame, label: int, config: ConsistencyConfig, min_iou: float
 ) -> dict[int, int]:
-    """Return which line now continues which line then, of one class."""
-    rows, cols = (np.flatnonzero(frame.labels == label) for frame in (now, then))
-    here = moved(then.lines[cols], invert_rigid(now.pose) @ then.pose)
-    filled = label in config.filled_classes
-    ious = overlaps(list(now.lines[rows]), list(here), filled, config.grid)
-    pairs = zip(*linear_sum_assignment(-ious), strict=True)
-    return {int(rows[i]): int(cols[j]) for i, j in pairs if ious[i, j] > min_iou}
+    """Assign the lines of a frame to the lines of an earlier frame by the IoU of their masks.
+
+    Args:
+        now: Current frame.
+        then: Earlier frame.
+        label: Label of the class.
+        config: Rules of the tracks.
+        min_iou: IoU that a pair must exceed.
+
+    Returns:
+        Index of the earlier line by index of the current line.
+    """
+    rows = np.flatnonzero(now.labels == label)
+    columns = np.flatnonzero(then.labels == label)
+    now_from_then = invert_rigid(now.pose) @ then.pose
+    earlier_lines = transform_lines(then.lines[columns], now_from_then)
+    ious = overlaps(
+        list(now.lines[rows]),
+        list(earlier_lines),
+        filled=label in config.filled_classes,
+        grid=config.grid,
+    )
+    pairs = {}
+    for i, j in zip(*linear_sum_assignment(-ious), strict=True):
+        if ious[i, j] > min_iou:
+            pairs[int(rows[i])] = int(columns[j])
+    return pairs
 
 
 def make_tracks(
     frames: Sequence[DriveFrame], config: ConsistencyConfig, look_back: int, min_iou: float
 ) -> list[IntArray]:
-    """Give each line of a scene's frames a track.
+    """Create the tracks of the lines of one scene.
 
-    A line takes the track of its partner in the nearest earlier frame whose track is still free in
-    its own frame, else a new one.
+    A line continues the track of its partner in the nearest earlier frame, if no line of its class
+    in the current frame has this track. Otherwise, a track begins.
+
+    Args:
+        frames: Frames of the scene, with ``lines`` and ``labels``.
+        config: Rules of the tracks.
+        look_back: Number of earlier frames from which a track may continue.
+        min_iou: IoU that neighbouring lines of a track must exceed.
 
     Returns:
-        The tracks of each frame's lines; numbers are of one scene. (N,) each
+        Track of each line of each frame; numbers are unique in the scene. (n,) each
     """
     tracks: list[IntArray] = []
-    new = 0
+    num_tracks = 0
     for index, frame in enumerate(frames):
-        own = np.full(len(frame.lines), -1)
+        frame_tracks = np.full(len(frame.lines), fill_value=-1)
+        first = max(0, index - look_back)
         for label in range(len(config.classes)):
-            earlier = range(index - 1, max(-1, index - 1 - look_back), -1)
-            found = [(t, partners(frame, frames[t], label, config, min_iou)) for t in earlier]
             used: set[int] = set()
-            for t, pairs in found:
-                for row, col in pairs.items():
-                    track = int(tracks[t][col])
-                    if own[row] < 0 and track not in used:
-                        own[row] = track
+            for earlier in range(index - 1, first - 1, -1):
+                pairs = partners(
+                    frame, frames[earlier], label=label, config=config, min_iou=min_iou
+                )
+                for row, column in pairs.items():
+                    track = int(tracks[earlier][column])
+                    if frame_tracks[row] < 0 and track not in used:
+                        frame_tracks[row] = track
                         used.add(track)
-        missing = np.flatnonzero(own < 0)
-        own[missing] = np.arange(new, new + len(missing))
-        new += len(missing)
-        tracks.append(own)
+        missing = np.flatnonzero(frame_tracks < 0)
+        frame_tracks[missing] = np.arange(num_tracks, num_tracks + len(missing))
+        num_tracks += len(missing)
+        tracks.append(frame_tracks)
     return tracks
 
 
 def with_lines(frame: DriveFrame, elements: MapElements) -> DriveFrame:
-    """Return a frame whose tracks are those of some elements."""
-    lines = _resampled(elements, TRACK_POINTS)
+    """Return a copy of a frame with the lines of some elements to track."""
+    lines = _resample(elements, num_points=TRACK_POINTS)
     return replace(frame, lines=lines, labels=np.asarray(elements.labels))
 
 
 def track_drive(frames: Sequence[DriveFrame], config: ConsistencyConfig) -> list[IntArray]:
-    """Give the predictions of a scene's frames tracks; those of a low score get -1. (N,) each"""
-    kept = [frame.predictions.confidence > config.min_score for frame in frames]
-    drawn = [with_lines(f, f.predictions.select(k)) for f, k in zip(frames, kept, strict=True)]
-    made = make_tracks(drawn, config, config.look_back, config.min_iou)
+    """Create the tracks of the predictions of one scene.
+
+    Args:
+        frames: Frames of the scene.
+        config: Rules of the tracks.
+
+    Returns:
+        Track of each prediction of each frame; -1 for a score of ``min_score`` or less. (N,) each
+    """
+    line_frames = []
+    for frame in frames:
+        is_confident = frame.predictions.confidence > config.min_score
+        line_frames.append(with_lines(frame, frame.predictions.select(is_confident)))
+    line_tracks = make_tracks(
+        line_frames, config=config, look_back=config.look_back, min_iou=config.min_iou
+    )
     tracks = []
-    for frame, keep, own in zip(frames, kept, made, strict=True):
-        ids = np.full(len(frame.predictions), -1)
-        ids[keep] = own
+    for frame, frame_tracks in zip(frames, line_tracks, strict=True):
+        ids = np.full(len(frame.predictions), fill_value=-1)
+        ids[frame.predictions.confidence > config.min_score] = frame_tracks
         tracks.append(ids)
     return tracks
 
 
 def tracks_of(frames: Sequence[DriveFrame], config: ConsistencyConfig) -> list[IntArray]:
-    """Return the tracks of a scene's predictions, their own or made."""
-    made = track_drive(frames, config)
-    pairs = zip(frames, made, strict=True)
-    return [own if frame.track_ids is None else frame.track_ids for frame, own in pairs]
+    """Return the tracks of the predictions of one scene, which are created where a frame has none.
+
+    Args:
+        frames: Frames of the scene.
+        config: Rules of the tracks.
+
+    Returns:
+        Track of each prediction of each frame, or -1. (N,) each
+    """
+    tracks = track_drive(frames, config)
+    for index, frame in enumerate(frames):
+        if frame.track_ids is not None:
+            tracks[index] = frame.track_ids
+    return tracks
 
 
 def _chamfer_lines(elements: MapElements, simplify: bool) -> kernels.Lines:
-    """Return lines of 200 points for the Chamfer distance; ground truth is simplified first."""
-    lines = elements.polylines
+    """Convert elements to lines of 200 points for the Chamfer distance.
+
+    With ``simplify``, lines are simplified and resampled to 20 points first, as for ground truth.
+    """
+    lines = [line[:, :2] for line in elements.polylines]
     if simplify:
-        simple = [
-            np.asarray(shapely.LineString(line[:, :2]).simplify(_SIMPLIFY_M).coords)
-            for line in lines
-        ]
-        twenty = MapElements.from_polylines(simple, elements.labels)
-        lines = list(_resampled(twenty, TRACK_POINTS))
-    elements = MapElements.from_polylines([line[:, :2] for line in lines], elements.labels)
-    points = _resampled(elements, CHAMFER_POINTS).reshape(-1, 2).T
+        simplified = []
+        for line in lines:
+            curve = shapely.LineString(line).simplify(_SIMPLIFY_M)
+            simplified.append(np.asarray(curve.coords))
+        simplified_elements = MapElements.from_polylines(simplified, labels=elements.labels)
+        lines = list(_resample(simplified_elements, num_points=TRACK_POINTS))
+    elements = MapElements.from_polylines(lines, labels=elements.labels)
+    points = _resample(elements, num_points=CHAMFER_POINTS).reshape(-1, 2).T
     offsets = np.arange(len(elements) + 1) * CHAMFER_POINTS
-    return np.concatenate([points, np.zeros_like(points[:1])]), offsets, elements.labels
+    heights = np.zeros_like(points[:1])
+    return np.concatenate([points, heights]), offsets, elements.labels
 
 
 @dataclass(frozen=True)
 class FrameHits:
-    """Predictions of one class in one frame that has ground truth of it, best first."""
+    """Predictions of one class in a frame with ground truth of the class, best first.
 
-    scores: FloatArray  # (N,)
-    tracks: IntArray  # (N,)
-    nearest: IntArray  # its track of the nearest ground truth (N,)
-    rows: IntArray  # number of that ground truth in the frame (N,)
-    distances: FloatArray  # to it, in metres (N,)
+    Args:
+        scores: Score of each prediction. (N,)
+        tracks: Track of each prediction. (N,)
+        nearest: Track of the ground truth nearest to each prediction. (N,)
+        rows: Index of this ground truth in the frame. (N,)
+        distances: Chamfer distance of this ground truth in metres. (N,)
+    """
+
+    scores: FloatArray
+    tracks: IntArray
+    nearest: IntArray
+    rows: IntArray
+    distances: FloatArray
 
     def hits(self, threshold: float, owners: dict[int, int] | None) -> BoolArray:
-        """Return which predictions count; owners of ground-truth tracks are kept in place. (N,)
+        """Compute whether each prediction matches.
 
-        Without owners they count as in plain AP.
+        Args:
+            threshold: Largest Chamfer distance of a match, in metres.
+            owners: Predicted track by track of the ground truth, from earlier frames; updated. A
+                match must have the predicted track of the ground truth. None for plain AP.
+
+        Returns:
+            Whether each prediction matches. (N,)
         """
-        found = np.zeros(len(self.scores), bool)
-        taken: set[int] = set()
-        for index, (row, distance) in enumerate(zip(self.rows, self.distances, strict=True)):
-            if distance > threshold or row in taken:
+        is_hit = np.zeros(len(self.scores), dtype=bool)
+        taken_rows: set[int] = set()
+        for index in range(len(self.scores)):
+            row = int(self.rows[index])
+            if self.distances[index] > threshold or row in taken_rows:
                 continue
-            taken.add(int(row))
-            track = int(self.tracks[index])
-            owner = owners.setdefault(int(self.nearest[index]), track) if owners is not None else 0
-            found[index] = owners is None or owner == track
-        return found
+            taken_rows.add(row)
+            if owners is None:
+                is_hit[index] = True
+            else:
+                track = int(self.tracks[index])
+                owner = owners.setdefault(int(self.nearest[index]), track)
+                is_hit[index] = owner == track
+        return is_hit
 
 
-def _told_apart(tracks: Sequence[IntArray]) -> list[IntArray]:
-    """Give each prediction of a scene that has no track (-1) one of its own, below -1. (N,) each"""
-    found, last = [], -1
-    for own in tracks:
-        none = own < 0
-        found.append(np.where(none, last - none.cumsum(), own))
-        last -= int(none.sum())
-    return found
+def _number_untracked(tracks: Sequence[IntArray]) -> list[IntArray]:
+    """Give each prediction of a scene without a track a unique number below -1. (N,) each"""
+    numbered = []
+    last = -1
+    for frame_tracks in tracks:
+        is_untracked = frame_tracks < 0
+        numbers = last - is_untracked.cumsum()
+        numbered.append(np.where(is_untracked, numbers, frame_tracks))
+        last -= int(is_untracked.sum())
+    return numbered
 
 
 def score_scene(
     frames: Sequence[DriveFrame], config: ConsistencyConfig
 ) -> tuple[list[list[FrameHits]], IntArray]:
-    """Compare the predictions of a scene with its ground truth.
+    """Compare the predictions of one scene with its ground truth.
+
+    Args:
+        frames: Frames of the scene.
+        config: Rules of the metric.
 
     Returns:
-        For each class the frames that have ground truth of it; the elements of each class.
+        Frames with ground truth of each class, and number of ground truths of each class. 2 x (C,)
     """
-    truths = make_tracks([with_lines(f, f.truth) for f in frames], config, 1, config.min_truth_iou)
-    predicted = _told_apart(tracks_of(frames, config))
-    of_class: list[list[FrameHits]] = [[] for _ in config.classes]
-    counts = np.zeros(len(config.classes), np.int64)
-    for frame, gt_tracks, tracks in zip(frames, truths, predicted, strict=True):
-        gts = _chamfer_lines(frame.truth, simplify=True)
-        preds = _chamfer_lines(frame.predictions, simplify=False)
-        distances = kernels.pair_distances(preds, gts, np.inf)
+    truth_frames = [with_lines(frame, frame.truth) for frame in frames]
+    truth_tracks = make_tracks(
+        truth_frames, config=config, look_back=1, min_iou=config.min_truth_iou
+    )
+    pred_tracks = _number_untracked(tracks_of(frames, config))
+    class_frames: list[list[FrameHits]] = [[] for _ in config.classes]
+    num_gts = np.zeros(len(config.classes), dtype=np.int64)
+    for frame, gt_tracks, tracks in zip(frames, truth_tracks, pred_tracks, strict=True):
+        gt_lines = _chamfer_lines(frame.truth, simplify=True)
+        pred_lines = _chamfer_lines(frame.predictions, simplify=False)
+        distances = kernels.pair_distances(pred_lines, gt=gt_lines, max_distance=np.inf)
         scores = frame.predictions.confidence
-        for label, found in enumerate(of_class):
-            rows = np.flatnonzero(frame.truth.labels == label)
-            if not len(rows):
+        for label in range(len(config.classes)):
+            gts = np.flatnonzero(frame.truth.labels == label)
+            if not len(gts):
                 continue
-            counts[label] += len(rows)
-            chosen = (frame.predictions.labels == label) & (scores > config.min_score)
-            best = np.flatnonzero(chosen)
-            best = best[np.argsort(-scores[best], kind="stable")]
-            nearest = rows[distances[best][:, rows].argmin(1)]
-            found.append(
-                FrameHits(
-                    scores[best], tracks[best], gt_tracks[nearest], nearest,
-                    distances[best, nearest],
-                )
-            )  # fmt: skip
-    return of_class, counts
+            num_gts[label] += len(gts)
+            is_class = frame.predictions.labels == label
+            preds = np.flatnonzero(is_class & (scores > config.min_score))
+            preds = preds[np.argsort(-scores[preds], kind="stable")]
+            nearest = gts[distances[preds][:, gts].argmin(axis=1)]
+            hits = FrameHits(
+                scores=scores[preds],
+                tracks=tracks[preds],
+                nearest=gt_tracks[nearest],
+                rows=nearest,
+                distances=distances[preds, nearest],
+            )
+            class_frames[label].append(hits)
+    return class_frames, num_gts
 
 
 def jitter(frames: Sequence[DriveFrame], tracks: Sequence[IntArray], grid: BEVGrid) -> FloatArray:
-    """Return how far the lines of tracks move over the ground between consecutive frames.
+    """Compute how far lines with a track move over the ground between consecutive frames.
 
-    Points of the earlier line that lie on the map now are compared with the nearest point of the
-    line now: the mean of each pair, in metres. (pairs,)
+    Points of the earlier line that are inside the current map are compared with the nearest point
+    of the current line.
+
+    Args:
+        frames: Frames of one scene.
+        tracks: Track of each prediction of each frame, or -1. (N,) each
+        grid: Extent of the map in metres.
+
+    Returns:
+        Mean distance in metres of each pair of consecutive lines of a track. (pairs,)
     """
-    found = []
+    distances_m = []
     for index in range(1, len(frames)):
-        now, then = frames[index], frames[index - 1]
-        motion = invert_rigid(now.pose) @ then.pose
-        lines = _resampled(now.predictions, CHAMFER_POINTS)
-        before = moved(_resampled(then.predictions, CHAMFER_POINTS), motion)
+        now = frames[index]
+        then = frames[index - 1]
+        now_from_then = invert_rigid(now.pose) @ then.pose
+        lines = _resample(now.predictions, num_points=CHAMFER_POINTS)
+        earlier_lines = _resample(then.predictions, num_points=CHAMFER_POINTS)
+        earlier_lines = transform_lines(earlier_lines, now_from_then)
         for row, track in enumerate(tracks[index]):
-            same = then.predictions.labels == now.predictions.labels[row]
-            for earlier in np.flatnonzero(same & (tracks[index - 1] == track) & (track >= 0)):
-                norm = grid.norm_from_metres(before[earlier])
-                points = before[earlier][((norm >= 0) & (norm <= 1)).all(1)]
+            if track < 0:
+                continue
+            is_class = then.predictions.labels == now.predictions.labels[row]
+            for earlier in np.flatnonzero(is_class & (tracks[index - 1] == track)):
+                norm = grid.norm_from_metres(earlier_lines[earlier])
+                is_inside = ((norm >= 0) & (norm <= 1)).all(axis=1)
+                points = earlier_lines[earlier][is_inside]
                 if len(points):
-                    steps = np.linalg.norm(points[:, None] - lines[row], axis=-1)
-                    found.append(float(steps.min(1).mean()))
-    return np.array(found)
+                    distances = np.linalg.norm(points[:, None] - lines[row], axis=-1)
+                    distances_m.append(float(distances.min(axis=1).mean()))
+    return np.array(distances_m)
 
 
-def by_scene(frames: Iterable[DriveFrame]) -> list[list[DriveFrame]]:
-    """Return the frames of each scene, in the order in which they come."""
+def group_by_scene(frames: Iterable[DriveFrame]) -> list[list[DriveFrame]]:
+    """Group frames by scene; scenes are in the order of their first frames."""
     scenes: dict[str, list[DriveFrame]] = {}
     for frame in frames:
         scenes.setdefault(frame.scene, []).append(frame)
@@ -322,44 +457,65 @@ def by_scene(frames: Iterable[DriveFrame]) -> list[list[DriveFrame]]:
 
 
 def consistency(frames: Iterable[DriveFrame], config: ConsistencyConfig) -> dict[str, float]:
-    """Return C-mAP, mAP of the same predictions without its rule, and jitter.
+    """Compute C-mAP, mAP by equal rules without consistency, and jitter.
 
-    Keys are ``consistency/CAP@0.5/<class>``, ``consistency/C-mAP``, ``consistency/mAP`` and
-    ``consistency/jitter_m`` (-1 without tracks).
+    Args:
+        frames: Frames of all scenes; the frames of a scene are in the order of their times.
+        config: Rules of the metric.
+
+    Returns:
+        Figures by ``consistency/CAP@0.5/<class>``, ``consistency/AP@0.5/<class>``,
+        ``consistency/C-mAP``, ``consistency/mAP`` and ``consistency/jitter_m`` (-1 without tracks).
     """
-    scenes = by_scene(frames)
-    scored = [score_scene(scene, config) for scene in scenes]
-    totals = np.sum([counts for _, counts in scored], axis=0)
+    scenes = group_by_scene(frames)
+    scene_hits = []
+    scene_counts = []
+    for scene in scenes:
+        class_frames, num_gts = score_scene(scene, config)
+        scene_hits.append(class_frames)
+        scene_counts.append(num_gts)
+    totals = np.sum(scene_counts, axis=0)
     figures: dict[str, float] = {}
-    means: dict[str, list[float]] = {"CAP": [], "AP": []}
+    all_aps: dict[str, list[float]] = {"CAP": [], "AP": []}
     for label, name in enumerate(config.classes):
+        class_hits = [class_frames[label] for class_frames in scene_hits]
         for threshold in config.thresholds:
-            for kind, aps in means.items():
-                hits, scores = _ranked(scored, label, threshold, kind == "CAP")
-                order = np.argsort(-scores, kind="stable")
-                ap = area_ap(hits[order], int(totals[label]))
+            for kind, aps in all_aps.items():
+                ap = _average_precision(
+                    class_hits,
+                    num_gts=int(totals[label]),
+                    threshold=threshold,
+                    consistent=kind == "CAP",
+                )
                 figures[f"consistency/{kind}@{threshold}/{name}"] = ap
                 aps.append(ap)
-    figures["consistency/C-mAP"], figures["consistency/mAP"] = (
-        float(np.mean(aps)) for aps in means.values()
-    )
-    steps = [jitter(scene, tracks_of(scene, config), config.grid) for scene in scenes]
-    every = np.concatenate([np.empty(0), *steps])
-    figures["consistency/jitter_m"] = float(every.mean()) if len(every) else -1.0
+    figures["consistency/C-mAP"] = float(np.mean(all_aps["CAP"]))
+    figures["consistency/mAP"] = float(np.mean(all_aps["AP"]))
+    jitters = [np.empty(0)]
+    for scene in scenes:
+        jitters.append(jitter(scene, tracks_of(scene, config), grid=config.grid))
+    jitter_m = np.concatenate(jitters)
+    figures["consistency/jitter_m"] = float(jitter_m.mean()) if len(jitter_m) else -1.0
     return figures
 
 
-def _ranked(
-    scored: Sequence[tuple[list[list[FrameHits]], IntArray]],
-    label: int,
-    threshold: float,
-    consistent: bool,
-) -> tuple[BoolArray, FloatArray]:
-    """Return hits and scores of a class in all frames. 2 x (N,)"""
-    hits, scores = [np.empty(0, bool)], [np.empty(0)]
-    for of_class, _ in scored:
+def _average_precision(
+    scenes: Sequence[Sequence[FrameHits]], num_gts: int, threshold: float, consistent: bool
+) -> float:
+    """Compute the AP of one class over all scenes.
+
+    Args:
+        scenes: Frames of each scene with ground truth of the class.
+        num_gts: Number of ground truths of the class.
+        threshold: Largest Chamfer distance of a match, in metres.
+        consistent: Whether matches must continue the tracks of earlier frames.
+    """
+    hits = [np.empty(0, dtype=bool)]
+    scores = [np.empty(0)]
+    for scene in scenes:
         owners: dict[int, int] | None = {} if consistent else None
-        for frame in of_class[label]:
+        for frame in scene:
             hits.append(frame.hits(threshold, owners))
             scores.append(frame.scores)
-    return np.concatenate(hits), np.concatenate(scores)
+    order = np.argsort(-np.concatenate(scores), kind="stable")
+    return area_ap(np.concatenate(hits)[order], num_gts=num_gts)

@@ -1,4 +1,4 @@
-"""AP at distances from the vehicle: of the map cut along circles around it."""
+"""AP by distance from the vehicle: maps are cut along circles around it."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
@@ -9,14 +9,14 @@ import shapely
 from gsmap.evaluation.analysis.calibration import DISTANCES_M
 from gsmap.evaluation.analysis.groups import Groups
 from gsmap.evaluation.core.metric import Sample
-from gsmap.structures.elements import FloatArray, IntArray, MapElements
+from gsmap.structures.elements import FloatArray, MapElements
 from gsmap.structures.polylines import is_closed
 
-SHORTEST_M = 1.0  # shorter pieces of lines, and areas of fewer square metres, are left out
+SHORTEST_M = 1.0  # shorter pieces of lines, and pieces of areas below its square, are left out
 _SEPARATOR = " at "
 _BANDS = [
-    f"{low:g}-{high:g} m" if np.isfinite(high) else f"beyond {low:g} m"
-    for low, high in pairwise(DISTANCES_M)
+    f"{inner_m:g}-{outer_m:g} m" if np.isfinite(outer_m) else f"beyond {inner_m:g} m"
+    for inner_m, outer_m in pairwise(DISTANCES_M)
 ]
 
 
@@ -24,44 +24,42 @@ def cut_by_distance(samples: Iterable[Sample], areas: Sequence[int]) -> Iterator
     """Cut the map of each sample along circles around the vehicle.
 
     Args:
-        samples: Token, predictions and ground truth of each, in metres around the vehicle.
+        samples: Samples in metres around the vehicle.
         areas: Labels of the classes that are areas; the others are lines.
 
     Yields:
-        For each sample one with the pieces in each band. A piece has the label and the score of
-        its element.
+        For each sample a new sample per band, with the pieces in the band. A piece has the label
+        and the score of its element.
     """
     for token, predictions, truth in samples:
-        sides = (_in_bands(elements, areas) for elements in (predictions, truth))
-        for name, *pieces in zip(_BANDS, *sides, strict=True):
-            yield Sample(f"{token}{_SEPARATOR}{name}", *pieces)
+        pred_bands = _split_by_band(predictions, areas)
+        gt_bands = _split_by_band(truth, areas)
+        for band, name in enumerate(_BANDS):
+            yield Sample(f"{token}{_SEPARATOR}{name}", pred_bands[band], gt_bands[band])
 
 
 def distance_groups(tokens: Iterable[str]) -> Groups:
-    """Return the band of each sample that `cut_by_distance` made."""
-    return Groups({token: token.rsplit(_SEPARATOR, 1)[1] for token in tokens})
+    """Return the band of each sample that `cut_by_distance` has created, by token."""
+    return Groups({token: token.rsplit(_SEPARATOR, maxsplit=1)[1] for token in tokens})
 
 
-def _in_bands(elements: MapElements, areas: Sequence[int]) -> list[MapElements]:
+def _split_by_band(elements: MapElements, areas: Sequence[int]) -> list[MapElements]:
     """Return the pieces of all elements in each band."""
     pieces: list[list[FloatArray]] = [[] for _ in _BANDS]
-    owners: list[list[int]] = [[] for _ in pieces]
+    owners: list[list[int]] = [[] for _ in _BANDS]
     for row, (points, label, _) in enumerate(elements.with_coordinates(2).rows):
         cut = cut_area if label in areas else cut_line
         for band, piece in cut(points):
             pieces[band].append(piece)
             owners[band].append(row)
-    scores = elements.scores
-    return [
-        MapElements.from_polylines(
-            own, elements.labels[rows], None if scores is None else scores[rows]
+    band_elements = []
+    for band in range(len(_BANDS)):
+        rows = np.array(owners[band], dtype=np.int64)
+        scores = None if elements.scores is None else elements.scores[rows]
+        band_elements.append(
+            MapElements.from_polylines(pieces[band], labels=elements.labels[rows], scores=scores)
         )
-        for own, rows in zip(pieces, map(_rows, owners), strict=True)
-    ]
-
-
-def _rows(numbers: list[int]) -> IntArray:
-    return np.array(numbers, dtype=np.int64)
+    return band_elements
 
 
 def cut_line(points: FloatArray) -> Iterator[tuple[int, FloatArray]]:
@@ -71,68 +69,94 @@ def cut_line(points: FloatArray) -> Iterator[tuple[int, FloatArray]]:
         points: Vertices in metres around the vehicle. (n, 2)
 
     Yields:
-        Band and vertices (m, 2) of each piece that is at least ``SHORTEST_M`` long. A ring that
-        is cut is not cut at its start, too.
+        Index of the band and vertices (m, 2) of each piece of at least ``SHORTEST_M``. The first
+        and the last piece of a ring are joined if they are in one band.
     """
     if len(points) < 2:
         return
-    places = _crossings(points)
-    vertices, middles = (_at(points, at) for at in (places, (places[1:] + places[:-1]) / 2))
-    bands = np.searchsorted(DISTANCES_M[1:-1], np.hypot(*middles.T), side="right")
-    ends = [0, *(np.flatnonzero(np.diff(bands)) + 1).tolist(), len(bands)]
-    runs = [(int(bands[a]), vertices[a : b + 1]) for a, b in pairwise(ends)]
-    if len(runs) > 1 and runs[0][0] == runs[-1][0] and is_closed(points):
-        band, last = runs.pop()
-        runs[0] = band, np.concatenate([last, runs[0][1][1:]])
-    for band, piece in runs:
-        if np.hypot(*np.diff(piece, axis=0).T).sum() >= SHORTEST_M:
+    positions = _cut_positions(points)
+    middles = (positions[1:] + positions[:-1]) / 2
+    vertices = _interpolate(points, positions)
+    middle_x, middle_y = _interpolate(points, middles).T
+    distances = np.hypot(middle_x, middle_y)
+    bands = np.searchsorted(DISTANCES_M[1:-1], distances, side="right")  # of each part
+    changes = np.flatnonzero(np.diff(bands)) + 1
+    pieces = []
+    for start, end in pairwise([0, *changes.tolist(), len(bands)]):
+        pieces.append((int(bands[start]), vertices[start : end + 1]))
+    if len(pieces) > 1 and pieces[0][0] == pieces[-1][0] and is_closed(points):
+        band, last = pieces.pop()
+        _, first = pieces[0]
+        pieces[0] = (band, np.concatenate([last, first[1:]]))
+    for band, piece in pieces:
+        dx, dy = np.diff(piece, axis=0).T
+        if np.hypot(dx, dy).sum() >= SHORTEST_M:
             yield band, piece
 
 
-def _crossings(points: FloatArray) -> FloatArray:
-    """Return where the vertices and the circles are along a line, in segments, sorted."""
-    start, step = points[:-1], np.diff(points, axis=0)
+def _cut_positions(points: FloatArray) -> FloatArray:
+    """Find the positions of the vertices of a line and of its crossings with the circles.
+
+    Args:
+        points: Vertices in metres around the vehicle. (n, 2)
+
+    Returns:
+        Positions in segments, in [0, n - 1], sorted.
+    """
+    start = points[:-1]
+    step = np.diff(points, axis=0)
     radii = np.array(DISTANCES_M[1:-1])[:, None]
-    a, b = (step**2).sum(1), (start * step).sum(1)
-    with np.errstate(divide="ignore", invalid="ignore"):  # a line that misses a circle: NaN
-        root = np.sqrt(b**2 - a * ((start**2).sum(1) - radii**2))
+    a = (step**2).sum(axis=1)
+    b = (start * step).sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):  # NaN where a line misses a circle
+        root = np.sqrt(b**2 - a * ((start**2).sum(axis=1) - radii**2))
         shares = np.stack([-b - root, -b + root]) / a  # (2, radii, n - 1)
-    inside = (shares > 0) & (shares < 1)
-    places = (shares + np.arange(len(step)))[inside]
-    return np.unique(np.concatenate([np.arange(float(len(points))), places]))
+    is_inside = (shares > 0) & (shares < 1)
+    crossings = (shares + np.arange(len(step)))[is_inside]
+    vertices = np.arange(float(len(points)))
+    return np.unique(np.concatenate([vertices, crossings]))
 
 
-def _at(points: FloatArray, places: FloatArray) -> FloatArray:
-    """Return the points at places along a line, in segments. (k, 2)"""
-    numbers = np.arange(len(points))
-    return np.stack([np.interp(places, numbers, values) for values in points.T], axis=1)
+def _interpolate(points: FloatArray, positions: FloatArray) -> FloatArray:
+    """Interpolate the points of a line at positions in segments. (k, 2)"""
+    x, y = points.T
+    indices = np.arange(len(points))
+    return np.stack([np.interp(positions, indices, x), np.interp(positions, indices, y)], axis=1)
 
 
 def cut_area(points: FloatArray) -> Iterator[tuple[int, FloatArray]]:
     """Cut an area along the circles.
 
     Args:
-        points: Its outline in metres around the vehicle. (n, 2)
+        points: Outline in metres around the vehicle. (n, 2)
 
     Yields:
-        Band and closed outline (m, 2) of each piece of at least ``SHORTEST_M`` squared.
+        Index of the band and closed outline (m, 2) of each piece of at least ``SHORTEST_M``
+        squared.
     """
     if len(np.unique(points, axis=0)) < 3:
         return
-    # an outline that crosses itself becomes several areas, and lines
-    valid = shapely.get_parts(shapely.get_parts(shapely.make_valid(shapely.Polygon(points))))
-    for area in valid[shapely.area(valid) > 0]:
-        for band, ring in enumerate(_RINGS):
-            for piece in shapely.get_parts(area & ring):
+    # an outline that crosses itself becomes a collection of areas and lines
+    collection = shapely.make_valid(shapely.Polygon(points))
+    parts = shapely.get_parts(shapely.get_parts(collection))
+    for area in parts[shapely.area(parts) > 0]:
+        for band, band_area in enumerate(_BAND_AREAS):
+            for piece in shapely.get_parts(area & band_area):
                 if piece.area >= SHORTEST_M**2:
                     yield band, shapely.get_coordinates(piece.exterior)
 
 
-def _rings() -> list[shapely.Geometry]:
-    """Return each band as an area; the last ends far beyond any map."""
-    far = 1e6
-    discs = [shapely.Point(0, 0).buffer(min(d, far), quad_segs=64) for d in DISTANCES_M[1:]]
-    return [outer.difference(inner) for inner, outer in pairwise([shapely.Point(0, 0), *discs])]
+def _band_areas() -> list[shapely.Geometry]:
+    """Create the area of each band; the last one ends far beyond any map."""
+    far_m = 1e6
+    centre = shapely.Point(0, 0)
+    areas = []
+    inner: shapely.Geometry = centre
+    for radius_m in DISTANCES_M[1:]:
+        outer = centre.buffer(min(radius_m, far_m), quad_segs=64)
+        areas.append(outer.difference(inner))
+        inner = outer
+    return areas
 
 
-_RINGS = _rings()
+_BAND_AREAS = _band_areas()

@@ -1,4 +1,4 @@
-"""Drives of a result file: tracks read from it, made, and written beside its elements."""
+"""Drives of a result file: reading and writing of tracks, and evaluation of consistency."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,8 +11,8 @@ from gsmap.datasets.elements import elements_of_instances
 from gsmap.evaluation.analysis.consistency import (
     ConsistencyConfig,
     DriveFrame,
-    by_scene,
     consistency,
+    group_by_scene,
     tracks_of,
 )
 from gsmap.evaluation.core.results_json import RESULTS_KEY, SampleFile, vectors_of, write_results
@@ -26,85 +26,93 @@ TRACK_KEY = "track_id"
 def drive_frames(
     results: Path, annotations: AnnotationFile, classes: Sequence[str]
 ) -> list[DriveFrame]:
-    """Return the frames of an annotation file with a result file's predictions, by scene and time.
-
-    Tracks are those of the results (``track_id`` of a vector), if they have any.
+    """Read the frames of all drives, in the order of scenes and times.
 
     Args:
-        results: Result file, in MapTR's JSON form.
-        annotations: Ground truth with poses, which has every scene's samples.
-        classes: Names of the classes, in the order of their indices.
+        results: Path of the result file in MapTR's JSON form. If its vectors have a ``track_id``,
+            the frames have these tracks.
+        annotations: Ground truth with poses and with all samples of each scene.
+        classes: Names of the classes; a label is an index into them.
 
     Raises:
         FileNotFoundError: If the result file does not exist.
-        ValueError: If it is malformed, lacks a sample, only some of its vectors have a track, or
-            two elements of one class in one sample have the same.
+        ValueError: If the file is malformed or lacks a sample, if some but not all vectors have a
+            track, or if two elements of a class in a sample have equal tracks.
     """
-    return _frames_of(SampleFile(results, RESULTS_KEY, classes), annotations)
+    return _read_frames(SampleFile(results, key=RESULTS_KEY, classes=classes), annotations)
 
 
-def _frames_of(samples: SampleFile, annotations: AnnotationFile) -> list[DriveFrame]:
-    """Return what `drive_frames` does; then the file has said what it says of itself."""
+def _read_frames(samples: SampleFile, annotations: AnnotationFile) -> list[DriveFrame]:
+    """Read the frames of all drives, as `drive_frames` does, and the metadata of ``samples``."""
     if not annotations.meta.options.get("poses", True):
         raise InputError(f"{annotations.path} knows no poses, which consistency needs.")
-    found, results = {}, samples.path
+    results = samples.path
+    predictions: dict[str, MapElements] = {}
+    track_ids: dict[str, IntArray | None] = {}
+    last_token: dict[bool, str] = {}  # of the samples with and without tracks
     items = items_of(results, RESULTS_KEY, "give a result file")
-    # samples first, for what they say of a bad file
+    # samples come first, because they describe a malformed file
     for (token, elements, _), (item, _) in zip(samples, items, strict=True):
-        given = [vector.get(TRACK_KEY) for vector in item["vectors"]]
-        ids = _track_ids(given, results, token)
+        values = [vector.get(TRACK_KEY) for vector in item["vectors"]]
+        ids = _convert_tracks(values, results=results, token=token)
         if ids is not None:
-            _check_tracks(ids, elements, results, token)
-        found[token] = elements, ids
-    tracked = {ids is not None: token for token, (elements, ids) in found.items() if len(elements)}
-    if len(tracked) > 1:
+            _check_tracks(ids, elements=elements, results=results, token=token)
+        predictions[token] = elements
+        track_ids[token] = ids
+        if len(elements):
+            last_token[ids is not None] = token
+    if len(last_token) > 1:
         raise InputError(
-            f"{results}: sample {tracked[True]!r} has tracks, sample {tracked[False]!r} has none: "
-            f"give every vector a {TRACK_KEY}, or none."
+            f"{results}: sample {last_token[True]!r} has tracks, sample {last_token[False]!r} has "
+            f"none: give every vector a {TRACK_KEY}, or none."
         )
-    if missing := [token for token in annotations.column("token") if token not in found]:
+    missing = [token for token in annotations.column("token") if token not in predictions]
+    if missing:
         raise InputError(
             f"{results} has no sample {missing[0]!r} ({len(missing)} are missing): consistency "
             "needs whole drives."
         )
-    order = zip(
-        annotations.column("scene"), annotations.column("timestamp_ns"),
-        range(len(annotations)), strict=True,
-    )  # fmt: skip
+    scenes = annotations.column("scene")
+    times = annotations.column("timestamp_ns")
+    order = sorted(zip(scenes, times, range(len(annotations)), strict=True))
     frames = []
-    for _, _, row in sorted(order):
+    for _, _, row in order:
         sample = annotations[row]
-        elements, ids = found[sample.token]
         if sample.instances is None:
             raise InputError(f"sample {sample.token!r} has no ground truth: it cannot be scored.")
-        truth = elements_of_instances(sample.instances)
-        frames.append(
-            DriveFrame(sample.token, sample.scene, sample.global_from_frame, elements, truth, ids)
+        frame = DriveFrame(
+            token=sample.token,
+            scene=sample.scene,
+            pose=sample.global_from_frame,
+            predictions=predictions[sample.token],
+            truth=elements_of_instances(sample.instances),
+            track_ids=track_ids[sample.token],
         )
+        frames.append(frame)
     return frames
 
 
-def _track_ids(ids: list[object], results: Path, token: str) -> IntArray | None:
-    """Check the tracks of a sample; None if there are none."""
-    if all(track is None for track in ids):
+def _convert_tracks(values: list[object], results: Path, token: str) -> IntArray | None:
+    """Convert the tracks of a sample to integers (N,); None if no vector has a track."""
+    if all(value is None for value in values):
         return None
-    for track in ids:
+    for track in values:
         if type(track) is not int or not -1 <= track < 2**31:
             raise InputError(
                 f"{results}, sample {token!r}: {TRACK_KEY} must be an integer from -1 (no track), "
                 f"got {track!r:.40}."
             )
-    return np.array(ids, np.int64)
+    return np.array(values, dtype=np.int64)
 
 
 def _check_tracks(ids: IntArray, elements: MapElements, results: Path, token: str) -> None:
-    """Raise ValueError if two elements of a class have one track."""
+    """Raise ValueError if two elements of a class have equal tracks."""
     pairs, counts = np.unique([elements.labels, ids], axis=1, return_counts=True)
-    twice = pairs[1, (counts > 1) & (pairs[1] >= 0)]
-    if len(twice):
+    repeated = pairs[1, (counts > 1) & (pairs[1] >= 0)]
+    if len(repeated):
         raise InputError(
-            f"{results}, sample {token!r}: two elements of a class have {TRACK_KEY} {twice[0]}: a "
-            "track is one element in each frame."
+            f"{results}, sample {token!r}: two elements of a class have {TRACK_KEY} {repeated[0]}: "
+            "a track is one element in each frame."
         )
 
 
@@ -114,18 +122,24 @@ def write_tracks(
     config: ConsistencyConfig,
     about: Mapping[str, Any],
 ) -> None:
-    """Write results with the track of each element: ``track_id``, -1 for one of a low score.
+    """Write results with the track of each element: ``track_id``, -1 below the smallest score.
 
-    Tracks are those that the frames have, or made as `make_tracks` does; they persist over a
-    scene's frames. ``about`` is what the results say of themselves.
+    Args:
+        path: Path of the result file.
+        frames: Frames of all drives. Tracks are created by `make_tracks` where a frame has none;
+            they persist over the frames of a scene.
+        config: Rules of the tracks.
+        about: Metadata of the results.
     """
     samples = []
-    for scene in by_scene(frames):
+    for scene in group_by_scene(frames):
         for frame, tracks in zip(scene, tracks_of(scene, config), strict=True):
             vectors = vectors_of(frame.predictions, config.classes)
-            ids = zip(vectors, tracks.tolist(), strict=True)
-            samples.append((frame.token, [{**vector, TRACK_KEY: t} for vector, t in ids]))
-    write_results(path, samples, {**about, "classes": list(config.classes)})
+            for vector, track in zip(vectors, tracks.tolist(), strict=True):
+                vector[TRACK_KEY] = track
+            samples.append((frame.token, vectors))
+    meta = {**about, "classes": list(config.classes)}
+    write_results(path, samples=samples, meta=meta)
 
 
 def evaluate_drives(
@@ -134,21 +148,23 @@ def evaluate_drives(
     config: ConsistencyConfig,
     tracks_file: Path | None = None,
 ) -> dict[str, float]:
-    """Return the figures of `consistency` of a result file; write its tracks if that is asked for.
+    """Compute the figures of `consistency` of a result file.
 
     Args:
-        results: Result file of all samples.
+        results: Path of the result file with all samples.
         annotations: Ground truth with poses.
-        config: The metric's settings.
-        tracks_file: Where the results are written again, each element with its ``track_id``.
+        config: Rules of the metric.
+        tracks_file: Path at which results are written with the ``track_id`` of each element, or
+            None.
 
     Raises:
         FileNotFoundError: If the result file does not exist.
-        ValueError: If it is malformed, lacks a sample, or the annotations have no ground truth.
+        ValueError: If the file is malformed or lacks a sample, or the annotations have no ground
+            truth.
     """
-    samples = SampleFile(results, RESULTS_KEY, config.classes)
-    frames = _frames_of(samples, annotations)
+    samples = SampleFile(results, key=RESULTS_KEY, classes=config.classes)
+    frames = _read_frames(samples, annotations)
     figures = consistency(frames, config)
     if tracks_file is not None:
-        write_tracks(tracks_file, frames, config, samples.about)
+        write_tracks(tracks_file, frames=frames, config=config, about=samples.about)
     return figures

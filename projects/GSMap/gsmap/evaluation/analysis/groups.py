@@ -1,4 +1,4 @@
-"""AP of parts of the samples: each town, each scene, or the scenes at night and in rain."""
+"""AP of groups of samples: by town, by scene, or by weather and time of day."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -16,15 +16,15 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.files import read_json
 
 CONDITIONS = ("clear", "cloudy", "dusk", "night", "rain")
-"""Words that are looked for in the descriptions of nuScenes' scenes, and MiniCity's."""
-OTHERWISE = "day"  # nuScenes says neither that it is day nor that it is dry
+"""Words for weather and light in the descriptions of scenes, in nuScenes and MiniCity."""
+OTHERWISE = "day"  # descriptions of nuScenes do not mention dry days
 _COLUMNS = {"scene": "scene", "map": "map_name"}
-_LONGEST = 80  # characters of a group's name
+_LONGEST = 80  # characters of the name of a group
 
 
 @dataclass(frozen=True)
 class Groups:
-    """Parts of the samples.
+    """Groups of the samples.
 
     Args:
         group_of: Group of each sample, by token.
@@ -34,29 +34,41 @@ class Groups:
 
     @cached_property
     def names(self) -> list[str]:
-        """The groups, sorted."""
+        """Names of the groups, sorted. (G,)"""
         return sorted(set(self.group_of.values()))
 
     def draw(self, tokens: Sequence[str]) -> tuple[IntArray, FloatArray]:
-        """Return the group of each sample (S,), and each group alone, as a resample. (G, G)"""
-        if missing := next((token for token in tokens if token not in self.group_of), None):
-            raise InputError(f"the group of sample {missing!r} is not known.")
-        numbers = {name: number for number, name in enumerate(self.names)}
-        found = np.array([numbers[self.group_of[token]] for token in tokens], dtype=np.int64)
-        return found, np.eye(len(self.names))
+        """Return each group alone as a resample (`bootstrap.Weights`).
+
+        Args:
+            tokens: Tokens of the samples. (S,)
+
+        Returns:
+            Index of the group of each sample (S,), and number of copies of each group (G, G).
+
+        Raises:
+            ValueError: If the group of a sample is unknown.
+        """
+        index_of = {name: index for index, name in enumerate(self.names)}
+        indices = []
+        for token in tokens:
+            if token not in self.group_of:
+                raise InputError(f"the group of sample {token!r} is not known.")
+            indices.append(index_of[self.group_of[token]])
+        return np.array(indices, dtype=np.int64), np.eye(len(self.names))
 
 
 def read_groups(annotations: str | Path, by: str) -> Groups:
-    """Read what group each sample of an annotation file belongs to.
+    """Read the group of each sample of an annotation file.
 
     Args:
-        annotations: The annotation file.
-        by: ``scene``, ``map``, or a JSON file with the group of each scene or of each sample; or
-            the ``scene.json`` of nuScenes' tables, whose descriptions name weather and night.
+        annotations: Path of the annotation file.
+        by: ``scene``, ``map``, or a JSON file with the group of each scene or of each sample. The
+            ``scene.json`` of nuScenes is accepted, too; its descriptions contain weather and night.
 
     Raises:
         FileNotFoundError: If a file does not exist.
-        ValueError: If there are no groups in it, or a scene or sample is not in the JSON file.
+        ValueError: If a file contains no groups, or the JSON file lacks a scene or sample.
     """
     if Path(annotations).suffix.lower() == ".json":
         raise InputError(f"{annotations} knows no scenes: give the annotation file (.arrow).")
@@ -68,24 +80,26 @@ def read_groups(annotations: str | Path, by: str) -> Groups:
     tokens = file.column("token")
     groups = file.column(_COLUMNS.get(by, "scene"))
     if by not in _COLUMNS:
-        group_of = _groups_in(by)
-        of_samples = not group_of.keys().isdisjoint(tokens)
-        kind, names = ("sample", tokens) if of_samples else ("scene", groups)
-        if missing := next((name for name in names if name not in group_of), None):
-            raise InputError(f"{by} has no {kind} {missing!r}, which {annotations} has.")
+        group_of = _read_group_file(by)
+        if group_of.keys().isdisjoint(tokens):
+            kind = "scene"
+            names = groups
+        else:
+            kind = "sample"
+            names = tokens
+        for name in names:
+            if name not in group_of:
+                raise InputError(f"{by} has no {kind} {name!r}, which {annotations} has.")
         groups = [group_of[name] for name in names]
     return Groups(dict(zip(tokens, groups, strict=True)))
 
 
-def _groups_in(path: str) -> dict[str, str]:
-    """Read the group of each scene or sample."""
+def _read_group_file(path: str) -> dict[str, str]:
+    """Read the group of each scene or sample from a JSON file."""
     content = read_json(path)
     if isinstance(content, list) and all(isinstance(row, dict) for row in content):
         content = {row.get("name"): _conditions(row.get("description")) for row in content}
-    if not isinstance(content, dict) or not all(
-        isinstance(text, str) and 0 < len(text) <= _LONGEST and text.isprintable()
-        for text in content.values()
-    ):
+    if not isinstance(content, dict) or not all(map(_is_group_name, content.values())):
         raise InputError(
             f"{path} is neither an object with the group of each scene or sample, in at most "
             f"{_LONGEST} characters, nor a scene.json of nuScenes."
@@ -93,51 +107,79 @@ def _groups_in(path: str) -> dict[str, str]:
     return content
 
 
+def _is_group_name(value: object) -> bool:
+    """Whether a value is a printable text of at most 80 characters, and not empty."""
+    return isinstance(value, str) and 0 < len(value) <= _LONGEST and value.isprintable()
+
+
 def _conditions(description: object) -> str:
-    """Return the words of a description that say what weather and light there are."""
+    """Return the words for weather and light in a description."""
     words = set(re.findall("[a-z]+", str(description).lower()))
     return ", ".join(word for word in CONDITIONS if word in words) or OTHERWISE
 
 
 def ap_by_group(reports: Sequence[MetricReport], groups: Groups) -> dict[str, dict[str, float]]:
-    """Return every AP of the samples of each group alone, by its flat key; -1 where there is none.
+    """Compute every AP over the samples of each group alone.
 
-    No line is compared again: the AP of a group is that of a file with its samples.
+    The AP of a group equals the AP of a file with its samples. Matches are computed once.
+
+    Args:
+        reports: Reports of all metrics over all samples.
+        groups: Groups of the samples.
+
+    Returns:
+        AP by name of the group and flat key; -1 where it does not exist.
     """
-    found: dict[str, dict[str, float]] = {name: {} for name in groups.names}
+    group_aps: dict[str, dict[str, float]] = {name: {} for name in groups.names}
     for report in reports:
         for key, values in resampled_figures(report, groups).items():
             for name, value in zip(groups.names, values, strict=True):
-                found[name][key] = UNDEFINED if np.isnan(value) else float(value)
-    return found
+                group_aps[name][key] = UNDEFINED if np.isnan(value) else float(value)
+    return group_aps
 
 
-def group_report(found: Mapping[str, Mapping[str, float]]) -> MetricReport:
-    """Return what `ap_by_group` does as one report, with keys such as ``by/night/chamfer/mAP``."""
-    return MetricReport(
-        "by",
-        {},
-        {f"by/{name}/{key}": v for name, aps in found.items() for key, v in aps.items()},
-        {},
-    )
+def group_report(group_aps: Mapping[str, Mapping[str, float]]) -> MetricReport:
+    """Convert the figures of `ap_by_group` to a report, with keys such as ``by/night/chamfer/mAP``.
+
+    Args:
+        group_aps: AP by name of the group and flat key.
+    """
+    metrics = {}
+    for name, aps in group_aps.items():
+        for key, value in aps.items():
+            metrics[f"by/{name}/{key}"] = value
+    return MetricReport(name="by", groups={}, metrics=metrics, detections={})
 
 
 def group_table(
-    reports: Sequence[MetricReport], groups: Groups, found: Mapping[str, Mapping[str, float]]
+    reports: Sequence[MetricReport], groups: Groups, group_aps: Mapping[str, Mapping[str, float]]
 ) -> tuple[list[str], list[list[str]]]:
-    """Return head and rows of a table: samples, means and classes of each group, in percent.
+    """Create a table with the number of samples and the AP of each group, in percent.
 
     Args:
-        reports: Of all samples.
-        groups: Their groups.
-        found: From `ap_by_group`.
+        reports: Reports of all metrics over all samples.
+        groups: Groups of the samples.
+        group_aps: Figures of `ap_by_group`.
+
+    Returns:
+        Head and rows; columns are the name, the samples, and the mean and classes of each metric.
     """
-    ranked = [report for report in reports if report.detections]
-    parts = [(r.name, part) for r in ranked for part in ("mAP", *(f"{n}/AP" for n in r.detections))]
-    numbers = np.bincount(groups.draw(reports[0].tokens)[0], minlength=len(groups.names))
+    head = ["", "samples"]
+    keys = []
+    for report in reports:
+        if report.detections:
+            head.append(f"{report.name} mAP")
+            keys.append(f"{report.name}/mAP")
+            for class_name in report.detections:
+                head.append(f"{report.name} {class_name}")
+                keys.append(f"{report.name}/{class_name}/AP")
+    group_index, _ = groups.draw(reports[0].tokens)
+    num_samples = np.bincount(group_index, minlength=len(groups.names))
     rows = []
-    for (name, figures), number in zip(found.items(), numbers, strict=True):
-        values = (figures[f"{metric}/{part}"] for metric, part in parts)
-        cells = ("-" if value == UNDEFINED else f"{100 * value:.1f}" for value in values)
-        rows.append([name, str(number), *cells])
-    return ["", "samples", *(f"{m} {part.removesuffix('/AP')}" for m, part in parts)], rows
+    for (name, figures), number in zip(group_aps.items(), num_samples, strict=True):
+        row = [name, str(number)]
+        for key in keys:
+            value = figures[key]
+            row.append("-" if value == UNDEFINED else f"{100 * value:.1f}")
+        rows.append(row)
+    return head, rows

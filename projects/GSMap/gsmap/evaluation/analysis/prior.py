@@ -1,10 +1,10 @@
-"""The "same map everywhere" prior: the best fixed set of elements, fitted on a training set.
+"""Baseline that predicts one constant map in every sample, fitted on a training set.
 
-A network that has learnt to look at its images must beat it. Each element is predicted, with the
-same score, in every sample; the set is chosen greedily for AP_chamfer on the training set.
+A network that uses its images must be better than this baseline. The elements and their scores are
+constant; they are chosen greedily for AP_chamfer on the training set.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,133 +15,183 @@ from gsmap.evaluation.core.evaluator import MapEvaluator
 from gsmap.evaluation.core.file_evaluation import Evaluation, match_samples, read_ground_truth
 from gsmap.evaluation.core.metric import Sample
 from gsmap.evaluation.core.raster_ap import MIN_SCORE
+from gsmap.evaluation.core.report import MetricReport
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
 from gsmap.structures.polylines import resample_all
 from gsmap.utils.errors import InputError
 from gsmap.utils.split_lists import require_same_list
 
-_MIN_PRECISION = 1e-3  # an element that is right once in a thousand samples adds nothing
-_REFINEMENTS = 3  # how often a chosen element is moved to the mean of what it matches
+_MIN_PRECISION = 1e-3  # below one match in a thousand samples, an element adds nothing
+_REFINEMENTS = 3  # iterations that move an element to the mean of its matches
 _NUM_POINTS = 20  # of each element
 _MAX_CANDIDATES = 400  # of a class, drawn at random
-_MAX_TRAINING_SAMPLES = 2000  # evenly spread over the file
+_MAX_TRAINING_SAMPLES = 2000  # at equal distances in the file
 
 
 def _aligned_mean(line: FloatArray, others: FloatArray) -> FloatArray:
-    """Return the mean of lines (K, P, 2), each in the point order nearest to ``line`` (P, 2).
+    """Compute the mean of lines, each in the point order that is nearest to a given line.
 
-    A closed ring may also start at any of its points.
+    Closed rings may start at any of their points.
+
+    Args:
+        line: Points in metres. (P, 2)
+        others: Points of K lines in metres. (K, P, 2)
+
+    Returns:
+        Mean line in metres. (P, 2)
     """
     orders = [others, others[:, ::-1]]
     if np.allclose(line[0], line[-1]) and np.allclose(others[:, 0], others[:, -1]):
         ring = others[:, :-1]
         for shift in range(1, ring.shape[1]):
-            turned = np.roll(ring, shift, axis=1)
-            turned = np.concatenate([turned, turned[:, :1]], axis=1)
-            orders += [turned, turned[:, ::-1]]
+            rolled = np.roll(ring, shift=shift, axis=1)
+            closed = np.concatenate([rolled, rolled[:, :1]], axis=1)
+            orders += [closed, closed[:, ::-1]]
     stacked = np.stack(orders)  # (S, K, P, 2)
     gaps = np.square(stacked - line).sum(axis=(2, 3))
-    mean: FloatArray = stacked[gaps.argmin(axis=0), np.arange(len(others))].mean(axis=0)
+    nearest_order = gaps.argmin(axis=0)
+    mean: FloatArray = stacked[nearest_order, np.arange(len(others))].mean(axis=0)
     return mean
 
 
 class _ClassFit:
-    """Greedy choice of the elements of one class."""
+    """Greedy choice of the elements of one class.
+
+    Args:
+        label: Label of the class.
+        truth: Ground truth of each training sample.
+        chamfer: Rules of AP_chamfer.
+    """
 
     def __init__(self, label: int, truth: Sequence[MapElements], chamfer: ChamferConfig) -> None:
-        self.label, self.chamfer, self.num_samples = label, chamfer, len(truth)
+        self.label = label
+        self.chamfer = chamfer
+        self.num_samples = len(truth)
         self.thresholds = np.asarray(chamfer.thresholds)
-        truth = [elements.with_coordinates(chamfer.dim) for elements in truth]
-        frames = [elements.select(elements.labels == label) for elements in truth]
-        self.frames = [frame for frame in frames if len(frame)]
-        self.first = np.cumsum([0, *map(len, self.frames)])  # where each frame starts, (F + 1,)
-        points = [resample_all(f.points, f.offsets, _NUM_POINTS) for f in self.frames]
-        none = np.empty((0, _NUM_POINTS, chamfer.dim))
-        self.points = np.concatenate([none, *points])  # (K, P, 2 or 3)
-        self.taken = np.zeros((len(self.thresholds), len(self.points)), dtype=np.bool_)
-        drawn = np.random.default_rng(0).permutation(len(self.points))
-        self.candidates = self.points[np.sort(drawn[:_MAX_CANDIDATES])]
+        self.frames: list[MapElements] = []  # samples with ground truth of the class
+        lines = [np.empty((0, _NUM_POINTS, chamfer.dim))]
+        for elements in truth:
+            frame = elements.with_coordinates(chamfer.dim)
+            frame = frame.select(frame.labels == label)
+            if len(frame):
+                self.frames.append(frame)
+                lines.append(resample_all(frame.points, frame.offsets, num_points=_NUM_POINTS))
+        lengths = [len(frame) for frame in self.frames]
+        self.first = np.cumsum([0, *lengths])  # first ground truth of each frame, (F + 1,)
+        self.points = np.concatenate(lines)  # (K, P, 2 or 3)
+        self.is_taken = np.zeros((len(self.thresholds), len(self.points)), dtype=np.bool_)
+        order = np.random.default_rng(0).permutation(len(self.points))
+        self.candidates = self.points[np.sort(order[:_MAX_CANDIDATES])]
         self.nearest, self.distance = self._compare(self.candidates)
 
     def _compare(self, lines: FloatArray) -> tuple[IntArray, FloatArray]:
-        """Return the ground truth nearest to each line in each frame, or -1; metres. 2 x (N, F)"""
-        elements = MapElements.from_polylines(lines, np.full(len(lines), self.label))
-        nearest = np.full((len(lines), len(self.frames)), -1)
-        distance = np.full(nearest.shape, np.inf)
+        """Find the ground truth that is nearest to each line in each frame.
+
+        Args:
+            lines: Points in metres. (N, P, 2 or 3)
+
+        Returns:
+            Index of the ground truth, or -1, and its Chamfer distance in metres. 2 x (N, F)
+        """
+        labels = np.full(len(lines), fill_value=self.label)
+        elements = MapElements.from_polylines(lines, labels=labels)
+        nearest = np.full((len(lines), len(self.frames)), fill_value=-1)
+        distance = np.full(nearest.shape, fill_value=np.inf)
         for i, frame in enumerate(self.frames):
-            best, d = nearest_by_chamfer(elements, frame, self.chamfer, self.thresholds[-1])
-            nearest[:, i] = np.where(best >= 0, best + self.first[i], -1)
-            distance[:, i] = d
+            in_frame, distance[:, i] = nearest_by_chamfer(
+                elements, frame, config=self.chamfer, max_distance=self.thresholds[-1]
+            )
+            nearest[:, i] = np.where(in_frame >= 0, in_frame + self.first[i], -1)
         return nearest, distance
 
     def _new_hits(self, nearest: IntArray, distance: FloatArray) -> FloatArray:
         """Count the free ground truths that each line matches, averaged over thresholds. (N,)"""
-        hits = [
-            ((distance <= threshold) & ~taken[nearest]).sum(axis=-1)
-            for threshold, taken in zip(self.thresholds, self.taken, strict=True)
-        ]
+        hits = []
+        for t, threshold in enumerate(self.thresholds):
+            is_new = (distance <= threshold) & ~self.is_taken[t][nearest]
+            hits.append(is_new.sum(axis=-1))
         return np.asarray(np.mean(hits, axis=0))
 
     def propose(self) -> tuple[float, float, int]:
-        """Return the gain in AP of the best candidate, its precision and its position."""
+        """Return the gain in AP of the best candidate, its precision and its index."""
         if not len(self.candidates):
             return 0.0, 0.0, -1
         hits = self._new_hits(self.nearest, self.distance)
         best = int(hits.argmax())
-        precision = float(hits[best]) / self.num_samples
-        return precision * float(hits[best]) / len(self.points), precision, best
+        num_hits = float(hits[best])
+        precision = num_hits / self.num_samples
+        gain = precision * num_hits / len(self.points)
+        return gain, precision, best
 
     def take(self, index: int) -> tuple[FloatArray, float]:
-        """Refine a candidate, mark what it matches as taken; return it and its precision."""
-        line, nearest, distance = self.candidates[index], self.nearest[index], self.distance[index]
-        best = float(self._new_hits(nearest, distance))
+        """Refine a candidate and mark its matches as taken.
+
+        Args:
+            index: Index of the candidate.
+
+        Returns:
+            Refined line in metres (P, 2 or 3), and its precision.
+        """
+        line = self.candidates[index]
+        nearest = self.nearest[index]
+        distance = self.distance[index]
+        num_hits = float(self._new_hits(nearest, distance))
         for _ in range(_REFINEMENTS):
-            near = (distance <= self.thresholds[-1]) & ~self.taken[-1][nearest]
-            if not near.any():
+            is_new = (distance <= self.thresholds[-1]) & ~self.is_taken[-1][nearest]
+            if not is_new.any():
                 break
-            moved = _aligned_mean(line, self.points[nearest[near]])
-            (new_nearest,), (new_distance,) = self._compare(moved[None])
-            hits = float(self._new_hits(new_nearest, new_distance))
-            if hits <= best:
+            refined = _aligned_mean(line, self.points[nearest[is_new]])
+            all_nearest, all_distances = self._compare(refined[None])
+            refined_hits = float(self._new_hits(all_nearest[0], all_distances[0]))
+            if refined_hits <= num_hits:
                 break
-            line, best, nearest, distance = moved, hits, new_nearest, new_distance
+            line = refined
+            num_hits = refined_hits
+            nearest = all_nearest[0]
+            distance = all_distances[0]
         for t, threshold in enumerate(self.thresholds):
-            self.taken[t][nearest[distance <= threshold]] = True
-        return line, best / self.num_samples
+            self.is_taken[t][nearest[distance <= threshold]] = True
+        return line, num_hits / self.num_samples
 
 
 def fit_prior(
     truth: Sequence[MapElements], chamfer: ChamferConfig, max_elements: int = 50
 ) -> MapElements:
-    """Fit the fixed set of elements that scores best on a training set.
+    """Fit the constant set of elements with the best AP on a training set.
 
-    Each step adds the element whose new matches raise the area under the precision-recall curve the
-    most (precision times recall of the new matches, each class by its own count of ground truths);
-    its score rises with the share of samples in which it is a new match. An element is a ground
-    truth of the training set, moved to the mean of what it matches where that helps.
+    Each step adds the element whose new matches increase the area under the precision-recall curve
+    the most: precision times recall of the new matches, with the recall of its class. Its score
+    increases with the share of samples in which it is a new match. An element is a ground truth of
+    the training set, moved to the mean of its matches where this adds matches.
 
     Args:
         truth: Ground truth of each training sample.
         chamfer: Rules of AP_chamfer.
-        max_elements: Elements in the set, over all classes; a network of 50 queries predicts 50.
+        max_elements: Largest number of elements of all classes; a network with 50 queries
+            predicts 50.
 
     Raises:
-        ValueError: If the training set holds no ground truth.
+        ValueError: If the training set contains no ground truth.
     """
     fits = [_ClassFit(label, truth, chamfer) for label in range(len(chamfer.classes))]
     if not any(len(fit.candidates) for fit in fits):
         raise InputError("the training set holds no ground truth of these classes.")
-    chosen: list[tuple[FloatArray, int, float]] = []  # line, label, score
-    while len(chosen) < max_elements:
+    lines: list[FloatArray] = []
+    labels: list[int] = []
+    scores: list[float] = []
+    while len(lines) < max_elements:
         proposals = [fit.propose() for fit in fits]
-        label = int(np.argmax([gain for gain, _, _ in proposals]))
+        gains = [gain for gain, _, _ in proposals]
+        label = int(np.argmax(gains))
         _, precision, index = proposals[label]
         if precision < _MIN_PRECISION:
             break
         line, share = fits[label].take(index)
-        # AP_raster drops lower scores; the order, which is all that counts, stays
-        chosen.append((line, label, MIN_SCORE + (1.0 - MIN_SCORE) * min(share, 1.0)))
-    return MapElements.from_polylines(*zip(*chosen, strict=True))
+        lines.append(line)
+        labels.append(label)
+        # AP_raster drops scores below MIN_SCORE; only the order of scores matters
+        scores.append(MIN_SCORE + (1.0 - MIN_SCORE) * min(share, 1.0))
+    return MapElements.from_polylines(lines, labels=labels, scores=scores)
 
 
 def evaluate_prior(
@@ -151,41 +201,64 @@ def evaluate_prior(
     max_elements: int = 50,
     allow_other_split: bool = False,
 ) -> Evaluation:
-    """Fit a prior on one file of ground truth and score it on another.
+    """Fit a prior on one file of ground truth and evaluate it on another.
 
     Args:
-        train_path: Annotation file or MapTR's JSON, to fit on.
-        truth_path: Annotation file or MapTR's JSON, to score on.
-        evaluator: The metrics.
-        max_elements: Elements of the prior.
-        allow_other_split: Whether both files may be of different splits of a data set.
+        train_path: Ground truth to fit on: annotation file or MapTR's JSON.
+        truth_path: Ground truth to evaluate on: annotation file or MapTR's JSON.
+        evaluator: Evaluator of the metrics.
+        max_elements: Largest number of elements of the prior.
+        allow_other_split: Whether the files may belong to different splits of a data set.
+
+    Returns:
+        Reports of all metrics, and a note on the fit.
 
     Raises:
         FileNotFoundError: If a file does not exist.
         ValueError: If a file is malformed, or the splits differ.
     """
-    paths = [path for path in (train_path, truth_path) if Path(path).suffix.lower() != ".json"]
-    metas = [AnnotationFile(path).meta for path in paths]
-    if len({meta.dataset for meta in metas}) < len(metas) and not allow_other_split:
-        train_list, truth_list = (meta.split_list for meta in metas)
-        subject = f"the prior of {train_path}"
-        require_same_list(train_list, truth_list, subject, "--allow-other-split")
-    named = {metric.name: metric for metric in evaluator.metrics}
-    chamfer = named.get("chamfer")
-    if not isinstance(chamfer, ChamferConfig):
-        chamfer = ChamferConfig(evaluator.classes)
-    everything, _ = read_ground_truth(train_path, evaluator.classes)
-    step = max(1, -(-len(everything) // _MAX_TRAINING_SAMPLES))
-    train = dict(list(everything.items())[::step])
+    if not allow_other_split:
+        _check_splits(train_path, truth_path)
+    chamfer = ChamferConfig(evaluator.classes)
+    for metric in evaluator.metrics:
+        if metric.name == "chamfer" and isinstance(metric, ChamferConfig):
+            chamfer = metric
+    all_train, _ = read_ground_truth(train_path, evaluator.classes)
+    step = max(1, -(-len(all_train) // _MAX_TRAINING_SAMPLES))
+    train = dict(list(all_train.items())[::step])
     truth, _ = read_ground_truth(truth_path, evaluator.classes)
-    fitted = fit_prior(list(train.values()), chamfer, max_elements)
-    alone = MapEvaluator(chamfer)
-    (on_train,) = alone.reports(
-        match_samples([Sample(token, fitted, found) for token, found in train.items()], alone)
-    )
+    prior = fit_prior(list(train.values()), chamfer=chamfer, max_elements=max_elements)
+
+    chamfer_evaluator = MapEvaluator(chamfer)
+    train_report = _evaluate_constant(prior, truth=train, evaluator=chamfer_evaluator)[0]
     note = (
-        f"the same {len(fitted)} elements in every sample, fitted on {len(train)} training "
-        f"samples; mAP_chamfer there {on_train.metrics['chamfer/mAP']:.6f}"
+        f"the same {len(prior)} elements in every sample, fitted on {len(train)} training "
+        f"samples; mAP_chamfer there {train_report.metrics['chamfer/mAP']:.6f}"
     )
-    pairs = [Sample(token, fitted, found) for token, found in truth.items()]
-    return evaluator.reports(match_samples(pairs, evaluator)), [note]
+    return _evaluate_constant(prior, truth=truth, evaluator=evaluator), [note]
+
+
+def _evaluate_constant(
+    prior: MapElements, truth: Mapping[str, MapElements], evaluator: MapEvaluator
+) -> list[MetricReport]:
+    """Evaluate constant predictions against the ground truth of each sample, by token."""
+    samples = []
+    for token, elements in truth.items():
+        samples.append(Sample(token, predictions=prior, ground_truth=elements))
+    return evaluator.reports(match_samples(samples, evaluator))
+
+
+def _check_splits(train_path: str | Path, truth_path: str | Path) -> None:
+    """Raise ValueError if two annotation files belong to different splits of a data set."""
+    for path in (train_path, truth_path):
+        if Path(path).suffix.lower() == ".json":  # without a split
+            return
+    train_meta = AnnotationFile(train_path).meta
+    truth_meta = AnnotationFile(truth_path).meta
+    if train_meta.dataset == truth_meta.dataset:
+        require_same_list(
+            train_meta.split_list,
+            truth_meta.split_list,
+            f"the prior of {train_path}",
+            "--allow-other-split",
+        )

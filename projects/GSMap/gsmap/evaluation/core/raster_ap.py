@@ -96,7 +96,7 @@ class RasterConfig(Metric):
     @property
     def thresholds(self) -> dict[str, tuple[float, ...]]:
         """Smallest IoUs of a match of each class, by its name. C x (T,)"""
-        thresholds = {}
+        thresholds: dict[str, tuple[float, ...]] = {}
         for name, is_polygon in zip(self.classes, self.is_polygon, strict=True):
             thresholds[name] = POLYGON_THRESHOLDS if is_polygon else LINE_THRESHOLDS
         return thresholds

@@ -253,7 +253,8 @@ def _squared_gaps(first: _MaskPixels, second: _MaskPixels, axis: str) -> FloatAr
     first_low, first_high = first.bounds(getattr(first, axis))
     second_low, second_high = second.bounds(getattr(second, axis))
     gaps = np.maximum(second_low - first_high[:, None], first_low[:, None] - second_high)
-    return np.maximum(gaps, 0.0) ** 2
+    squared: FloatArray = np.square(np.maximum(gaps, 0.0))
+    return squared
 
 
 def line_distances(
