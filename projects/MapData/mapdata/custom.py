@@ -218,8 +218,11 @@ def _create_sample(record: Mapping[str, Any], meta: AnnotationMeta, root: Path) 
     if record.get(_GLOBAL) is not None:
         record = _transform_elements(record, meta)
     values: dict[str, Any] = {
-        "scene": "", "map_name": "", "timestamp_ns": 0, "global_from_frame": np.eye(4)
-    }  # fmt: skip
+        "scene": "",
+        "map_name": "",
+        "timestamp_ns": 0,
+        "global_from_frame": np.eye(4),
+    }
     for name, value in record.items():
         if value is not None:
             values[name] = value
@@ -295,8 +298,10 @@ def _rectify_image(camera: Mapping[str, Any], root: Path) -> str:
         model=str(camera.get("distortion_model", "")),
     )
     calibration = (
-        rig_camera.intrinsics.tolist(), rig_camera.distortion.tolist(), rig_camera.model
-    )  # fmt: skip
+        rig_camera.intrinsics.tolist(),
+        rig_camera.distortion.tolist(),
+        rig_camera.model,
+    )
     digest = hashlib.sha256(repr(calibration).encode()).hexdigest()[:12]
     folder = f"rectified/{file_name(rig_camera.name)}-{digest}"
     path = f"{folder}/{file_name(camera['path'])}.jpg"
