@@ -38,8 +38,8 @@ def _visualizer(runner: Runner) -> MapVisualizer:
 class MapVisualizationHook(Hook):
     """Draws predictions, into a folder in testing and to the visualizer's backends in validation.
 
-    In testing, each rank draws its samples. In validation, rank 0 draws a few fixed samples, so that
-    the slider of TensorBoard shows their progress.
+    In testing, each rank draws its samples. In validation, rank 0 draws a few fixed samples, so
+    that the slider of TensorBoard shows their progress.
 
     Args:
         draw: Whether to draw at all.
