@@ -139,7 +139,7 @@ def _worker_count(options: Argoverse2Options, log_dirs: Sequence[Path]) -> int:
 
 
 def _excluded_times(log_dirs: list[Path], options: Argoverse2Options) -> dict[str, set[int]]:
-    """Times in nanoseconds, by log, at which thinning out the whole split drops the sample."""
+    """Times in nanoseconds, by name of the log, of samples dropped by ``thin_over="split"``."""
     if options.thin_over == "log":
         return {}
     assert options.rate_hz is not None  # checked by the options
@@ -182,7 +182,7 @@ def _add_problems(summary: ConversionSummary, log_id: str, result: LogSamples) -
 def _remove_unfit_logs(
     log_dirs: Sequence[Path], keep_map_changes: bool, summary: ConversionSummary
 ) -> list[Path]:
-    """Remove the logs that are known to be unfit, and count them in the summary."""
+    """Remove logs with unusable data and, by default, logs with a changed map; count both."""
     broken = "its map or sensor data cannot be used (known to fail)"
     changed = "its map was changed on purpose and contradicts the images (Argoverse 2's own note)"
     fit_logs = []

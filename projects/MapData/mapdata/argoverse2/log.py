@@ -202,7 +202,7 @@ def _split_folder(root: Path, split: str) -> Path | None:
 
 
 def _logs_of(folder: Path) -> list[Path]:
-    """Sorted subfolders with a map or a pose table, without partial downloads."""
+    """Sorted subfolders with a map or a pose table, without unfinished folders."""
     log_dirs = set()
     for part in ("map", POSES):
         for path in folder.glob(f"*/{part}"):

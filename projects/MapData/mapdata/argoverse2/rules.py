@@ -35,9 +35,9 @@ def clip_polygons(polygons: np.ndarray, patch: LocalPatch) -> tuple[np.ndarray, 
     """
     clipped = shapely.intersection(polygons, patch.polygon)
     pieces, owner = shapely.get_parts(clipped, return_index=True)
-    is_valid = (shapely.get_type_id(pieces) == POLYGON) & shapely.is_valid(pieces)
-    pieces = patch.to_frame(pieces[is_valid])
-    owner = owner[is_valid]
+    is_polygon = (shapely.get_type_id(pieces) == POLYGON) & shapely.is_valid(pieces)
+    pieces = patch.to_frame(pieces[is_polygon])
+    owner = owner[is_polygon]
     is_valid = shapely.is_valid(pieces)  # the transform may round a thin piece to an invalid one
     return pieces[is_valid], owner[is_valid]
 

@@ -125,6 +125,9 @@ def read_log(
         with_map: Whether to add the ground truth.
         excluded_ns: Times in nanoseconds of samples to leave out (`thin_out_split`).
 
+    Returns:
+        Samples by ascending time, with counts of the unusable samples and map elements.
+
     Raises:
         FileNotFoundError: If the map or the poses are missing.
         ValueError: If a file is damaged, or sensor data that ``options.at`` needs are missing.
@@ -272,10 +275,10 @@ def sample_times(log: Argoverse2Log, options: Argoverse2Options) -> np.ndarray:
 def thin_out(times_ns: np.ndarray, rate_hz: float | None) -> np.ndarray:
     """Select times at a lower rate.
 
-    The first time is kept, then each time that follows the latest kept one after at least a period
-    of ``rate_hz`` less half the median gap of ``times_ns``. With this tolerance a sensor of 10 Hz
-    with jitter is thinned out to every fourth time at 2.5 Hz, and a sensor slower than ``rate_hz``
-    keeps all times.
+    The first time is selected. A later time is selected if its gap to the latest selected one is
+    at least a period of ``rate_hz`` minus half the median gap of ``times_ns``. Because of this
+    tolerance every fourth time of a 10 Hz sensor with jitter is selected at 2.5 Hz, and all times
+    of a sensor slower than ``rate_hz``.
 
     Args:
         times_ns: Ascending times in nanoseconds. (n,)
@@ -301,7 +304,11 @@ class _UnusableSample(Exception):
 def _sample(
     log: Argoverse2Log, log_map: Argoverse2Map | None, timestamp_ns: int, options: Argoverse2Options
 ) -> MapSample:
-    """Make the sample at a time; ``_UnusableSample`` if a pose or an image is missing."""
+    """Make the sample at a time.
+
+    Raises:
+        _UnusableSample: If the pose at this time or an image is missing.
+    """
     city_from_ego = log.poses.get(timestamp_ns)
     if city_from_ego is None:
         raise _UnusableSample("no pose at the sample's time")
@@ -365,7 +372,7 @@ def _cameras(
 def _lidar(
     log: Argoverse2Log, timestamp_ns: int, ego_from_city: np.ndarray, options: Argoverse2Options
 ) -> LidarRecord | None:
-    """LiDAR sweep closest in time, with earlier sweeps; None without one that has a pose.
+    """LiDAR sweep closest in time, with earlier sweeps; None if no sweep with a pose is close.
 
     Argoverse 2 stores the points of a sweep in the ego frame at the time of the sweep.
     """

@@ -18,12 +18,12 @@ _STAND_INS: dict[str, Callable[..., Any]] = {
     "__builtin__.bytes": lambda: b"",
     "builtins.bytes": lambda: b"",
 }
-_KEY_BITS = 60  # of an integer in a key
-_KEY_PARTS = 8  # of a tuple as key
+_KEY_BITS = 60  # limit of the integers in a key
+_KEY_PARTS = 8  # limit of the length of a tuple as key
 _KEYS = (str, bytes, int, float, np.generic, type(None))
 _CONTAINERS = (list, tuple, dict, set, frozenset)
 _MAX_DEPTH = 50
-_VALUES_PER_BYTE = 20  # a value counts once for each of its containers
+_VALUES_PER_BYTE = 20  # limit of the values, counted once for each container that holds them
 _DAMAGE = (
     pickle.UnpicklingError, EOFError, struct.error, LookupError, TypeError, ValueError,
     AttributeError, ArithmeticError,

@@ -59,7 +59,9 @@ def read_info_file(
 
 
 def _matrix(values: Any, size: int, name: str) -> np.ndarray:
-    """Square matrix of a field; a transform may lack its last row, intrinsics may be padded.
+    """Convert a field to a square matrix.
+
+    The last row of a transform is added if it is missing; padding of intrinsics is removed.
 
     Args:
         values: Nested lists or an array. (size, size), (3, 4), or (4, 4) for intrinsics

@@ -54,7 +54,7 @@ _OFFICIAL_SPLITS = {
     "v1.0-trainval": ("train", "val"), "v1.0-mini": ("mini_train", "mini_val"),
     "v1.0-test": ("test",),
 }  # fmt: skip
-_FRAMES_PER_WORKER = 500  # a process starts in about the time that these frames take
+_FRAMES_PER_WORKER = 500  # converted in about the time that a process takes to start
 _Scene = tuple[dict[str, Any], NuScenesTables]  # record of a scene, and the tables of its version
 
 
@@ -166,7 +166,12 @@ def _resolve_splits(
 def _extract_instances(
     local_map: NuScenesLocalMap, poses: np.ndarray
 ) -> list[list[MapInstance] | str]:
-    """Extract the map elements at each pose (n, 4, 4); a text is the reason of a failure."""
+    """Extract the map elements at each pose; the result is a text if the extraction fails.
+
+    Args:
+        local_map: Prepared map.
+        poses: Transforms from the annotation frame to the map in metres. (n, 4, 4)
+    """
     results: list[list[MapInstance] | str] = []
     for pose in poses:
         try:
@@ -264,9 +269,9 @@ class _Conversion:
             y_range=options.y_range,
             crossings=options.crossings,
         )
-        full_workers = _count_samples(scenes) // _FRAMES_PER_WORKER
-        workers = max(1, min(options.workers, len(scenes), full_workers))
-        # Samples are read ahead of the results: their poses are the tasks of the workers.
+        useful_workers = _count_samples(scenes) // _FRAMES_PER_WORKER
+        workers = max(1, min(options.workers, len(scenes), useful_workers))
+        # Samples are read ahead of the results, because the workers need their poses.
         samples, samples_ahead = tee(map(self._scene_samples, scenes))
         poses = map(_stack_poses, samples_ahead)
         results = ordered_map(partial(_extract_instances, local_map), poses, workers=workers)

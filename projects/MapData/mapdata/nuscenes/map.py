@@ -106,7 +106,7 @@ def expansion(root: Path, name: str) -> Path:
 
 
 def open_layers(root: Path, name: str, classes: Collection[str]) -> MapLayers:
-    """Read the geometries of a map that the classes need.
+    """Read the geometries of a map for the given classes.
 
     Lines with fewer than two nodes and invalid polygons are left out and counted.
 
@@ -158,9 +158,9 @@ def maps_in(root: Path) -> list[str]:
 
 
 def _open_map(root: Path, name: str) -> "NuScenesMap":
-    """Open a map with the devkit, whose list of locations is extended meanwhile.
+    """Open a map with the devkit.
 
-    The devkit accepts only the four locations of nuScenes otherwise.
+    The devkit only accepts the locations in its list, so the name is added to the list meanwhile.
     """
     from nuscenes.map_expansion.map_api import NuScenesMap, locations
 

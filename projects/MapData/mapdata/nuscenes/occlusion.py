@@ -22,7 +22,7 @@ from gsmap.utils.files import write_text
 from gsmap.utils.words import counted
 from mapdata.nuscenes.tables import pose_of, read_table
 
-LIMITS = (10, 20)  # lower limits of the second and third group, per cent of the map
+LIMITS = (10, 20)  # limits between the groups, per cent of the map
 _NEAR_M = 0.3  # smallest depth of a visible point
 _STEP_M = 1.0  # distance between the sampled points of a map
 

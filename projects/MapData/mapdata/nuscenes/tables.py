@@ -75,7 +75,7 @@ def _has_kind(value: Any, kind: type | int) -> bool:
 
 
 def pose_of(record: Mapping[str, Any], prefix: str = "") -> np.ndarray:
-    """Combine the translation and the rotation of a record to a transform.
+    """Build the transform of a record from its translation and rotation.
 
     Args:
         record: Record with ``translation`` in metres (3,) and ``rotation``, a quaternion
@@ -132,7 +132,7 @@ def read_table(folder: Path, table: str) -> Iterator[dict[str, Any]]:
 
 
 class NuScenesTables:
-    """Tables with the key frames of cameras and LiDAR and, on request, LiDAR sweeps.
+    """Tables of one version: key frames of cameras and LiDAR and, on request, LiDAR sweeps.
 
     Annotation tables and the records of other sensors are not kept. Of the 2.6 million
     ``sample_data`` records of ``v1.0-trainval`` a tenth remains (a fifth with sweeps), with the
@@ -279,7 +279,7 @@ class NuScenesTables:
         return self._records["log"][scene["log_token"]]["location"]
 
     def _global_from_sensor(self, data: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
-        """Transform from the sensor of a ``sample_data`` record to the map (4, 4); calibration."""
+        """Transform from the sensor of a record to the map (4, 4), and the calibration record."""
         calibration = self._records["calibrated_sensor"][data["calibrated_sensor_token"]]
         global_from_ego = pose_of(self._records["ego_pose"][data["ego_pose_token"]])
         return global_from_ego @ pose_of(calibration), calibration

@@ -294,7 +294,7 @@ def _image_settings(fields: Fields) -> dict[str, Any]:
         settings["model.img_augment"] = None
     for part in ("img_backbone", "img_neck"):
         values = fields.take(f"model.{part}", default={})
-        if values["type"] != "VoVNet":  # registered by GSMap
+        if values["type"] != "VoVNet":  # GSMap registers VoVNet itself
             values["type"] = f"mmdet.{values['type']}"
         for name, value in values.items():
             settings[f"model.{part}.{name}"] = value
@@ -450,7 +450,7 @@ def _mapvr_settings(fields: Fields, settings: dict[str, Any]) -> None:
     settings[_HEAD + "dice_cost"] = {"weight": dice_cost_weight}
     cost_weight = settings[_HEAD + "match_costs.1.weight"]
     if points_weight != cost_weight:
-        # GSMap has one weight for loss and cost: the other one is reported as without counterpart
+        # GSMap has one weight for loss and cost, so a different cost weight counts as unplaced
         fields.section(f"{_COSTS}.pts_cost")["weight"] = cost_weight
 
 
