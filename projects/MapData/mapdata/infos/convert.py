@@ -61,8 +61,8 @@ def _relative(path: str, root: Path) -> str:
     parts = posix_path.parts
     for anchor in ("samples", "sweeps", "train", "val", "test"):
         if anchor in parts:
-            last = len(parts) - 1 - parts[::-1].index(anchor)  # position of the last anchor
-            return Path(*parts[last:]).as_posix()
+            last_anchor = len(parts) - 1 - parts[::-1].index(anchor)
+            return Path(*parts[last_anchor:]).as_posix()
     if not Path(path).is_absolute():
         return posix_path.as_posix()
     raise InputError(f"path {path!r} does not lie under {root}: give the right --data-root.")
@@ -147,7 +147,7 @@ def _nuscenes_sample(
         )
         sweeps.append(sweep_record)
     can_bus = info.get("can_bus")
-    if can_bus is not None:  # completed by the pose, as MapTR does on loading
+    if can_bus is not None:  # MapTR also adds the pose on loading
         measurements = np.asarray(can_bus, np.float64)[7:16]
         can_bus = pose_signals(global_from_ego)
         can_bus[3:7] = np.asarray(info["ego2global_rotation"])

@@ -144,7 +144,7 @@ def _compute(node: ast.expr, names: _Names) -> Any:
 
 
 def _mapping(pairs: Iterable[Any], names: _Names) -> dict[Any, Any]:
-    """Evaluate pairs of key and value nodes to a dict; a key of None stands for ``**``."""
+    """Evaluate pairs of key and value nodes to a dict; ``**`` has the key None."""
     values: dict[Any, Any] = {}
     for key_node, value_node in pairs:
         if key_node is None:

@@ -16,7 +16,7 @@ from mapdata.upstream_configs.fields import Fields
 _KEY = re.compile(r"[a-zA-Z][\w.-]*", re.ASCII)
 _TYPE = re.compile(r"(mmdet\.)?\w+")
 METHODS = ("MapTR", "MapTRv2", "GeMap", "GeMapFull")
-# top-level names with a meaning; others are variables of the file
+# top-level names that configure a run; other names are variables of the file
 TOP_LEVEL_NAMES = (
     "_base_", "model", "data", "optimizer", "optimizer_config", "lr_config", "total_epochs",
     "runner", "evaluation", "fp16", "checkpoint_config", "log_config", "load_from",
@@ -372,7 +372,7 @@ def _decoder_settings(fields: Fields, settings: dict[str, Any]) -> None:
     for attention in other_attentions:
         fields.drop(attention, names="type embed_dims", num_heads=num_heads, dropout=dropout)
     fields.drop(cross_attention, names="type embed_dims num_levels im2col_step")
-    # default dropouts of the two attentions in the original code
+    # the original attentions have different default dropouts
     self_dropout = fields.take(f"{self_attention}.dropout", default=0.0)
     cross_dropout = fields.take(f"{cross_attention}.dropout", default=0.1)
     if self_dropout != settings[layer + "dropout"]:
