@@ -237,7 +237,7 @@ def _decode_other(
         if picture.mode.startswith("I"):
             return picture.size, _bgr_from_16_bit_grey(np.asarray(picture))
         if has_16_bits:
-            encoded = np.frombuffer(content, np.uint8)
+            encoded = np.frombuffer(content, dtype=np.uint8)
             _require_bright(cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED))
         rgb = np.asarray(picture.convert("RGB"))
         return picture.size, np.ascontiguousarray(rgb[:, :, ::-1])

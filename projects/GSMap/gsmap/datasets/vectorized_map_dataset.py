@@ -224,7 +224,7 @@ class VectorizedMapDataset(BaseDataset):
         Raises:
             ValueError: If samples for training have no ground truth, or no sample is left.
         """
-        rows = np.array([entry["row"] for entry in self.data_list], np.int64)
+        rows = np.array([entry["row"] for entry in self.data_list], dtype=np.int64)
         if self._filter_empty_gt:
             counts = self.annotations.instance_counts()[rows]
             if (counts < 0).any():
@@ -327,7 +327,7 @@ class VectorizedMapDataset(BaseDataset):
             labels = [instance.label for instance in instances]
             ground_truth = {
                 "polylines": [instance.points for instance in instances],
-                "labels": np.array(labels, np.int64),
+                "labels": np.array(labels, dtype=np.int64),
             }
         images = self._images(sample, entry)
         info: dict[str, Any] = {

@@ -124,12 +124,12 @@ def _are_inside(paths: pa.StringArray, *_: object) -> np.ndarray:
     """Test which paths are relative, inside the data root and without control characters."""
     _, offsets, data = paths.buffers()
     text = b"" if data is None else data.to_pybytes()
-    starts = np.frombuffer(offsets, np.int32, len(paths) + 1)[:-1]
+    starts = np.frombuffer(offsets, dtype=np.int32, count=len(paths) + 1)[:-1]
     # Fast path for nearly all files: a scan of the bytes instead of a regular expression.
-    letters = np.frombuffer(text + b"/", np.uint8)
+    letters = np.frombuffer(text + b"/", dtype=np.uint8)
     are_plain = b".." not in text and b"\\" not in text and (letters >= ord(" ")).all()
     if are_plain and (letters[starts] != ord("/")).all():
-        return np.ones(len(paths), bool)
+        return np.ones(len(paths), dtype=bool)
     return ~pc.match_substring_regex(paths, _OUTSIDE).to_numpy(zero_copy_only=False)
 
 
@@ -179,7 +179,10 @@ _NAME = (
     " {0!r} would lead out of a folder or has control characters: give it a plain name",
 )
 _RULES: dict[str, tuple[Callable[..., np.ndarray], str]] = {
-    "token": (lambda texts, *_: pc.not_equal(texts, "").to_numpy(False), " is empty"),
+    "token": (
+        lambda texts, *_: pc.not_equal(texts, "").to_numpy(zero_copy_only=False),
+        " is empty",
+    ),
     "scene": _NAME,
     "map_name": _NAME,
     "global_from_frame": _TRANSFORM,

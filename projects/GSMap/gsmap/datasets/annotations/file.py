@@ -74,7 +74,7 @@ class AnnotationWriter:
         self._finished = False
 
     def __enter__(self) -> "AnnotationWriter":
-        self._file = self._resources.enter_context(atomic_write(self.path, "wb"))
+        self._file = self._resources.enter_context(atomic_write(self.path, mode="wb"))
         self._writer = pa.ipc.new_file(self._file, self._schema)
         return self
 
@@ -419,7 +419,7 @@ class AnnotationFile(Sequence[MapSample]):
 
     def instance_counts(self) -> np.ndarray:
         """Return the number of map elements of each sample, -1 without ground truth. (samples,)"""
-        counts = [np.empty(0, np.int64)]
+        counts = [np.empty(0, dtype=np.int64)]
         for batch in self.batches:
             lengths = pc.list_value_length(batch.column("instances"))
             counts.append(lengths.fill_null(-1).to_numpy())

@@ -177,7 +177,7 @@ def rain(image: Image, level: int, rng: np.random.Generator) -> Image:
     has_drop = rng.random((height, width)) < _RAIN_DENSITIES[level]
     drops = has_drop.astype(np.float32)
     length = max(3, round(0.06 * height))
-    streak = np.zeros((length, length), np.float32)
+    streak = np.zeros((length, length), dtype=np.float32)
     top = (length * 2 // 5, 0)
     bottom = (length * 3 // 5, length - 1)  # nearly vertical
     cv2.line(streak, top, bottom, color=(1.0,))
@@ -210,7 +210,7 @@ def motion_blur(image: Image, level: int, rng: np.random.Generator) -> Image:
         rng: Not used.
     """
     length = 2 * round(_BLUR_LENGTHS[level] * image.shape[1] / 2) + 1  # odd: without a shift
-    return np.asarray(cv2.blur(image, (length, 1)), np.uint8)
+    return np.asarray(cv2.blur(image, (length, 1)), dtype=np.uint8)
 
 
 def jpeg(image: Image, level: int, rng: np.random.Generator) -> Image:
@@ -223,7 +223,7 @@ def jpeg(image: Image, level: int, rng: np.random.Generator) -> Image:
     """
     settings = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITIES[level]]
     _, data = cv2.imencode(".jpg", image, params=settings)
-    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), dtype=np.uint8)
 
 
 def _rotation(axis: NDArray[np.float64], level: int) -> NDArray[np.float64]:

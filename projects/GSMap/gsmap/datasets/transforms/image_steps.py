@@ -178,7 +178,7 @@ class Distortion:
     def on_device(self, images: Tensor) -> Tensor:
         """See `ImageStep`."""
         rows = [_distortion_row(numbers) for numbers in self.numbers]
-        table = torch.from_numpy(np.array(rows, np.float32))  # (V, 8)
+        table = torch.from_numpy(np.array(rows, dtype=np.float32))  # (V, 8)
         if images.is_cuda:
             table = table.pin_memory().to(images.device, non_blocking=True)
         return distort_images(images, table.to(images.device))

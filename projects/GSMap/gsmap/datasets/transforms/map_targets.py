@@ -67,7 +67,7 @@ def map_targets(
     orders = np.empty((len(instances), num_orders, num_points, dim))
     longest = max((len(instance.points) for instance in instances), default=2)
     polylines = np.empty((len(instances), longest, 2))
-    closed = np.empty(len(instances), bool)
+    closed = np.empty(len(instances), dtype=bool)
     for i, instance in enumerate(instances):
         if instance.points.shape[1] < dim:
             raise InputError(
@@ -77,7 +77,7 @@ def map_targets(
         line = instance.points[:, :dim].astype(np.float64)
         points[i] = resample(line, num_points)
         if orders_of == "vertices":
-            orders[i] = equivalent_orders(line, num_points, rng)
+            orders[i] = equivalent_orders(line, num_points, rng=rng)
         else:
             is_ring = ends_meet(points[i], x_range=x_range, y_range=y_range)
             orders[i] = sampled_orders(points[i], closed=is_ring)

@@ -72,7 +72,7 @@ class MakeBEVMask(BaseTransform):
             ValueError: If the sample has no ground truth, or a label is not less than
                 ``num_classes``.
         """
-        masks = np.zeros((self.num_classes or 1, *self.size), np.uint8)
+        masks = np.zeros((self.num_classes or 1, *self.size), dtype=np.uint8)
         for instance in ground_truth_elements(results, self):
             cells = bev_cells(instance, results, size=self.size)
             channel = channel_of(instance, self.num_classes)
@@ -121,7 +121,7 @@ class MakeInstanceMasks(BaseTransform):
                 f"sample {results['token']!r} has no targets yet: put MakeInstanceMasks behind "
                 "FormatMapTargets in the pipeline."
             )
-        masks = np.zeros((len(instances), *self.size), np.uint8)
+        masks = np.zeros((len(instances), *self.size), dtype=np.uint8)
         gaps = np.zeros_like(masks)
         for number, instance in enumerate(instances):
             cells = bev_cells(instance, results, size=self.size)
@@ -204,7 +204,7 @@ class MakePVMask(BaseTransform):
         num_channels = self.num_classes or 1
         rows = height // self.stride
         cols = width // self.stride
-        masks = np.zeros((len(matrices), num_channels, rows, cols), np.uint8)
+        masks = np.zeros((len(matrices), num_channels, rows, cols), dtype=np.uint8)
         lines = []
         for instance, points in self._elements(results):
             channel = channel_of(instance, self.num_classes)

@@ -55,7 +55,7 @@ def read_points(path: str, load_dim: int) -> np.ndarray:
             "or correct load_dim."
         )
     else:
-        points = np.fromfile(file, np.float32).reshape(-1, load_dim)
+        points = np.fromfile(file, dtype=np.float32).reshape(-1, load_dim)
     if not np.isfinite(points).all():
         raise BrokenSampleError(f"{path} holds NaN or infinity: copy it again.")
     return points
@@ -181,7 +181,7 @@ class MakeDepthMap(BaseTransform):
         homogeneous = np.concatenate([points, np.ones((len(points), 1))], axis=-1)
         height, width = padded_size(results["img_shape"], self.pad_size_divisor)
         min_depth, max_depth = self.depth_range
-        depths = np.zeros((len(results["lidar2img"]), height, width), np.float32)
+        depths = np.zeros((len(results["lidar2img"]), height, width), dtype=np.float32)
         for view, lidar2img in enumerate(results["lidar2img"]):
             u, v, depth = (homogeneous @ lidar2img.T)[:, :3].T
             in_range = (depth >= min_depth) & (depth < max_depth)
