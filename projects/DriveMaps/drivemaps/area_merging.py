@@ -103,7 +103,7 @@ def _vote(
         rows_of_frame[frame_index].append(row)
     footprints = {index: drive.footprint(drive.frames[index]) for index in rows_of_frame}
     edges = [shapely.boundary(shape) for shape in (*areas, *footprints.values())]
-    # Between the edges, no vote changes: one spot stands for each face.
+    # The votes are constant between the edges, so one spot per face is enough.
     faces = shapely.get_parts(shapely.polygonize([shapely.union_all(edges)]))
     spots = shapely.get_coordinates(shapely.point_on_surface(faces))  # (F, 2)
     x, y = spots.T

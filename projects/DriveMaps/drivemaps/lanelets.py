@@ -63,8 +63,8 @@ class LaneGraph:
 def lane_graph_of(drive: Drive, elements: MapElements) -> LaneGraph:
     """Construct lanelets from the centre lines in the map of a drive.
 
-    Lines of maps have no direction. The direction of travel of a centre line is that in which most
-    centre lines of the frames run along it.
+    Lines of maps have no direction of travel. A centre line is oriented like most of the centre
+    lines of the frames along it.
 
     Args:
         drive: Frames with centre lines in the direction of travel.
@@ -102,8 +102,12 @@ def lane_graph(centerlines: Iterable[FloatArray], borders: Sequence[FloatArray])
     Returns:
         Lanelets and nodes.
     """
-    distinct = [_drop_repeats(np.asarray(line)[:, :2]) for line in centerlines]
-    lines = _split([line for line in distinct if len(line) > 1])
+    nonempty = []
+    for centerline in centerlines:
+        vertices = _drop_repeats(np.asarray(centerline)[:, :2])
+        if len(vertices) > 1:
+            nonempty.append(vertices)
+    lines = _split(nonempty)
     if not lines:
         return LaneGraph([], left=np.empty((0, 2)), right=np.empty((0, 2)))
     tree = shapely.STRtree([shapely.LineString(border) for border in borders if len(border) > 1])
@@ -202,11 +206,17 @@ def _resample(line: FloatArray) -> FloatArray:
 
 def _orient_lines(lines: Sequence[FloatArray], pieces: Sequence[FloatArray]) -> list[FloatArray]:
     """Reverse the lines along which most pieces run in the opposite direction. each (n, 2)"""
-    points = [_resample(piece[:, :2]) for piece in pieces if len(piece) > 1]
-    if not points:
+    piece_points = []
+    piece_directions = []
+    for piece in pieces:
+        if len(piece) > 1:
+            points = _resample(piece[:, :2])
+            piece_points.append(points)
+            piece_directions.append(_directions(points))
+    if not piece_points:
         return list(lines)
-    tree = cKDTree(np.concatenate(points))
-    directions = np.concatenate([_directions(piece) for piece in points])
+    tree = cKDTree(np.concatenate(piece_points))
+    directions = np.concatenate(piece_directions)
     oriented = []
     for line in lines:
         samples = _resample(line[:, :2])
@@ -224,7 +234,7 @@ def _split(lines: Sequence[FloatArray]) -> list[FloatArray]:
     """Split lines where another line begins or ends on them in their direction.
 
     Args:
-        lines: Lines in metres; those of 2 m and less are dropped. each (n, 2)
+        lines: Lines in metres; lines of 2 m and less are dropped. each (n, 2)
 
     Returns:
         Parts of the lines, sampled at most ``_STEP_M`` apart. each (n, 2)

@@ -112,7 +112,8 @@ def merge_lines(drive: Drive, label: int, config: MergeConfig) -> list[tuple[Flo
         return []
     for _ in range(_NUM_ROUNDS):
         normals = _normals(lines)
-        lines = _move_to_means(lines, normals, _match_vertices(lines, normals))
+        matches = _match_vertices(lines, normals)
+        lines = _move_to_means(lines, normals=normals, matches=matches)
     matches = _match_vertices(lines, _normals(lines))
     matched_scores = lines.scores[matches.segments]
     support = lines.scores + np.bincount(matches.vertices, matched_scores, minlength=num_vertices)

@@ -38,7 +38,7 @@ def merge(drive: Drive, config: MergeConfig | None = None) -> MapElements:
 
     Args:
         drive: Frames with their predictions.
-        config: Parameters of merging; by default those of ``MergeConfig()``.
+        config: Parameters of merging; ``MergeConfig()`` by default.
 
     Returns:
         Lines and closed rings in the global frame, with their confidence as scores.

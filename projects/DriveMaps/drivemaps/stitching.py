@@ -44,7 +44,7 @@ def stitch(lines: Sequence[FloatArray]) -> list[FloatArray]:
     visited: set[int] = set()  # indices of lines
     for index in range(len(lines)):
         if index not in visited:
-            chains.append(_join_chain(lines, partner_of, index, visited))
+            chains.append(_join_chain(lines, partner_of, index=index, visited=visited))
     return chains
 
 
@@ -56,13 +56,13 @@ def _candidates(lines: Sequence[FloatArray]) -> list[tuple[int, int]]:
         for part in (line[:, :2], line[::-1, :2]):
             end = part[0]
             inner = shapely.line_interpolate_point(shapely.LineString(part), _HEADING_M)
-            outward = end - shapely.get_coordinates(inner)[0]
+            heading = end - shapely.get_coordinates(inner)[0]
             ends.append(end)
-            headings.append(outward / max(np.linalg.norm(outward), 1e-9))
+            headings.append(heading / max(np.linalg.norm(heading), 1e-9))
     if not ends:
         return []
     points = np.array(ends)  # (2 N, 2)
-    outward = np.array(headings)  # (2 N, 2)
+    outward = np.array(headings)  # unit vectors that point out of the lines. (2 N, 2)
     pairs = cKDTree(points).query_pairs(JOIN_M, output_type="ndarray")
     first, second = pairs.T
     cosine = (outward[first] * outward[second]).sum(axis=1)
@@ -82,12 +82,12 @@ def _join_chain(
         lines: All lines. N x (n, D)
         partner_of: End that each joined end is joined to; line i has the ends 2 i and 2 i + 1.
         index: Index of a line of the chain.
-        visited: Indices of lines in previous chains; those of this chain are added.
+        visited: Indices of lines in previous chains; the lines of this chain are added.
 
     Returns:
         Vertices without successive equal ones. (m, D)
     """
-    entry = 2 * index
+    entry = 2 * index  # end at which the walk enters a line; the other end is entry ^ 1
     passed = {index}
     # Walk back to an open end, or once around a ring.
     while entry in partner_of and partner_of[entry] // 2 not in passed:

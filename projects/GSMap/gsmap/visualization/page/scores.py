@@ -104,9 +104,9 @@ def score_result(
     for token, elements, _ in file:
         predictions[token] = elements
     if not allow_other_split:
-        require_results_of(meta.split_list, file.about, path)
+        require_results_of(meta.split_list, about=file.about, path=path)
     try:
-        notes = mismatch_notes(predictions, truth, allow_mismatch)
+        notes = mismatch_notes(predictions, truth, allowed=allow_mismatch)
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error
     num_ignored = dict(file.ignored)  # predictions by class
@@ -119,7 +119,9 @@ def score_result(
     sample_values = []
     matches = {}
     for token, true_elements in truth.items():
-        values = evaluator.match(token, predictions.get(token, nothing), true_elements)
+        values = evaluator.match(
+            token, predictions=predictions.get(token, nothing), ground_truth=true_elements
+        )
         chamfer = cast(FrameMatches, values["chamfer"])
         sample_values.append(values)
         matches[chamfer.token] = chamfer
@@ -151,10 +153,11 @@ def score_by_distance(
     samples = []
     for token, true_elements in truth.items():
         predictions = result.predictions.get(token, nothing)
-        samples.append(Sample(token, predictions, true_elements))
+        sample = Sample(token, predictions=predictions, ground_truth=true_elements)
+        samples.append(sample)
     area_labels = [label for label, name in enumerate(meta.classes) if name in AREA_CLASSES]
-    matches = (evaluator.match(*piece) for piece in cut_by_distance(samples, area_labels))
-    return replace(result, reports=evaluator.reports(matches))
+    pieces = cut_by_distance(samples, areas=area_labels)
+    return replace(result, reports=evaluator.reports(evaluator.match_all(pieces)))
 
 
 def _create_evaluator(meta: AnnotationMeta) -> MapEvaluator:

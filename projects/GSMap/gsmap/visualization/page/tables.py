@@ -300,7 +300,8 @@ def _matched_vertices(
     samples = []
     for token, true_elements in truth.items():
         if token in result.predictions:
-            samples.append(Sample(token, result.predictions[token], true_elements))
+            predictions = result.predictions[token]
+            samples.append(Sample(token, predictions=predictions, ground_truth=true_elements))
     return matched_vertices(samples, ChamferConfig(tuple(style.classes)))
 
 
@@ -318,7 +319,7 @@ def group_tables(results: Sequence[ScoredResult], groups: Groups, by: str) -> li
     tables = []
     for result in results:
         ap = ap_by_group(result.reports, groups)
-        head, rows = group_table(result.reports, groups, ap)
+        head, rows = group_table(result.reports, groups, group_aps=ap)
         caption = f"AP (%) by {by}"
         if len(results) > 1:
             caption += f", {result.name}"
