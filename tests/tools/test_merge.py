@@ -197,10 +197,10 @@ GRID = {"x_range": [-15, 15], "y_range": [-30, 30]}
 @pytest.mark.parametrize(
     ("rules", "message"),
     [
-        ({"metrics": []}, "tells no rules of metrics .*at least one"),
-        ({"settings": {"classes": [["a"]]}}, "tells no rules of metrics .*classes must be names"),
-        ({"settings": []}, "tells no rules of metrics"),
-        ({"metrics": ["os"]}, "tells no rules of metrics .*there is no metric"),
+        ({"metrics": []}, "contains no rules of metrics .*at least one"),
+        ({"settings": {"classes": [["a"]]}}, "contains no rules of metrics .*classes must be names"),
+        ({"settings": []}, "contains no rules of metrics"),
+        ({"metrics": ["os"]}, "contains no rules of metrics .*there is no metric"),
         ({"settings": {"classes": ["divider"]}}, "holds no matches by the rules .*shapes"),
         ({"settings": {"classes": list(CLASSES), "thresholds": [1]}}, "holds no matches by the"),
         ({"metrics": ["chamfer", "raster"]}, "holds no matches .*'raster'"),

@@ -108,10 +108,16 @@ class GaussianMetric(BaseMetric):
             metres) of each class, and ``at_floor``, the share of Gaussians at the lower bound of
             sizes; empty without Gaussians.
         """
-        samples = [sample for _, sample in sorted(dict(results).items()) if sample]
-        if not samples:
+        floors = []
+        class_figures = []
+        for _, measurement in sorted(dict(results).items()):
+            if measurement:
+                floor, figures = measurement
+                floors.append(floor)
+                class_figures.append(figures)
+        if not floors:
             return {}
-        at_floor = np.concatenate([floor for floor, _ in samples])
+        at_floor = np.concatenate(floors)
         metrics = {"at_floor": float(at_floor.mean()) if len(at_floor) else 0.0}
         rows = [
             f"Gaussians of predictions with a score of {SCORE_THRESHOLD} or more, "
@@ -120,7 +126,7 @@ class GaussianMetric(BaseMetric):
         for label, name in enumerate(self.dataset_meta["classes"]):
             ious = [np.empty(0)]
             sizes = [np.empty((0, 2))]
-            for _, figures in samples:
+            for figures in class_figures:
                 if label in figures:
                     sample_iou, sample_sizes = figures[label]
                     ious.append(sample_iou)

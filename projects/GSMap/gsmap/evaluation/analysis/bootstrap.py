@@ -317,9 +317,7 @@ def ap_differences(
     Raises:
         ValueError: If metrics or samples of the results differ.
     """
-    first_content = [(report.name, list(report.tokens)) for report in first]
-    second_content = [(report.name, list(report.tokens)) for report in second]
-    if first_content != second_content:
+    if _samples_of_metrics(first) != _samples_of_metrics(second):
         raise InputError("two results can be compared on the same samples and metrics only.")
     intervals = {}
     for first_report, second_report in zip(first, second, strict=True):
@@ -332,6 +330,11 @@ def ap_differences(
                 difference = first_value - second_value
                 intervals[key] = _interval(difference, values=values - second_figures[key])
     return intervals
+
+
+def _samples_of_metrics(reports: Sequence[MetricReport]) -> list[tuple[str, list[str]]]:
+    """Return the name of each metric and the tokens of its samples."""
+    return [(report.name, list(report.tokens)) for report in reports]
 
 
 def format_intervals(intervals: Mapping[str, Interval], title: str, signed: bool = False) -> str:

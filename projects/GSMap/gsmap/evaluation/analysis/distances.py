@@ -15,8 +15,8 @@ from gsmap.structures.polylines import is_closed
 SHORTEST_M = 1.0  # shorter pieces of lines, and pieces of areas below its square, are left out
 _SEPARATOR = " at "
 _BANDS = [
-    f"{inner_m:g}-{outer_m:g} m" if np.isfinite(outer_m) else f"beyond {inner_m:g} m"
-    for inner_m, outer_m in pairwise(DISTANCES_M)
+    *(f"{inner_m:g}-{outer_m:g} m" for inner_m, outer_m in pairwise(DISTANCES_M[:-1])),
+    f"beyond {DISTANCES_M[-2]:g} m",
 ]
 
 

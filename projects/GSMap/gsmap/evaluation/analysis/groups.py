@@ -98,7 +98,10 @@ def _read_group_file(path: str) -> dict[str, str]:
     """Read the group of each scene or sample from a JSON file."""
     content = read_json(path)
     if isinstance(content, list) and all(isinstance(row, dict) for row in content):
-        content = {row.get("name"): _conditions(row.get("description")) for row in content}
+        scenes = {}
+        for row in content:
+            scenes[row.get("name")] = _conditions(row.get("description"))
+        content = scenes
     if not isinstance(content, dict) or not all(map(_is_group_name, content.values())):
         raise InputError(
             f"{path} is neither an object with the group of each scene or sample, in at most "
@@ -130,7 +133,9 @@ def ap_by_group(reports: Sequence[MetricReport], groups: Groups) -> dict[str, di
     Returns:
         AP by name of the group and flat key; -1 where it does not exist.
     """
-    group_aps: dict[str, dict[str, float]] = {name: {} for name in groups.names}
+    group_aps: dict[str, dict[str, float]] = {}
+    for name in groups.names:
+        group_aps[name] = {}
     for report in reports:
         for key, values in resampled_figures(report, groups).items():
             for name, value in zip(groups.names, values, strict=True):

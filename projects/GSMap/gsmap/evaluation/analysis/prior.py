@@ -76,8 +76,9 @@ class _ClassFit:
             if len(frame):
                 self.frames.append(frame)
                 lines.append(resample_all(frame.points, frame.offsets, num_points=_NUM_POINTS))
-        lengths = [len(frame) for frame in self.frames]
-        self.first = np.cumsum([0, *lengths])  # first ground truth of each frame, (F + 1,)
+        self.first = np.cumsum(
+            [0, *map(len, self.frames)]
+        )  # first ground truth of each frame, (F + 1,)
         self.points = np.concatenate(lines)  # (K, P, 2 or 3)
         self.is_taken = np.zeros((len(self.thresholds), len(self.points)), dtype=np.bool_)
         order = np.random.default_rng(0).permutation(len(self.points))

@@ -138,8 +138,7 @@ class MapEvaluator:
         """
         if self.ground_truth_points is not None:
             ground_truth = _resample_elements(ground_truth, self.ground_truth_points)
-        sample = Sample(token, predictions, ground_truth)
-        return {metric.name: metric.match(sample) for metric in self.metrics}
+        return self._match_sample(Sample(token, predictions, ground_truth))
 
     def match_empty(self) -> SampleMatches:
         """Match a sample without elements, for the names and shapes of the records."""
@@ -147,6 +146,10 @@ class MapEvaluator:
         truth = replace(MapElements.from_polylines(), points=points)
         predictions = replace(MapElements.from_polylines(scores=()), points=points)
         sample = Sample(token="", predictions=predictions, ground_truth=truth)
+        return self._match_sample(sample)
+
+    def _match_sample(self, sample: Sample) -> SampleMatches:
+        """Match one sample, whose ground truth is resampled already, under every metric."""
         return {metric.name: metric.match(sample) for metric in self.metrics}
 
     def match_all(self, samples: Iterable[Sample]) -> list[SampleMatches]:
@@ -167,10 +170,10 @@ class MapEvaluator:
         """
         tables: dict[str, MatchTable | ValueTable] = {}
         for sample in samples:
-            if not tables:
-                tables = {name: new_table(record) for name, record in sample.items()}
-            for name, table in tables.items():
-                table.add(sample[name])  # type: ignore[arg-type]
+            for name, record in sample.items():
+                if name not in tables:
+                    tables[name] = new_table(record)
+                tables[name].add(record)  # type: ignore[arg-type]
         if not tables:
             raise InputError("there is no sample to score.")
         reports: list[MetricReport] = []

@@ -48,7 +48,8 @@ def write_matches(
     """
     arrays = {"notes": np.array(notes, dtype=str)}
     for metric in matches[0] if matches else ():
-        arrays |= _join_records(metric, [sample[metric] for sample in matches])
+        records = [sample[metric] for sample in matches]
+        arrays |= _join_records(metric, records=records)
     with atomic_write(shard.path_of(target), mode="wb") as file:
         np.savez_compressed(file, **arrays)
     rules = {
@@ -63,12 +64,16 @@ def write_matches(
 
 def _join_records(metric: str, records: Sequence[Matches]) -> dict[str, npt.NDArray[Any]]:
     """Concatenate the arrays of all samples along their first axes."""
-    joined = {f"{metric}{_TOKENS}": np.array([record.token for record in records])}
-    records_arrays = [arrays_of(record) for record in records]
-    for name in records_arrays[0]:
-        values = [np.atleast_1d(arrays[name]) for arrays in records_arrays]
-        joined[f"{metric}/{name}"] = np.concatenate(values)
-        joined[f"{metric}/{name}{_LENGTHS}"] = np.array([len(value) for value in values])
+    tokens = []
+    columns: dict[str, list[npt.NDArray[Any]]] = {}
+    for record in records:
+        tokens.append(record.token)
+        for name, values in arrays_of(record).items():
+            columns.setdefault(name, []).append(np.atleast_1d(values))
+    joined: dict[str, npt.NDArray[Any]] = {f"{metric}{_TOKENS}": np.array(tokens)}
+    for name, parts in columns.items():
+        joined[f"{metric}/{name}"] = np.concatenate(parts)
+        joined[f"{metric}/{name}{_LENGTHS}"] = np.array(list(map(len, parts)))
     return joined
 
 
@@ -88,8 +93,8 @@ def report_shards(shards: Sequence[ShardFile]) -> tuple[list[MetricReport], list
         evaluator = _evaluator(shards[0].manifest["options"]["evaluator"])
     except _FAULTS as error:
         raise InputError(
-            f"the manifest of {shards[0].path} tells no rules of metrics ({error!r}): make that "
-            "shard again."
+            f"the manifest of {shards[0].path} contains no rules of metrics ({error!r}): "
+            "create this shard again."
         ) from error
     matches: list[SampleMatches] = []
     notes: list[str] = []
@@ -97,7 +102,7 @@ def report_shards(shards: Sequence[ShardFile]) -> tuple[list[MetricReport], list
         try:
             with np.load(shard.path) as file:
                 notes += file["notes"].tolist()
-                arrays = {name: file[name] for name in file.files}
+                arrays = dict(file)
             if len(arrays) > 1:
                 matches += _split_samples(arrays, evaluator)
         except (*_FAULTS, *DAMAGED_ZIP) as error:
@@ -110,17 +115,19 @@ def report_shards(shards: Sequence[ShardFile]) -> tuple[list[MetricReport], list
 
 def _split_samples(arrays: Arrays, evaluator: MapEvaluator) -> list[SampleMatches]:
     """Split the arrays of all metrics into records of samples."""
-    metrics = {name.removesuffix(_TOKENS) for name in arrays if name.endswith(_TOKENS)}
+    metrics = set()
+    for name in arrays:
+        if name.endswith(_TOKENS):
+            metrics.add(name.removesuffix(_TOKENS))
     empty = evaluator.match_empty()
     if metrics != empty.keys():
         raise InputError(f"it has matches of {sorted(metrics)}, not of {sorted(empty)}")
-    samples: list[SampleMatches] = []
+    columns = []
     for metric, like in empty.items():
-        records = list(_split_records(arrays, metric=metric, like=like))
-        if not samples:
-            samples = [{} for _ in records]
-        for sample, record in zip(samples, records, strict=True):
-            sample[metric] = record
+        columns.append(_split_records(arrays, metric=metric, like=like))
+    samples = []
+    for records in zip(*columns, strict=True):
+        samples.append(dict(zip(empty, records, strict=True)))
     return samples
 
 

@@ -275,9 +275,9 @@ def matches_of(token: str, arrays: Mapping[str, npt.NDArray[Any]], like: Matches
     """
     expected = {name: values.shape for name, values in arrays_of(like).items()}
     shapes = {name: values.shape for name, values in arrays.items()}
-    fits = shapes.keys() == expected.keys() and all(
-        _fits_shape(shapes[name], expected[name]) for name in expected
-    )
+    fits = shapes.keys() == expected.keys()
+    for name in expected if fits else ():
+        fits = fits and _fits_shape(shapes[name], empty_shape=expected[name])
     if isinstance(like, SampleValues) and fits:
         return SampleValues(token, arrays)
     if fits:

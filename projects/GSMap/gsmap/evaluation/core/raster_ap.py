@@ -232,7 +232,9 @@ def raster_report(matches: MatchTable, config: RasterConfig) -> MetricReport:
     detections = matches.detections(config.thresholds)
     figures: dict[str, dict[str, float]] = {}
     metrics: dict[str, float] = {}
+    num_present = 0
     for label, (name, ranked) in enumerate(detections.items()):
+        num_present += ranked.num_gts > 0
         figures[name] = _class_figures(ranked, matches.class_iou(label))
         for key, value in figures[name].items():
             metrics[f"{name}/{key}"] = value
@@ -247,7 +249,6 @@ def raster_report(matches: MatchTable, config: RasterConfig) -> MetricReport:
                 metrics[f"{group}/{key}"] = _mean(figures[name][key] for name in names)
     metrics["mAP"] = _mean(of_class["AP"] for of_class in figures.values())
     metrics["mIoU"] = _mean(of_class["mIoU"] for of_class in figures.values())
-    num_present = sum(ranked.num_gts > 0 for ranked in detections.values())
     metrics["num_absent_classes"] = float(len(config.classes) - num_present)
     metrics["num_samples"] = float(len(matches))
     return MetricReport(

@@ -122,6 +122,7 @@ def format_table(report: MetricReport) -> str:
     """
     if not report.groups:
         return "\n".join(f"{key:<44} {value:.4f}" for key, value in report.metrics.items())
+
     lines = [f"AP_{report.name}"]
     for group in report.groups:
         lines += _group_lines(report, group)
@@ -137,36 +138,41 @@ def _group_lines(report: MetricReport, group: str) -> list[str]:
     """Format the table of one group of classes."""
     names = report.groups[group]
     thresholds = report.detections[names[0]].thresholds
-    ap_keys = ["AP"] + [f"AP@{threshold}" for threshold in thresholds]
     if report.by_distance:
         unit = "m"
         loosest = thresholds[-1]
         error_title = "error m"
         error_key = f"error_m@{loosest}"
-        mean_keys = ["mAP", *ap_keys[1:]]
+        mean_keys = ["mAP"]
+        mean_prefix = ""
     else:
         unit = "IoU"
         loosest = thresholds[0]
         error_title = "mIoU"
         error_key = "mIoU"
-        mean_keys = [f"{group}/{key}" for key in ap_keys]
+        mean_keys = [f"{group}/AP"]
+        mean_prefix = f"{group}/"
 
-    threshold_titles = [f"@{threshold} {unit}" for threshold in thresholds]
-    titles = ["AP", *threshold_titles, "recall", error_title, "calib. err.", "truths", "preds"]
-    class_keys = [*ap_keys, f"recall@{loosest}", error_key, f"calibration_error@{loosest}"]
+    titles = ["AP"]
+    class_keys = ["AP"]
+    for threshold in thresholds:
+        titles.append(f"@{threshold} {unit}")
+        class_keys.append(f"AP@{threshold}")
+        mean_keys.append(f"{mean_prefix}AP@{threshold}")
+    titles += ["recall", error_title, "calib. err.", "truths", "preds"]
+    class_keys += [f"recall@{loosest}", error_key, f"calibration_error@{loosest}"]
     class_keys += ["num_gts", "num_preds"]
     rows = {group: titles}
     for name in names:
         rows[name] = [_cell(report, f"{name}/{key}") for key in class_keys]
     rows["mean"] = [_cell(report, key) for key in mean_keys]
 
-    name_width = max(len(name) for name in rows)
-    widths = [max(len(title), 6) + 2 for title in titles]
+    name_width = max(map(len, rows))
     lines = []
     for name, cells in rows.items():
         line = name.ljust(name_width)
-        for cell, width in zip(cells, widths, strict=False):  # the means have no details
-            line += cell.rjust(width)
+        for cell, title in zip(cells, titles, strict=False):  # the means have no details
+            line += cell.rjust(max(len(title), 6) + 2)
         lines.append(line)
     lines.insert(1, "-" * len(lines[-2]))
     return lines

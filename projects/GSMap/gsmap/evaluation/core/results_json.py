@@ -182,23 +182,33 @@ def read_vectors(
         ValueError: If a value is not allowed.
     """
     label_of = {name: label for label, name in enumerate(classes)}
-    names = [vector["cls_name"] for vector in vectors]
-    if not all(isinstance(name, str) for name in names):
-        raise TypeError("cls_name is no text")
-    ignored.update(name for name in names if name not in label_of)
-    polylines = [_points_of(vector) for vector in vectors]
-    if any(len(points) and len(points[0]) == 3 for points in polylines):
+    polylines = []
+    labels = []
+    scores = []
+    has_heights = False
+    for vector in vectors:
+        name = vector["cls_name"]
+        if not isinstance(name, str):
+            raise TypeError("cls_name is no text")
+        if name not in label_of:
+            ignored[name] += 1
+        labels.append(label_of.get(name, -1))
+        points = _points_of(vector)
+        polylines.append(points)
+        has_heights |= len(points) > 0 and len(points[0]) == 3
+        if scored:
+            scores.append(vector["confidence_level"])
+    if has_heights:
         ignored[THREE_D] += 1
     gaussian_fields = {}
     for name in _GAUSSIAN_FIELDS if gaussians and vectors else ():
         key = f"gaussian_{name}"
         if all(key in vector for vector in vectors):
             gaussian_fields[name] = [vector[key] for vector in vectors]
-    scores = [vector["confidence_level"] for vector in vectors] if scored else None
     elements = MapElements.from_polylines(
         polylines,
-        labels=[label_of.get(name, -1) for name in names],
-        scores=scores,
+        labels=labels,
+        scores=scores if scored else None,
         **gaussian_fields,
     )
     _check_lengths(elements)
@@ -310,7 +320,7 @@ def merge_results(path: Path, shards: Sequence[ShardFile]) -> int:
         heads = [file.readline() for file in files]
         head = heads[0]
         if len(set(heads)) > 1:
-            raise InputError(f"the shards of {path} have different first lines: make them anew.")
+            raise InputError(f"the shards of {path} have different first lines: create them again.")
         out.write(head.removesuffix("\n"))
         count = 0
         last = None

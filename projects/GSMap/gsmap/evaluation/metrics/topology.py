@@ -78,11 +78,13 @@ class Topology(Metric):
             is_confident = predictions.confidence >= self.min_score
             preds = _lines(predictions, chosen=(predictions.labels == label) & is_confident)
             gts = _lines(truth, chosen=truth.labels == label)
-            is_area = label in self.area_labels
+            num_folds = 0
+            for line in preds:
+                num_folds += count_folds(line, is_area=label in self.area_labels)
             counts[label] = (
                 _count_excess_pieces(gts, lines=preds, config=self),
                 _count_excess_pieces(preds, lines=gts, config=self),
-                sum(count_folds(line, is_area=is_area) for line in preds),
+                num_folds,
                 len(gts),
                 len(preds),
             )
