@@ -21,7 +21,7 @@ NAMED = {
     "masks": ("ElementMasks",),
     "matching": ("MapAssigner", "MapCost", "OrderedPointsCost"),
     "pairs": ("GroundTruth", "MatchedPairs", "Predictions", "SampleView"),
-    "parts": ("DEFAULTS", "brought"),
+    "parts": ("DEFAULTS", "optional_part"),
     "references": ("PointReference",),
 }
 

@@ -20,7 +20,7 @@ from gsmap.models.bemapnet.head import BezierHead
 from gsmap.models.bemapnet.keys import BEMAPNET
 from gsmap.models.bemapnet.neck import BiFPN
 from gsmap.models.lines.decoder import PointLineDecoder
-from gsmap.models.lines.front import turned
+from gsmap.models.lines.front import turn_raster
 from gsmap.structures.grid import BEVGrid
 
 CONFIG = "bemapnet/bemapnet_r50_30e.py"
@@ -125,7 +125,7 @@ def check_encoder(golden: Golden, name: str) -> Iterator[Row]:
     feats = source.unflatten(3, (6, 7)).permute(0, 3, 1, 2, 4)
     out = encoder.encode(feats, {"ground_from_img": matrices}, (171, 256))
     memory = tokens[0].unflatten(1, (6, 5, 7)).permute(2, 1, 3, 0, 4).flatten(0, 2)
-    bev = torch.stack([turned(level, GRID) for level in out["bev_levels"]])
+    bev = torch.stack([turn_raster(level, GRID) for level in out["bev_levels"]])
     for key, value in {"memory": memory[..., ::4], "bev": bev[:, :, ::4]}.items():
         yield Row(name, key, largest_difference(value.detach(), data[key]), 1e-4)
     scalar = (bev * parts.normal("bm_bev_g", tuple(bev.shape))).sum()
@@ -190,11 +190,11 @@ def check_head(golden: Golden, name: str) -> Iterator[Row]:
                 wanted = data[f"{key}_l{layer}c{label}"]
                 off = largest_difference(value, wanted)
                 yield Row(name, f"{key}_l{layer}c{label}", off, 1e-5)
-    masks = head.enlarged(parts.normal("bm_head_m0", (2, 9, 10, 5)))
+    masks = head.resize_masks(parts.normal("bm_head_m0", (2, 9, 10, 5)))
     off = largest_difference(masks[:, :3], data["ins_mask_l0c0"])
     yield Row(name, "ins_mask_l0c0", off, 1e-5)
     head.bev_size = (10, 5)
-    classes = head.class_masks(turned(parts.normal("bm_head_b0", (2, 64, 10, 5)), GRID))
+    classes = head.class_masks(turn_raster(parts.normal("bm_head_b0", (2, 64, 10, 5)), GRID))
     for label in range(3):
         off = largest_difference(classes[:, label], data[f"sem_l0c{label}"][:, 1])
         yield Row(name, f"sem_l0c{label}", off, 1e-5)

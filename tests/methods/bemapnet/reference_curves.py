@@ -19,7 +19,7 @@ from reference.report import Row, largest_difference
 from gsmap.models.bemapnet.curves import Curve, control_points, neighbourhood, recovery_loss
 from gsmap.models.bemapnet.head import BezierHead
 from gsmap.models.bemapnet.targets import FormatBezierTargets
-from gsmap.models.lines.targets import Part, drawn
+from gsmap.models.lines.targets import Part, draw_lines
 from gsmap.structures.bezier import bernstein, curve_points, fit_piece, fit_pieces, mean_deviation
 from gsmap.structures.grid import BEVGrid
 
@@ -108,7 +108,7 @@ def check_targets(golden: Golden, name: str) -> Iterator[Row]:
     head = small_head((1, 1, 1), 0.15)
     head.grid = GRID
     for tag in ("closed", "many"):
-        parts, grid = own.annotated(target_input(golden, tag))
+        parts, grid = own.collect_parts(target_input(golden, tag))
         yield from fitted_rows(name, tag, parts, grid, data)
         sample = own.transform(target_input(golden, tag))["gt_instances_3d"]
         labels, kept = data[f"{tag}_labels"], data[f"{tag}_labels"][:, 0] >= 0
@@ -127,7 +127,7 @@ def check_targets(golden: Golden, name: str) -> Iterator[Row]:
     off = largest_difference(curves, data["fallback_c2_curve"]) / max(SIZE)
     yield Row(name, "fallback: curves (of the longer side)", off, 1e-6)
     lines = (curves / torch.tensor(SIZE).flip(0)).flip(-1).double().numpy()
-    found = drawn(lines, SIZE, own.thickness_px)
+    found = draw_lines(lines, SIZE, own.thickness_px)
     off = np.unpackbits(data["fallback_c2_mask"]).reshape(found.shape) != found
     yield Row(name, "fallback: share of pixels of masks that differ", off.mean(), 1e-3)
 

@@ -15,7 +15,7 @@ from torch import nn
 
 from gsmap.models.bemapnet.head import BezierHead
 from gsmap.models.lines.head import LinePredictions
-from gsmap.models.lines.targets import drawn
+from gsmap.models.lines.targets import draw_lines
 
 IMAGE_SIZE, FRAME = (128, 256), (171, 256)  # of the images, and before they were cropped
 ENDS = [0, -1]  # the layers that the file has
@@ -92,7 +92,7 @@ def kept_rows(
     scores = result.scores_3d.numpy()[order]
     yield Row(name, "kept scores", largest_difference(scores, data["keep_scores"][1:]), LOGITS)
     lines = head.grid.front_from_metres(result.pts).numpy()[order]
-    masks = drawn(lines, head.mask_size, 1)
+    masks = draw_lines(lines, head.mask_size, 1)
     found = np.stack([masks[labels == label].any(0) for label in range(3)])
     wanted = np.unpackbits(data["drawn"]).reshape(found.shape).astype(bool)
     # versions of OpenCV draw lines of one pixel differently

@@ -8,7 +8,7 @@ import torch
 from gsmap.models.base.attention import place_samples
 from gsmap.models.base.decoder import MapDecoder, MapDecoderLayer
 from gsmap.models.gsmap.guidance import GaussianGuidance
-from gsmap.models.gsmap.layer import GaussianDecoderLayer, guided
+from gsmap.models.gsmap.layer import GaussianDecoderLayer, add_guidance
 from gsmap.models.maptr.references import refine_reference
 from gsmap.structures.gaussians import GaussianSpace
 from gsmap.structures.grid import BEVGrid
@@ -109,4 +109,4 @@ def test_a_decoder_takes_the_layer_that_is_guided():
     """MapTR's take the layer that is guided."""
     for decoder in ({}, {"type": MapDecoder}):
         layer = {"type": GaussianDecoderLayer, "ffn_dims": 4}
-        assert guided({**decoder, "layer": {"ffn_dims": 4}}) == {**decoder, "layer": layer}
+        assert add_guidance({**decoder, "layer": {"ffn_dims": 4}}) == {**decoder, "layer": layer}

@@ -126,7 +126,7 @@ def test_without_noise_a_gaussian_is_moved_as_any_memory_moves_it():
     motion = rigid([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [1, 2, 0])
     exact = GaussianMemory(16, num=2, noise_m=0.0, noise_deg=0.0)
     moved = exact.transform_references(head, references, past(motion=motion))
-    plain = head.reference.moved(references, past(motion=motion).now_from_then)
+    plain = head.reference.transform_references(references, past(motion=motion).now_from_then)
     torch.testing.assert_close(moved, plain, atol=1e-5, rtol=1e-5)
 
 

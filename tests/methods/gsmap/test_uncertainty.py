@@ -155,5 +155,5 @@ def test_odds_are_divided_by_the_smaller_sigma():
     scores = torch.tensor([[3.0], [2.0]]).log()
     scales = torch.tensor([[[0.5, 9.0], [2.0, 2.0]], [[7.0, 0.25], [1.0, 1.0]]])
     for power, odds in ((0.0, [3, 2]), (1.0, [3, 4]), (2.0, [3, 8])):
-        found = GaussianCoder(ALONG_Y, sigma_power=power).weighed(scores, {"scales": scales})
+        found = GaussianCoder(ALONG_Y, sigma_power=power).weigh_scores(scores, {"scales": scales})
         torch.testing.assert_close(found.exp()[:, 0], torch.tensor(odds).float())

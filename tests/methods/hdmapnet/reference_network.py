@@ -18,7 +18,7 @@ from reference.report import Row, largest_difference, largest_relative, relative
 from torch import Tensor
 
 from gsmap.datasets.annotations.record import MapInstance
-from gsmap.models.base.layers import enlarged
+from gsmap.models.base.layers import resize_map
 from gsmap.models.hdmapnet.decoder import LineMapDecoder, LineMaps
 from gsmap.models.hdmapnet.encoder import ViewTransformEncoder, sample_maps
 from gsmap.models.hdmapnet.keys import HDMAPNET
@@ -83,7 +83,7 @@ def check_view(golden: Golden, name: str) -> Iterator[Row]:
     views, places = encoder.transform_views(feats), encoder.cell_positions(matrices)
     laid = sample_maps(views.flatten(0, 1), places.flatten(0, 1))
     topdown = encoder.encode(feats, {"cam_from_ground": matrices}, (64, 96))["bev_feats"]
-    up = enlarged(topdown, (50, 100))
+    up = resize_map(topdown, (50, 100))
     ours = {
         "bv_feat": views[:, :, ::2],
         "pix": places.flatten(0, 1),

@@ -21,7 +21,7 @@ from mmdet3d.structures import Det3DDataSample
 from predictions import stacked
 
 from gsmap.models.gsmap.guidance import GaussianGuidance
-from gsmap.models.gsmap.layer import guided
+from gsmap.models.gsmap.layer import add_guidance
 from gsmap.models.maptr.self_attention import PointSelfAttention
 from gsmap.models.mgmapnet.decoder import MGMapNetDecoder
 from gsmap.models.mgmapnet.head import with_granularities
@@ -200,8 +200,8 @@ def test_a_loss_of_samples_needs_a_decoder_that_tells_them():
 def test_layers_of_the_decoder_are_guided_by_a_part_and_stay():
     layer = {"ffn_dims": 4, "guidance": {"type": GaussianGuidance, "embed_hidden_dims": 2}}
     own = {"ffn_dims": 4, "guidance": {"embed_hidden_dims": 2}}
-    found = guided({"type": MGMapNetDecoder, "layer": own})
+    found = add_guidance({"type": MGMapNetDecoder, "layer": own})
     assert found == {"type": MGMapNetDecoder, "layer": layer}
-    assert guided({"type": MGMapNetDecoder, "layer": {"guidance": None}})["layer"] == {
+    assert add_guidance({"type": MGMapNetDecoder, "layer": {"guidance": None}})["layer"] == {
         "guidance": None
     }

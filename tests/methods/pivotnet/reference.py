@@ -15,7 +15,7 @@ from reference.registry import check
 from reference.report import Row, largest_difference, largest_relative, relative_norm
 from torch import Tensor, nn
 
-from gsmap.models.lines.front import turned
+from gsmap.models.lines.front import turn_raster
 from gsmap.models.lines.head import LinePredictions
 from gsmap.models.pivotnet.encoder import PivotBEVEncoder
 from gsmap.models.pivotnet.head import PivotHead
@@ -159,7 +159,7 @@ def check_head(golden: Golden, name: str) -> Iterator[Row]:
         ours = {
             f"points_{kind}": (torch.stack([lines.points for lines in own]), 3e-5),
             f"point_logits_{kind}": (torch.stack([lines.point_logits for lines in own]), 3e-4),
-            f"ins_mask_{kind}_sub": (head.enlarged(own[-1].masks)[:, ::5, ::4, ::2], 3e-4),
+            f"ins_mask_{kind}_sub": (head.resize_masks(own[-1].masks)[:, ::5, ::4, ::2], 3e-4),
         }
         for key, (value, tolerance) in ours.items():
             yield Row(name, key, largest_difference(value.detach(), data[key]), tolerance)
@@ -169,7 +169,7 @@ def check_head(golden: Golden, name: str) -> Iterator[Row]:
     levels = [parts.normal(f"pv_bev_level{i}", (B, C, *BEV)) for i in range(3)]
     with torch.no_grad():
         masks = torch.stack(
-            [head.class_masks(turned(level, head.grid)) for level in (*levels, bev)]
+            [head.class_masks(turn_raster(level, head.grid)) for level in (*levels, bev)]
         )
     for label, kind in enumerate(CLASSES):
         off = largest_difference(
@@ -228,7 +228,7 @@ def check_forward(golden: Golden, name: str) -> Iterator[Row]:
     memory = [level.flatten(2) for level in encoder.sources(feats)]
     subsets["memory_sub"] = torch.cat(memory, 2)[0, ::8, ::20].T
     bev = encoder.encode(feats, {"img_from_ground": ground_matrices(golden, size)}, size)
-    levels = [turned(level, head.grid) for level in bev["bev_levels"]]
+    levels = [turn_raster(level, head.grid) for level in bev["bev_levels"]]
     subsets["bev_sub"] = torch.cat(levels)[:, ::8, ::8, ::8]
     for key, value in subsets.items():
         yield Row(name, key, largest_difference(value, data[key]), 1e-4)
@@ -245,7 +245,7 @@ def check_forward(golden: Golden, name: str) -> Iterator[Row]:
         off = np.abs(points.numpy() - data[f"points_{kind}"]).max((0, 1, 3, 4))
         yield Row(name, f"points of {kind}, but for one line", float(np.sort(off)[:-1].max()), 3e-5)
         yield Row(name, f"points of {kind}", float(off.max()), 3e-3)
-        enlarged = head.enlarged(own[-1].masks)[:, ::5, ::20, ::10]
+        enlarged = head.resize_masks(own[-1].masks)[:, ::5, ::20, ::10]
         ours = {
             f"point_logits_{kind}": (own[-1].point_logits, data[f"point_logits_{kind}"]),
             f"ins_mask_{kind}_sub": (enlarged, data[f"ins_mask_{kind}_sub"]),

@@ -41,11 +41,11 @@ def test_points_of_lines_are_unfolded_with_all_that_belongs_to_them():
     folded = torch.tensor([[0.0, 0], [0, 2], [0, 1], [0, 3]])
     fields = {"pts": folded.repeat(2, 1, 1), "scales": torch.arange(16.0).view(2, 4, 2)}
     coder = MapCoder(GRID, unfold_classes=[2])
-    found = coder.unfolded(fields, torch.tensor([2, 1]))
+    found = coder.unfold_lines(fields, torch.tensor([2, 1]))
     assert found["pts"][:, :, 1].tolist() == [[0, 1, 2, 3], [0, 2, 1, 3]]
     assert found["scales"][0].tolist() == [[0, 1], [4, 5], [2, 3], [6, 7]]
     torch.testing.assert_close(found["scales"][1], fields["scales"][1])
-    assert MapCoder(GRID).unfolded(fields, torch.tensor([2, 2])) is fields
+    assert MapCoder(GRID).unfold_lines(fields, torch.tensor([2, 2])) is fields
 
 
 def test_wrong_settings_are_refused():

@@ -94,7 +94,7 @@ def test_all_layers_and_samples_at_once_are_matched_as_each_alone():
         layer_of([(near, far), (near, far), (LINE, near)], scores),
     ]
     truth = GroundTruth([elements(LINE), elements(), elements(LINE, far, near)], NORMALISED, None)
-    joined = Predictions.joined(layers)
+    joined = Predictions.join(layers)
     matches, counts = make_assigner().assign(joined, truth, [{}] * 3)
     assert counts == [1, 0, 2]
     assert matches.samples.tolist() == [[0, 2, 2]] * 2

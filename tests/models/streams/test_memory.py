@@ -277,7 +277,7 @@ def test_references_move_with_the_vehicle():
     motion = torch.as_tensor(np.linalg.inv(pose(0.0, math.pi / 2)))[None]
     ahead = head.reference.norm(torch.tensor([[0.0, 6.0]]))
     reference = torch.cat([ahead, torch.tensor([[0.3, 0.2, 0.1]])], -1)[None]
-    moved = head.reference.moved(reference, motion)
+    moved = head.reference.transform_references(reference, motion)
     assert head.reference.metres(moved[0, 0, :2]).tolist() == pytest.approx([6.0, 0.0], abs=1e-4)
     before, after = (head.reference.space.decode(r).rotations for r in (reference, moved))
     assert float(after - before) == pytest.approx(-math.pi / 2, abs=1e-5)
@@ -320,7 +320,7 @@ def test_a_query_that_has_moved_as_the_vehicle_has_no_loss(config):
     assert float(propagation.loss(head)) > 0.1
     state, _, reference = (leaf.flatten(1, 2) for leaf in propagation.propagated)
     predicted = head.reference.refine(0, state, reference)[..., :2].detach()
-    targets = head.reference.moved_points(predicted, past.then_from_now).view(1, 2, 5, 2)
+    targets = head.reference.transform_points(predicted, past.then_from_now).view(1, 2, 5, 2)
     memories = {**past.memory, "targets": targets}
     propagation.past = Past(memories, past.now_from_then, past.seconds, past.continues)
     assert float(propagation.loss(head)) < 1e-6

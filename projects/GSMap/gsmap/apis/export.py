@@ -129,8 +129,8 @@ class ExportedDetector(nn.Module):
             predictions = head(recalled.outputs, **recalled.hooks)
         last_layer = predictions[-1]
         decoded = head.reference.decode(last_layer.references[0])
-        best = head.coder.best(head.coder.weighed(last_layer.scores[0], decoded))
-        fields = head.detected(decoded, best)
+        best = head.coder.best(head.coder.weigh_scores(last_layer.scores[0], decoded))
+        fields = head.select_detections(decoded, best)
         elements = [best.scores, best.labels, fields["pts"]]
         for name in head.reference.outputs[1:]:
             elements.append(fields[name])

@@ -114,9 +114,9 @@ class StaticFrame(nn.Module):
         """
         head = self.model.map_head
         decoded = head.reference.decode(references)
-        best = head.coder.best(head.coder.weighed(scores, decoded))
+        best = head.coder.best(head.coder.weigh_scores(scores, decoded))
         fields = {"scores_3d": best.scores, "labels_3d": best.labels}
-        fields |= head.detected(decoded, best)
+        fields |= head.select_detections(decoded, best)
         layout = {}
         columns = []
         for name, value in fields.items():
@@ -313,7 +313,7 @@ class FastFrames:
         scores = fields.pop("scores_3d")[on_map]
         labels = fields.pop("labels_3d")[on_map]
         visible = {name: value[on_map] for name, value in fields.items()}
-        visible = head.coder.unfolded(visible, labels)
+        visible = head.coder.unfold_lines(visible, labels)
         visible.update(scores_3d=scores, labels_3d=labels)
         instances = InstanceData(metainfo=dict(head.reference.metainfo), **visible)
         return self.frame.model.add_pred_to_datasample([sample], [instances])[0]

@@ -87,7 +87,7 @@ class MapCoder:
             keep &= scores > self.score_threshold
         return keep
 
-    def weighed(self, scores: Tensor, fields: Tensors) -> Tensor:
+    def weigh_scores(self, scores: Tensor, fields: Tensors) -> Tensor:
         """Return class logits by which detections are chosen. (N, classes) -> (N, classes)
 
         Args:
@@ -103,7 +103,7 @@ class MapCoder:
         query = torch.div(index, scores.shape[-1], rounding_mode="floor")
         return Detections(best, index % scores.shape[-1], query)
 
-    def unfolded(self, fields: Tensors, labels: Tensor) -> Tensors:
+    def unfold_lines(self, fields: Tensors, labels: Tensor) -> Tensors:
         """Put what belongs to points in the order of a short way through them.
 
         Args:
@@ -151,12 +151,12 @@ class DetectionHead(BaseModule, NeedsTargets):
         results = []
         for scores, references in zip(outputs[-1].scores, outputs[-1].references, strict=True):
             fields = self.reference.decode(references)
-            best = self.coder.decode(self.coder.weighed(scores, fields), fields["pts"])
-            chosen = self.coder.unfolded(self.detected(fields, best), best.labels)
+            best = self.coder.decode(self.coder.weigh_scores(scores, fields), fields["pts"])
+            chosen = self.coder.unfold_lines(self.select_detections(fields, best), best.labels)
             chosen.update(scores_3d=best.scores, labels_3d=best.labels)
             results.append(InstanceData(metainfo=dict(self.reference.metainfo), **chosen))
         return results
 
-    def detected(self, fields: Tensors, best: Detections) -> Tensors:
+    def select_detections(self, fields: Tensors, best: Detections) -> Tensors:
         """Return what the reference decoded, (N, ...), of the detections. (M, ...)"""
         return {name: value[best.query_inds] for name, value in fields.items()}

@@ -26,13 +26,13 @@ from gsmap.models.base.pairs import GroundTruth, MapMatches, MatchedPairs, Predi
 from gsmap.models.base.parts import (
     PARTS,
     AuxHead,
-    by_name,
     check_classes,
+    check_unique_names,
     check_weight,
     class_of,
-    refuse_twins,
+    modules_by_name,
 )
-from gsmap.models.base.queries import PointTable, added_settings
+from gsmap.models.base.queries import PointTable, resolve_added_settings
 from gsmap.models.base.references import RefinedReference
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32
@@ -100,7 +100,7 @@ class MapHead(DetectionHead):
         **settings: Any,
     ) -> None:
         super().__init__(init_cfg)
-        point_queries = added_settings(settings).get("point_queries", point_queries)
+        point_queries = resolve_added_settings(settings).get("point_queries", point_queries)
         self.grid, self.classes = grid, tuple(classes)
         self.num_points, self.embed_dims = num_points, embed_dims
         self.masks = ElementMasks.of(grid, masks)
@@ -133,12 +133,12 @@ class MapHead(DetectionHead):
             for _ in range(decoder["num_layers"])
         )
         self.loss_cls = MODELS.build(loss_cls)
-        self.losses = by_name([MODELS.build(loss) for loss in losses if loss])
-        self.aux_heads = by_name(
+        self.losses = modules_by_name([MODELS.build(loss) for loss in losses if loss])
+        self.aux_heads = modules_by_name(
             [MODELS.build({"embed_dims": embed_dims, **head}) for head in aux_heads]
         )
         own = {"embed_dims": embed_dims, "num_classes": len(self.classes)}
-        self.flow_parts = by_name([MODELS.build({**own, **part}) for part in flow_parts])
+        self.flow_parts = modules_by_name([MODELS.build({**own, **part}) for part in flow_parts])
         self.assigner = MapAssigner(match_costs)
         self.coder = self.build_coder(coder or {})
         self.check_parts()
@@ -178,8 +178,8 @@ class MapHead(DetectionHead):
                     "gsmap.models.base.losses.MapLoss (docs/add_a_method.md)."
                 )
         names = ["cls", *self.losses]
-        refuse_twins([*names, *self.aux_heads, *self.flow_parts], "losses")
-        refuse_twins([group.name for group in self.query_groups], "query groups")
+        check_unique_names([*names, *self.aux_heads, *self.flow_parts], "losses")
+        check_unique_names([group.name for group in self.query_groups], "query groups")
         for group in self.query_groups:
             unknown = sorted(set(group.losses or ()) - set(names))
             if unknown:
@@ -381,9 +381,9 @@ class MapHead(DetectionHead):
             matches: Of each sample the numbers of its matched queries, increasing, and of the
                 ground truth of each, on the CPU. 2 x (m,)
         """
-        predictions = Predictions.joined([layer.of_queries(slice(None)) for layer in layers])
+        predictions = Predictions.join([layer.of_queries(slice(None)) for layer in layers])
         with torch.autocast(predictions.scores.device.type, enabled=False):
-            known = self.assigner.known(predictions, truths, matches)
+            known = self.assigner.assign_known(predictions, truths, matches)
             return self.group_losses(group, self.pairs(predictions, truths, *known))
 
     def split_groups(
@@ -409,7 +409,7 @@ class MapHead(DetectionHead):
         repeats: int = 1,
     ) -> MatchedPairs:
         """Match every sample's predictions of each layer with its ground truth."""
-        predictions = Predictions.joined(layers)
+        predictions = Predictions.join(layers)
         matches, counts = self.assigner.assign(predictions, truths, metas, repeats)
         return self.pairs(predictions, truths, matches, counts)
 

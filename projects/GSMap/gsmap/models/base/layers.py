@@ -58,7 +58,7 @@ def resnet_stages(
     return stem, nn.ModuleList(stages)
 
 
-def enlarged(feats: Tensor, shape: Sequence[int]) -> Tensor:
+def resize_map(feats: Tensor, shape: Sequence[int]) -> Tensor:
     """Resize a map, the centres of its corner cells staying where they are. (B, C, *shape)"""
     return F.interpolate(feats, size=tuple(shape), mode="bilinear", align_corners=True)
 

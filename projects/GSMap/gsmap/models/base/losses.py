@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from gsmap.models.base.pairs import BuiltHead, MatchedPairs
-from gsmap.models.base.parts import WEIGHT, weights_of
+from gsmap.models.base.parts import WEIGHT, class_weights
 from gsmap.utils.errors import InputTypeError
 from gsmap.utils.targets import NeedsTargets
 
@@ -83,7 +83,7 @@ class MapLoss(nn.Module, NeedsTargets):
             return torch.stack([self(pairs.layer(number)) for number in range(pairs.num_layers)])
         values = self.values(pairs)
         if isinstance(self.loss_weight, Sequence):
-            weights = weights_of(self.loss_weight, pairs.gt_labels)
+            weights = class_weights(self.loss_weight, pairs.gt_labels)
             values = (weights * values.movedim(0, -1)).movedim(-1, 0)
         sums = pairs.by_layer(values).flatten(1).sum(1) / pairs.avg_factor
         return sums if isinstance(self.loss_weight, Sequence) else self.loss_weight * sums

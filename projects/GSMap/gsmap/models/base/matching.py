@@ -66,13 +66,13 @@ class MapAssigner:
         of_samples, labels = self.costs(predictions, truths, metas)
         for index, costs in enumerate(of_samples):
             by_layer = costs.unflatten(1, (layers, num_queries)).unbind(1)
-            found = [assigned(own, self.names, metas[index], repeats) for own in by_layer]
+            found = [solve_assignment(own, self.names, metas[index], repeats) for own in by_layer]
             query, gt = (torch.stack(part) for part in zip(*found, strict=True))  # (L, m)
             pairs.append((query, gt))
-        return self.ordered(predictions, truths, pairs, labels)
+        return self.choose_orders(predictions, truths, pairs, labels)
 
     @torch.no_grad()
-    def known(
+    def assign_known(
         self,
         predictions: Predictions,
         truths: GroundTruth,
@@ -91,9 +91,9 @@ class MapAssigner:
         """
         layers = len(predictions.layers)
         by_layer = [tuple(part.expand(layers, -1) for part in sample) for sample in pairs]
-        return self.ordered(predictions, truths, by_layer, truths.labels.cpu())
+        return self.choose_orders(predictions, truths, by_layer, truths.labels.cpu())
 
-    def ordered(
+    def choose_orders(
         self,
         predictions: Predictions,
         truths: GroundTruth,
@@ -145,7 +145,7 @@ class MapAssigner:
         flat = SimpleNamespace(scores=predictions.scores.flatten(0, 1))
         classes = SimpleNamespace(labels=torch.arange(shape[2], device=predictions.scores.device))
         by_class = [
-            cost(flat, classes).view(shape) if reads_classes_alone(cost) else None
+            cost(flat, classes).view(shape) if depends_on_class_only(cost) else None
             for cost in self.match_costs
         ]
         parts: list[Tensor] = []
@@ -171,12 +171,12 @@ class MapAssigner:
         return found, next(read).long()
 
 
-def reads_classes_alone(cost: Any) -> bool:
+def depends_on_class_only(cost: Any) -> bool:
     """Return whether a cost of mmdet depends on scores and label alone, so one a class will do."""
     return type(cost) is FocalLossCost and not cost.binary_input
 
 
-def assigned(
+def solve_assignment(
     costs: Tensor, names: Sequence[str], img_meta: dict[str, Any] | None, repeats: int = 1
 ) -> tuple[Tensor, Tensor]:
     """Return the pairs of least summed cost: predictions in order, and the ground truth of each.

@@ -61,7 +61,7 @@ class Predictions:
         return self._layers or [self]
 
     @classmethod
-    def joined(cls, layers: Sequence["Predictions"]) -> "Predictions":
+    def join(cls, layers: Sequence["Predictions"]) -> "Predictions":
         """Return the predictions of several layers as one."""
         if len(layers) == 1:
             return layers[0]

@@ -35,12 +35,12 @@ def class_of(part: Mapping[str, Any], registry: Registry = MODELS) -> type | Non
     return registry.get(kind) if isinstance(kind, str) else kind
 
 
-def brought(kind: type, settings: Mapping[str, Any] | None, **defaults: Any) -> list[PARTS]:
+def optional_part(kind: type, settings: Mapping[str, Any] | None, **defaults: Any) -> list[PARTS]:
     """Return the config of a part that a method brings, or nothing if it is switched off (None)."""
     return [] if settings is None else [{"type": kind, **defaults, **settings}]
 
 
-def with_points_weight(
+def set_points_weight(
     parts: Sequence[PARTS], kind: type, weight: WEIGHT | None, key: str, registry: Registry = MODELS
 ) -> list[PARTS]:
     """Return configs of losses or costs, with another weight in that of the points.
@@ -66,20 +66,20 @@ def with_points_weight(
     return [{**part, key: weight} if own else part for part, own in zip(parts, found, strict=True)]
 
 
-def by_name(modules: Sequence[Any]) -> nn.ModuleDict:
+def modules_by_name(modules: Sequence[Any]) -> nn.ModuleDict:
     """Return modules by their ``name``; ValueError if two have the same."""
-    refuse_twins([module.name for module in modules], "parts")
+    check_unique_names([module.name for module in modules], "parts")
     return nn.ModuleDict({module.name: module for module in modules})
 
 
-def refuse_twins(names: Sequence[str], what: str) -> None:
+def check_unique_names(names: Sequence[str], what: str) -> None:
     """Raise ValueError if two have one name."""
     twins = sorted({name for name in names if names.count(name) > 1})
     if twins:
         raise InputError(f"two {what} have one name, {twins[0]!r}; there are {list(names)}.")
 
 
-def weights_of(weight: WEIGHT, labels: Tensor) -> Tensor:
+def class_weights(weight: WEIGHT, labels: Tensor) -> Tensor:
     """Return each element's weight, by its class. (M,) int64 -> (M,) float32 or ()"""
     weights = constant(labels, weight, torch.float32)
     return weights[labels] if weights.ndim else weights

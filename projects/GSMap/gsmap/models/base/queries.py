@@ -42,7 +42,7 @@ def head_setting(name: str) -> Callable[[HeadSetting], HeadSetting]:
     return add
 
 
-def added_settings(given: PARTS) -> PARTS:
+def resolve_added_settings(given: PARTS) -> PARTS:
     """Return the settings of `MapHead` that added settings stand for.
 
     Args:

@@ -55,7 +55,7 @@ class RefinedReference(Reference):
         """Bring points in metres to [0, 1] over the map. (..., coords) -> (..., coords)"""
         raise NotImplementedError
 
-    def moved(self, references: Tensor, motion: Tensor) -> Tensor:
+    def transform_references(self, references: Tensor, motion: Tensor) -> Tensor:
         """Return references of an earlier frame as they lie now. (B, ..., D) -> (B, ..., D)
 
         Args:
@@ -64,7 +64,7 @@ class RefinedReference(Reference):
         """
         raise NotImplementedError
 
-    def moved_points(self, points: Tensor, motion: Tensor) -> Tensor:
+    def transform_points(self, points: Tensor, motion: Tensor) -> Tensor:
         """Return normalised points (B, ..., coords) after a motion (B, 4, 4), put onto the map."""
         raise NotImplementedError
 

@@ -12,7 +12,7 @@ from gsmap.models.base.layers import init_matrices
 from gsmap.models.encoders.camera_encoder import CameraEncoder
 from gsmap.models.encoders.projection import pixel_rays
 from gsmap.models.lines.decoder import AttentionLayer
-from gsmap.models.lines.front import ahead, centres, front_size, turned
+from gsmap.models.lines.front import ahead, centres, front_size, turn_raster
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.errors import InputError
 
@@ -131,7 +131,7 @@ class BezierBEVEncoder(CameraEncoder):
                 key_padding_mask=hidden,
             )
             level = self.norm(cells).transpose(1, 2).unflatten(2, shape)
-            levels.append(turned(level, self.grid))
+            levels.append(turn_raster(level, self.grid))
         return {"bev_feats": levels[-1], "bev_levels": levels}
 
     def ground_points(

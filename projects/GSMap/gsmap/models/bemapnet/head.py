@@ -11,7 +11,7 @@ from mmdet3d.structures import Det3DDataSample
 from torch import Tensor, nn
 
 from gsmap.models.base.coder import Tensors
-from gsmap.models.base.layers import enlarged, mlp
+from gsmap.models.base.layers import mlp, resize_map
 from gsmap.models.base.parts import PARTS
 from gsmap.models.base.references import Reference
 from gsmap.models.bemapnet.curves import Curve, control_points
@@ -223,7 +223,7 @@ class BezierHead(LineHead):
         Raises:
             ValueError: If the sample has no targets, or targets that do not fit the head.
         """
-        instances = self.annotated(sample)
+        instances = self.line_targets(sample)
         points = self.grid.front_from_metres(instances.pts.float()).flip(-1)
         truths = []
         for label, curve in enumerate(cast(Iterable[Curve], self.curves)):
@@ -256,4 +256,4 @@ class BezierHead(LineHead):
 
     def front(self, bev_feats: Tensor) -> Tensor:
         """Rotate BEV features to the front and resize them to the head's cells. (B, C, H, W)"""
-        return enlarged(super().front(bev_feats), self.bev_size)
+        return resize_map(super().front(bev_feats), self.bev_size)

@@ -10,7 +10,7 @@ from mmcv.ops import point_sample
 from mmdet.models.utils import get_uncertain_point_coords_with_randomness
 from torch import Tensor
 
-from gsmap.models.base.matching import assigned
+from gsmap.models.base.matching import solve_assignment
 from gsmap.models.bemapnet.curves import neighbourhood, recovery_loss
 from gsmap.models.lines.losses import Case, LineLosses
 from gsmap.utils.errors import InputError
@@ -133,7 +133,7 @@ class BezierLosses(LineLosses):
 
     def pairs(self, case: Case, costs: list[Tensor]) -> Pairs:
         """Match a case by its `costs`, on the CPU."""
-        rows, cols = assigned(costs[0], COSTS, img_meta={"token": case.token})
+        rows, cols = solve_assignment(costs[0], COSTS, img_meta={"token": case.token})
         return Pairs(rows, cols)
 
     def __call__(self, cases: Sequence[Case], matches: Sequence[Pairs]) -> dict[str, Tensor]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from mmdet3d.registry import TRANSFORMS
 
 from gsmap.models.lines.front import front_size
-from gsmap.models.lines.targets import FormatLineTargets, Points, directed
+from gsmap.models.lines.targets import FormatLineTargets, Points, direct_line
 from gsmap.structures.bezier import MAX_DEGREE, curve_points, fit_pieces, mean_deviation
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import is_closed
@@ -63,7 +63,7 @@ class FormatBezierTargets(FormatLineTargets):
             Control points (from the front, from the left) in [0, 1]. (P, 2)
         """
         if self.sort_rings and is_closed(line):
-            line = directed(line, tolerance=0.0, sort_rings=True)
+            line = direct_line(line, tolerance=0.0, sort_rings=True)
         rows, columns = front_size(grid)
         size_m = (rows * self.pixel_m, columns * self.pixel_m)
         degree = self.degrees[label]

@@ -6,7 +6,7 @@ from typing import Any
 from mmdet3d.registry import MODELS
 
 from gsmap.models.base.head import MapHead
-from gsmap.models.base.parts import DEFAULTS, PARTS, brought, class_of
+from gsmap.models.base.parts import DEFAULTS, PARTS, class_of, optional_part
 from gsmap.models.gemap.attention import GeometryDecoupledAttention
 from gsmap.models.gemap.losses import EuclideanLoss
 
@@ -45,7 +45,7 @@ class GeMapHead(MapHead):
             decoder = {**decoder, "layer": {**layer, "self_attn": attention}}
         super().__init__(
             decoder=decoder,
-            losses=[*losses, *brought(EuclideanLoss, loss_euclidean)],
+            losses=[*losses, *optional_part(EuclideanLoss, loss_euclidean)],
             query_groups=query_groups if one_to_many else query_groups[:1],
             **kwargs,
         )

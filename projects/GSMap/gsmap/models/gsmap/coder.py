@@ -26,7 +26,7 @@ class GaussianCoder(MapCoder):
             raise InputError(f"sigma_power must be >= 0, got {sigma_power}.")
         self.sigma_power = sigma_power
 
-    def weighed(self, scores: Tensor, fields: Tensors) -> Tensor:
+    def weigh_scores(self, scores: Tensor, fields: Tensors) -> Tensor:
         """Weigh class logits (N, classes) by ``scales``, sigmas in metres (N, P, 2), if wanted."""
         if not self.sigma_power:
             return scores

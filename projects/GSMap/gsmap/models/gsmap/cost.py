@@ -7,7 +7,7 @@ from torch import Tensor
 
 from gsmap.models.base.matching import MapCost
 from gsmap.models.base.pairs import BuiltHead, SampleView
-from gsmap.models.base.parts import WEIGHT, weights_of
+from gsmap.models.base.parts import WEIGHT, class_weights
 from gsmap.models.gsmap.reference import require_gaussians
 from gsmap.ops.soft_iou import pairwise_dice_loss, pairwise_soft_iou
 from gsmap.utils.errors import InputError
@@ -40,7 +40,7 @@ class IoUCost(MapCost):
     ) -> Tensor:
         """Compare the masks of matching, (N, h, w) and (K, h, w). (N, K)"""
         preds, targets = pred_instances.cost_masks, gt_instances.cost_masks
-        weights = weights_of(self.weight, gt_instances.labels)
+        weights = class_weights(self.weight, gt_instances.labels)
         if self.kind == "dice":
             return weights * pairwise_dice_loss(preds, targets)
         return weights * (1 - pairwise_soft_iou(preds, targets))

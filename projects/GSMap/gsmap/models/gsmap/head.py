@@ -9,9 +9,9 @@ from torch import Tensor
 from gsmap.models.base.coder import Detections
 from gsmap.models.base.head import MapHead
 from gsmap.models.base.pairs import MatchedPairs
-from gsmap.models.base.parts import DEFAULTS, PARTS, WEIGHT, brought, with_points_weight
+from gsmap.models.base.parts import DEFAULTS, PARTS, WEIGHT, optional_part, set_points_weight
 from gsmap.models.gsmap.cost import IoUCost
-from gsmap.models.gsmap.layer import guided
+from gsmap.models.gsmap.layer import add_guidance
 from gsmap.models.gsmap.losses import MaskLoss, RasterLoss
 from gsmap.models.gsmap.masks import GaussianMasks
 from gsmap.models.gsmap.reference import GaussianReference
@@ -73,15 +73,15 @@ class GSMapHead(MapHead):
             "min_scale_m": smallest,
             "init_scales_m": (max(1.0, 3 * smallest), max(0.4, 1.5 * smallest)),
         }
-        losses = with_points_weight(losses, PointsLoss, points_weight, "loss_weight")
-        match_costs = with_points_weight(
+        losses = set_points_weight(losses, PointsLoss, points_weight, "loss_weight")
+        match_costs = set_points_weight(
             match_costs, OrderedPointsCost, points_weight, "weight", TASK_UTILS
         )
         super().__init__(
             grid=grid,
-            decoder=guided(decoder),
-            losses=[*losses, *brought(RasterLoss, loss_raster)],
-            match_costs=[*match_costs, *brought(IoUCost, iou_cost, weight=2.0)],
+            decoder=add_guidance(decoder),
+            losses=[*losses, *optional_part(RasterLoss, loss_raster)],
+            match_costs=[*match_costs, *optional_part(IoUCost, iou_cost, weight=2.0)],
             masks=drawing,
             reference={**gaussian, **(reference or {})},
             **kwargs,
@@ -95,9 +95,9 @@ class GSMapHead(MapHead):
                 )
         self.temperatures = temperatures
 
-    def detected(self, fields: dict[str, Tensor], best: Detections) -> dict[str, Tensor]:
+    def select_detections(self, fields: dict[str, Tensor], best: Detections) -> dict[str, Tensor]:
         """Return what the reference decoded of the detections, sigmas at their temperatures."""
-        found = super().detected(fields, best)
+        found = super().select_detections(fields, best)
         if self.temperatures is None:
             return found
         factors = constant(found["scales"], self.temperatures)[best.labels][:, None]  # (M, 1, 2)

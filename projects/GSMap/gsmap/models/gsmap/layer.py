@@ -39,7 +39,7 @@ class GaussianDecoderLayer(MapDecoderLayer):
         super().__init__(guidance=guidance, **kwargs)
 
 
-def guided(decoder: PARTS) -> PARTS:
+def add_guidance(decoder: PARTS) -> PARTS:
     """Return a decoder's config with layers that Gaussians guide, where it says nothing else."""
     kind, layer = class_of({"type": MapDecoder, **decoder}), decoder.get("layer", {})
     if kind is None or not issubclass(kind, MapDecoder) or kind.layer_class is MapDecoderLayer:

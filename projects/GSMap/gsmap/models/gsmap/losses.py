@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gsmap.models.base.losses import MapLoss
 from gsmap.models.base.pairs import BuiltHead, MatchedPairs
-from gsmap.models.base.parts import WEIGHT, check_weight, weights_of
+from gsmap.models.base.parts import WEIGHT, check_weight, class_weights
 from gsmap.models.gsmap.reference import require_gaussians
 from gsmap.ops.raster_loss import NORMALIZATIONS, raster_loss
 from gsmap.ops.soft_iou import dice_loss, soft_iou
@@ -48,7 +48,7 @@ class MaskLoss(MapLoss):
         losses = self.per_instance(pairs.pred_masks, pairs.gt_masks)
         if self.full_iou == 0:
             return losses
-        full = weights_of(self.full_iou, pairs.gt_labels)
+        full = class_weights(self.full_iou, pairs.gt_labels)
         iou = soft_iou(pairs.pred_masks.detach(), pairs.gt_masks)
         return losses * torch.where(iou < full, iou / full, 1)
 

@@ -82,9 +82,9 @@ class GaussianReference(PointReference, AddsWeights):
         changes = self.by_point(self.gaussian_branches[layer](point_states))
         return torch.cat([points, reference[..., self.coords :] + changes], -1)
 
-    def moved(self, references: Tensor, motion: Tensor) -> Tensor:
+    def transform_references(self, references: Tensor, motion: Tensor) -> Tensor:
         """Return Gaussians of an earlier frame as they lie now, turned with the vehicle."""
-        moved = super().moved(references, motion)
+        moved = super().transform_references(references, motion)
         turn = torch.atan2(motion[:, 1, 0], motion[:, 0, 0]).to(moved)
         turn = turn.view(-1, *[1] * (moved.dim() - 1)).expand_as(moved[..., :1])
         return torch.cat([moved[..., :-1], moved[..., -1:] + turn], -1)

@@ -5,7 +5,7 @@ from typing import NamedTuple, cast
 from mmdet.models.backbones.resnet import BasicBlock
 from torch import Tensor, nn
 
-from gsmap.models.base.layers import enlarged, resnet_stages
+from gsmap.models.base.layers import resize_map, resnet_stages
 from gsmap.models.hdmapnet.encoder import JoinedMaps, conv_block
 
 
@@ -32,7 +32,7 @@ class FineMaps(nn.Sequential):
 
     def forward(self, feats: Tensor, like: Tensor) -> Tensor:  # type: ignore[override]
         """Predict at the size of ``like``. (B, C, h, w), (B, _, H, W) -> (B, D, H, W)"""
-        return super().forward(enlarged(feats, like.shape[-2:]))
+        return super().forward(resize_map(feats, like.shape[-2:]))
 
 
 class LineMapDecoder(nn.Module):

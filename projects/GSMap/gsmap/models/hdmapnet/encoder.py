@@ -9,7 +9,7 @@ from mmdet3d.registry import MODELS
 from mmengine.model import BaseModule
 from torch import Tensor, nn
 
-from gsmap.models.base.layers import enlarged
+from gsmap.models.base.layers import resize_map
 from gsmap.models.encoders.camera_encoder import CameraEncoder
 from gsmap.models.hdmapnet.layout import forward_size
 from gsmap.structures.grid import BEVGrid
@@ -37,7 +37,7 @@ class JoinedMaps(nn.Sequential):
 
     def forward(self, fine: Tensor, coarse: Tensor) -> Tensor:  # type: ignore[override]
         """Fuse two maps. (B, C, H, W), (B, D, h, w) -> (B, E, H, W)"""
-        coarse = enlarged(coarse, fine.shape[-2:])
+        coarse = resize_map(coarse, fine.shape[-2:])
         return super().forward(torch.cat([fine, coarse], dim=1))
 
 

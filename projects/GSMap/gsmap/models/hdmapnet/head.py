@@ -11,7 +11,7 @@ from mmengine.structures import InstanceData
 from torch import Tensor
 
 from gsmap.models.base.coder import DetectionHead, Samples, Tensors
-from gsmap.models.base.layers import enlarged
+from gsmap.models.base.layers import resize_map
 from gsmap.models.base.parts import PARTS
 from gsmap.models.hdmapnet.decoder import LineMapDecoder, LineMaps
 from gsmap.models.hdmapnet.layout import forward_size, metres_from_pixels, orient_forward
@@ -98,7 +98,7 @@ class HDMapNetHead(DetectionHead):
         """Predict maps of all pixels from ``bev_feats``. (B, C, H, W)"""
         feats = orient_forward(bev_outputs["bev_feats"], self.grid)
         if feats.shape[-2:] != self.map_size:
-            feats = enlarged(feats, self.map_size)
+            feats = resize_map(feats, self.map_size)
         maps = self.decoder(feats)
         return LineMaps(
             semantic=maps.semantic.float(),

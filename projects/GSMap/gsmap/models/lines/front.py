@@ -15,7 +15,7 @@ def front_size(grid: BEVGrid) -> tuple[int, int]:
     return (grid.width, grid.height)
 
 
-def turned(feats: Tensor, grid: BEVGrid) -> Tensor:
+def turn_raster(feats: Tensor, grid: BEVGrid) -> Tensor:
     """Convert between row 0 at the smallest y and row 0 at the front, in both directions.
 
     Args:

@@ -11,9 +11,9 @@ from mmengine.structures import InstanceData
 from torch import Tensor, nn
 
 from gsmap.models.base.coder import DetectionHead, MapCoder, Samples, Tensors
-from gsmap.models.base.layers import enlarged
+from gsmap.models.base.layers import resize_map
 from gsmap.models.base.parts import PARTS
-from gsmap.models.lines.front import front_size, turned
+from gsmap.models.lines.front import front_size, turn_raster
 from gsmap.models.lines.losses import LINE, Case, LineLosses
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import tensor_versions
@@ -188,7 +188,7 @@ class LineHead(DetectionHead):
             losses["semantic"] = self.semantic_loss(levels, truths)
         return {f"loss_{name}": value for name, value in losses.items()}
 
-    def annotated(self, sample: Det3DDataSample) -> InstanceData:
+    def line_targets(self, sample: Det3DDataSample) -> InstanceData:
         """Annotated lines of a sample.
 
         Raises:
@@ -221,7 +221,7 @@ class LineHead(DetectionHead):
             truths: Annotated lines of the class in each sample.
             tokens: Token of each sample.
         """
-        lines = lines._replace(masks=self.enlarged(lines.masks))
+        lines = lines._replace(masks=self.resize_masks(lines.masks))
         distances = self.losses.distances(lines.masks, [truth.masks for truth in truths])
         for index, token in enumerate(tokens):
             sample_lines = lines._make([values[index] for values in lines])
@@ -293,12 +293,12 @@ class LineHead(DetectionHead):
         front = self.front(bev_feats)
         # Each class has two channels, of which the released code trains the second only.
         logits = [branch(front)[:, 1:] for branch in self.semantic_branches]
-        return self.enlarged(torch.cat(logits, 1))
+        return self.resize_masks(torch.cat(logits, 1))
 
     def front(self, bev_feats: Tensor) -> Tensor:
         """BEV features with row 0 at the front, the input of the decoder. (B, C, H, W)"""
-        return turned(bev_feats, self.grid)
+        return turn_raster(bev_feats, self.grid)
 
-    def enlarged(self, masks: Tensor) -> Tensor:
+    def resize_masks(self, masks: Tensor) -> Tensor:
         """Enlarge masks to the size of the targets. (B, n, h, w) -> (B, n, H, W)"""
-        return enlarged(masks.float(), self.mask_size)
+        return resize_map(masks.float(), self.mask_size)

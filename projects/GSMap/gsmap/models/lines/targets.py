@@ -22,7 +22,7 @@ Points = NDArray[np.float64]
 Part = tuple[int, Points]  # class index, and a line (u, v) in [0, 1] from the front and the left
 
 
-def directed(line: Points, tolerance: float, sort_rings: bool = False) -> Points:
+def direct_line(line: Points, tolerance: float, sort_rings: bool = False) -> Points:
     """Order a line from its rear end to its front end.
 
     If both ends are level, the line starts at the right one.
@@ -47,7 +47,9 @@ def directed(line: Points, tolerance: float, sort_rings: bool = False) -> Points
     return line if is_ordered else line[::-1]
 
 
-def drawn(lines: Iterable[Points], size: tuple[int, int], thickness_px: int) -> NDArray[np.bool_]:
+def draw_lines(
+    lines: Iterable[Points], size: tuple[int, int], thickness_px: int
+) -> NDArray[np.bool_]:
     """Draw each line on a raster.
 
     Args:
@@ -133,7 +135,7 @@ class FormatLineTargets(BaseTransform):
         Raises:
             ValueError: If there is no ground truth, or the setting of `by_class` lacks a class.
         """
-        parts, grid = self.annotated(results)
+        parts, grid = self.collect_parts(results)
         labels = []
         points = []
         points_m = []
@@ -154,7 +156,7 @@ class FormatLineTargets(BaseTransform):
         )
         return results
 
-    def annotated(self, results: dict[str, Any]) -> tuple[list[Part], BEVGrid]:
+    def collect_parts(self, results: dict[str, Any]) -> tuple[list[Part], BEVGrid]:
         """Parts of the annotated lines, ordered by class, and the raster of the masks.
 
         Raises:
@@ -210,10 +212,10 @@ class FormatLineTargets(BaseTransform):
         """
         labels = np.array([label for label, _ in parts], int)
         lines = [line for _, line in parts]
-        masks = drawn(lines, size, self.thickness_px)
+        masks = draw_lines(lines, size, self.thickness_px)
         for index, mask in enumerate(masks):
             earlier_of_class = labels[:index] == labels[index]
             masks[:index][earlier_of_class] &= ~mask
         hidden = np.isin(labels, labels[~masks.any((1, 2))])
-        masks[hidden] = drawn(pivots, size, self.thickness_px)[hidden]
+        masks[hidden] = draw_lines(pivots, size, self.thickness_px)[hidden]
         return masks, hidden

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gsmap.models.base.matching import PointsCost
 from gsmap.models.base.pairs import SampleView
-from gsmap.models.base.parts import WEIGHT, weights_of
+from gsmap.models.base.parts import WEIGHT, class_weights
 from gsmap.utils.errors import InputError
 
 
@@ -61,4 +61,4 @@ class OrderedPointsCost(PointsCost):
             The costs. (N, K)
         """
         distances = order_distances(pred_instances.pts, gt_instances.pts_shifts).amin(-1)
-        return distances * weights_of(self.weight, gt_instances.labels)
+        return distances * class_weights(self.weight, gt_instances.labels)

@@ -163,7 +163,7 @@ class PointReference(nn.Module, RefinedReference):
         height = (points[..., 2:].clamp(low, high) - low) / (high - low)
         return torch.cat([points[..., :2], height], -1)
 
-    def moved(self, references: Tensor, motion: Tensor) -> Tensor:
+    def transform_references(self, references: Tensor, motion: Tensor) -> Tensor:
         """Transform references of an earlier frame to the current frame.
 
         Args:
@@ -173,10 +173,10 @@ class PointReference(nn.Module, RefinedReference):
         Returns:
             References of the current frame. (B, ..., D)
         """
-        points = self.moved_points(references[..., : self.coords], motion)
+        points = self.transform_points(references[..., : self.coords], motion)
         return torch.cat([points, references[..., self.coords :]], -1)
 
-    def moved_points(self, points: Tensor, motion: Tensor) -> Tensor:
+    def transform_points(self, points: Tensor, motion: Tensor) -> Tensor:
         """Transform normalised points and clamp them to the map.
 
         The computation has the precision of ``motion``.

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gsmap.models.base.matching import MapCost
 from gsmap.models.base.pairs import BuiltHead, SampleView
-from gsmap.models.base.parts import WEIGHT, weights_of
+from gsmap.models.base.parts import WEIGHT, class_weights
 from gsmap.models.mapvr.losses import ElementRenderer
 from gsmap.ops.soft_iou import pairwise_dice_loss
 
@@ -55,4 +55,4 @@ class RenderedDiceCost(MapCost):
         as_lines = pairwise_dice_loss(self.renderer.render(preds, lines), targets)
         as_polygons = pairwise_dice_loss(self.renderer.render(preds, ~lines), targets)
         costs = torch.where(is_polygon, as_polygons, as_lines)
-        return costs * weights_of(self.weight, gt_instances.labels)
+        return costs * class_weights(self.weight, gt_instances.labels)

@@ -7,7 +7,7 @@ from mmdet3d.registry import MODELS, TASK_UTILS
 
 from gsmap.models.base.head import MapHead
 from gsmap.models.base.masks import ElementMasks
-from gsmap.models.base.parts import DEFAULTS, PARTS, brought, class_of, with_points_weight
+from gsmap.models.base.parts import DEFAULTS, PARTS, class_of, optional_part, set_points_weight
 from gsmap.models.maptr.cost import OrderedPointsCost
 from gsmap.models.maptr.losses import DirectionLoss, PointsLoss
 from gsmap.models.mapvr.cost import RenderedDiceCost
@@ -78,15 +78,13 @@ class MapVRHead(MapHead):
         cost_size = (drawing.cost_grid.height, drawing.cost_grid.width)
         other_losses = [loss for loss in losses if class_of(loss) is not DirectionLoss]
         losses = [
-            *with_points_weight(other_losses, PointsLoss, points_weight, "loss_weight"),
-            *brought(SelfDirectionLoss, loss_direction),
-            *brought(RenderedDiceLoss, loss_dice, size=size, **shared),
+            *set_points_weight(other_losses, PointsLoss, points_weight, "loss_weight"),
+            *optional_part(SelfDirectionLoss, loss_direction),
+            *optional_part(RenderedDiceLoss, loss_dice, size=size, **shared),
         ]
         match_costs = [
-            *with_points_weight(
-                match_costs, OrderedPointsCost, points_weight, "weight", TASK_UTILS
-            ),
-            *brought(RenderedDiceCost, dice_cost, size=cost_size, **shared),
+            *set_points_weight(match_costs, OrderedPointsCost, points_weight, "weight", TASK_UTILS),
+            *optional_part(RenderedDiceCost, dice_cost, size=cost_size, **shared),
         ]
         super().__init__(
             grid=grid,

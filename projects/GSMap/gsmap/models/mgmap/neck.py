@@ -6,7 +6,7 @@ import torch
 from mmdet.models.backbones.resnet import BasicBlock
 from torch import Tensor, nn
 
-from gsmap.models.base.layers import enlarged, resnet_stages
+from gsmap.models.base.layers import resize_map, resnet_stages
 
 
 class Gates(nn.Module):
@@ -99,7 +99,7 @@ class EnhancedNeck(nn.Module):
             feats = stage(feats)
             maps.append(feats)
         size = bev_feats.shape[2:]
-        fused_feats = self.fusion(torch.cat([enlarged(feats, size) for feats in maps], dim=1))
-        maps.append(enlarged(fused_feats, stem.shape[2:]))
+        fused_feats = self.fusion(torch.cat([resize_map(feats, size) for feats in maps], dim=1))
+        maps.append(resize_map(fused_feats, stem.shape[2:]))
         levels = [level(feats) for level, feats in zip(self.levels, maps, strict=True)]
         return fused_feats, levels

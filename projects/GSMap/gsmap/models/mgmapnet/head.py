@@ -10,7 +10,7 @@ from mmengine.logging import print_log
 from gsmap.models.base.attention import BEVDeformableAttention
 from gsmap.models.base.head import MapHead
 from gsmap.models.base.masks import ElementMasks
-from gsmap.models.base.parts import DEFAULTS, PARTS, brought, class_of
+from gsmap.models.base.parts import DEFAULTS, PARTS, class_of, optional_part
 from gsmap.models.maptrv2.attention import DecoupledSelfAttention
 from gsmap.models.mgmapnet.decoder import MGMapNetDecoder, MGMapNetDecoderLayer
 from gsmap.models.mgmapnet.losses import InstanceMaskLoss, SamplingLocationLoss
@@ -53,8 +53,8 @@ class MGMapHead(MapHead):
         element_masks = ElementMasks(grid, **mask_settings)
         if "line_width_m" not in mask_settings:
             element_masks.line_width_m = LINE_PX * 2 * element_masks.half_pixel_m
-        mean_loc = brought(SamplingLocationLoss, loss_mean_loc)
-        ins_seg = brought(InstanceMaskLoss, loss_ins_seg, embed_dims=embed_dims)
+        mean_loc = optional_part(SamplingLocationLoss, loss_mean_loc)
+        ins_seg = optional_part(InstanceMaskLoss, loss_ins_seg, embed_dims=embed_dims)
         super().__init__(
             grid=grid,
             decoder=with_granularities(decoder),

@@ -12,7 +12,7 @@ from gsmap.models.base.attention import MultiLevelAttention
 from gsmap.models.base.layers import feed_forward, init_matrices
 from gsmap.models.encoders.camera_encoder import CameraEncoder
 from gsmap.models.encoders.projection import project_pillars
-from gsmap.models.lines.front import centres, front_size, turned
+from gsmap.models.lines.front import centres, front_size, turn_raster
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.errors import InputError
 
@@ -187,7 +187,7 @@ class PivotBEVEncoder(CameraEncoder):
             bev_view = (split_maps(cells, shapes), cell_reference)
             source_view = (sources, source_reference)
             cells = layer(cells, position, bev_view, source_view)
-            levels.append(turned(split_maps(cells, shapes)[0], self.grid))
+            levels.append(turn_raster(split_maps(cells, shapes)[0], self.grid))
         return {"bev_feats": levels[-1], "bev_levels": levels}
 
     def sources(self, feats: Sequence[Tensor]) -> list[Tensor]:

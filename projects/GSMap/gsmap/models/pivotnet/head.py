@@ -156,7 +156,7 @@ class PivotHead(LineHead):
         Raises:
             ValueError: If the sample has no targets, or targets that do not fit the head.
         """
-        instances = self.annotated(sample)
+        instances = self.line_targets(sample)
         pivots = self.grid.front_from_metres(instances.pts.float())
         truths = []
         for label, (_, num_points) in enumerate(self.decoder.queries):

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gsmap.models.base.matching import assigned
+from gsmap.models.base.matching import solve_assignment
 from gsmap.models.lines.losses import Case, LineLosses
 from gsmap.models.pivotnet.matching import match_pivots, sequence_costs
 from gsmap.structures.tensors import constant
@@ -87,7 +87,9 @@ class PivotLosses(LineLosses):
         sequences = sequence_costs(differences, counts, end_weight=self.end_weight)
         total = np.concatenate([line_costs, self.pivots * sequences[None]])
         names = ["class scores", "masks", "pivots"]
-        rows, cols = assigned(torch.from_numpy(total), names, img_meta={"token": case.token})
+        rows, cols = solve_assignment(
+            torch.from_numpy(total), names, img_meta={"token": case.token}
+        )
         num_points = differences.shape[-1]
         is_pivot = torch.zeros(len(rows), num_points, dtype=torch.bool)
         target_points = torch.zeros(len(rows), num_points, 2)

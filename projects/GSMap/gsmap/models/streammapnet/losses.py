@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gsmap.models.base.losses import MapLoss
 from gsmap.models.base.pairs import MatchedPairs, SampleView
-from gsmap.models.base.parts import weights_of
+from gsmap.models.base.parts import class_weights
 from gsmap.models.maptr.cost import OrderedPointsCost
 from gsmap.structures.tensors import check_same_shape
 
@@ -75,4 +75,4 @@ class SmoothPointsCost(OrderedPointsCost):
         pts = pts.expand((len(pts), *orders.shape))  # (N, K, S, P, 2)
         distances = self.between_points(pts, orders.expand_as(pts)).sum(dim=(-1, -2))
         closest = distances.amin(dim=-1) / pts.shape[-2]
-        return closest * weights_of(self.weight, gt_instances.labels)
+        return closest * class_weights(self.weight, gt_instances.labels)

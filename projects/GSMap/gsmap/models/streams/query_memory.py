@@ -99,7 +99,7 @@ class QueryMemory(BaseModule, AddsWeights):
         Returns:
             References of the current frame. (B, K, P, D)
         """
-        return head.reference.moved(references, past.now_from_then)
+        return head.reference.transform_references(references, past.now_from_then)
 
     def fuse_references(self, refined: Tensor, before: Tensor, head: FlowHead) -> Tensor:
         """Combine the references of propagated queries before and after the decoder.
@@ -293,7 +293,7 @@ class Propagation(FlowHook):
             reference=self.propagated.reference.flatten(1, 2),
         )
         pred = pred[..., : previous.shape[-1]].reshape(previous.shape)
-        target = head.reference.moved_points(previous, self.past.now_from_then)
+        target = head.reference.transform_points(previous, self.past.now_from_then)
         has_target = (previous.flatten(2) != 0).any(-1)  # (B, K)
         weight = has_target & self.past.continues[:, None]
         distances = F.smooth_l1_loss(pred, target, reduction="none", beta=self.memory.beta)

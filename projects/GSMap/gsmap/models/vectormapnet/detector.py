@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from gsmap.models.base.attention import BEVDeformableAttention
 from gsmap.models.base.coder import DetectionHead, MapCoder, Samples, Tensors
 from gsmap.models.base.layers import classification_branch, feed_forward, init_matrices
-from gsmap.models.base.matching import assigned
+from gsmap.models.base.matching import solve_assignment
 from gsmap.models.base.parts import PARTS
 from gsmap.models.base.references import Reference
 from gsmap.models.vectormapnet.canvas import Canvas
@@ -297,7 +297,7 @@ class KeyPointHead(DetectionHead):
         """
         costs = self.costs(scores, boxes, truth=truth).cpu()
         names = ["class scores", "corners", "overlaps"]
-        rows, cols = assigned(costs, names, img_meta={"token": token})
+        rows, cols = solve_assignment(costs, names, img_meta={"token": token})
         return rows.to(boxes.device), cols.to(boxes.device)
 
     def costs(self, scores: Tensor, boxes: Tensor, truth: InstanceData) -> Tensor:

@@ -10,7 +10,7 @@ from mmdet.models.backbones.resnet import BasicBlock
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
-from gsmap.models.base.layers import enlarged, resnet_stages
+from gsmap.models.base.layers import resize_map, resnet_stages
 from gsmap.models.encoders.camera_encoder import CameraEncoder
 from gsmap.models.encoders.projection import PillarProjection, project_pillars
 from gsmap.structures.grid import BEVGrid
@@ -117,7 +117,7 @@ class HeightPlanesEncoder(CameraEncoder):
         for number, blocks in enumerate(cast(Any, self.upsampling), start=1):
             image = feats[number].flatten(0, 1)
             for block, size in zip(blocks, reversed(sizes[:number]), strict=True):
-                image = enlarged(block(image), size)
+                image = resize_map(block(image), size)
             total = total + image
         return total.unflatten(0, feats[0].shape[:2])
 
