@@ -41,8 +41,8 @@ def predictions(*lines, scores=None):
 
 def assign(assigner, pred, truth, repeats=1, token="a"):
     """Return the match of the one layer of one sample. (M,) each"""
-    matches, counts = assigner.assign(pred, truth, [{"token": token}], repeats)
-    assert counts == [matches.rows.shape[1]]
+    matches = assigner.assign(pred, truth, [{"token": token}], repeats)
+    assert matches.counts == [matches.rows.shape[1]]
     assert torch.equal(matches.rows, matches.gt_inds)
     return SimpleNamespace(**{key: value[0] for key, value in matches._asdict().items()})
 
@@ -95,15 +95,15 @@ def test_all_layers_and_samples_at_once_are_matched_as_each_alone():
     ]
     truth = GroundTruth([elements(LINE), elements(), elements(LINE, far, near)], NORMALISED, None)
     joined = Predictions.join(layers)
-    matches, counts = make_assigner().assign(joined, truth, [{}] * 3)
-    assert counts == [1, 0, 2]
+    matches = make_assigner().assign(joined, truth, [{}] * 3)
+    assert matches.counts == [1, 0, 2]
     assert matches.samples.tolist() == [[0, 2, 2]] * 2
     assert matches.query_inds.tolist() == [[1, 0, 1], [0, 0, 1]]
     assert matches.joined_inds.tolist() == [[1, 0, 1], [2, 2, 3]]  # of both layers' queries
     assert matches.gt_inds.tolist() == [[0, 1, 2], [0, 0, 2]]
     assert matches.rows.tolist() == [[0, 2, 3], [0, 1, 3]]
     for number, layer in enumerate(layers):
-        alone, _ = make_assigner().assign(layer, truth, [{}] * 3)
+        alone = make_assigner().assign(layer, truth, [{}] * 3)
         for name in ("samples", "query_inds", "gt_inds", "rows", "order_inds", "host_labels"):
             assert torch.equal(getattr(alone, name)[0], getattr(matches, name)[number])
 

@@ -1,4 +1,4 @@
-"""Deformable attention over one feature map, or over several."""
+"""Deformable attention over one or several feature maps."""
 
 import math
 from collections.abc import Sequence
@@ -25,39 +25,53 @@ _CORNERS = 4
 
 
 def has_compiled_op(value: Tensor) -> bool:
-    """Return whether mmcv's compiled deformable attention can run on a tensor."""
+    """Whether the compiled deformable attention of mmcv supports a tensor."""
     return value.is_cuda and get_compiling_cuda_version() != "not available"
 
 
 def sample_map(value: Tensor, shape: tuple[int, int], locations: Tensor, weights: Tensor) -> Tensor:
-    """Do what `deformable_sample` does, by mmcv's compiled op on a GPU where it was built.
+    """Sample a feature map at several locations per query, and sum the weighted samples.
 
-    A kernel of `deformable_sample` that is switched on goes first.
+    The compiled op of mmcv runs if it supports the tensor, unless a kernel of `deformable_sample`
+    is switched on. Otherwise `deformable_sample` runs.
 
     Args:
         value: Cells of the map, row by row. (B, H * W, heads, C)
         shape: Rows H and columns W of the map.
-        locations: (x, y) in [0, 1] over the map. (B, Q, heads, S, 2)
-        weights: Weight of each sample. (B, Q, heads, S)
+        locations: Sampling locations (x, y), [0, 1] over the map. (B, Q, heads, S, 2)
+        weights: Weights of the samples. (B, Q, heads, S)
+
+    Returns:
+        Sampled features of all heads. (B, Q, heads * C)
     """
     if has_kernel(value) or not has_compiled_op(value):
         return deformable_sample(value, shape, locations, weights)
-    shapes = constant(value, [shape], torch.long)
-    samples = locations[:, :, :, None].contiguous(), weights[:, :, :, None].contiguous()
-    arguments = value.contiguous(), shapes, constant(value, [0], torch.long), *samples, _IM2COL_STEP
-    return MultiScaleDeformableAttnFunction.apply(*arguments)
+    level_shapes = constant(value, [shape], torch.long)
+    level_starts = constant(value, [0], torch.long)
+    return MultiScaleDeformableAttnFunction.apply(
+        value.contiguous(),
+        level_shapes,
+        level_starts,
+        locations[:, :, :, None].contiguous(),
+        weights[:, :, :, None].contiguous(),
+        _IM2COL_STEP,
+    )
 
 
 def place_samples(
     offsets: Tensor, reference: Tensor, shape: tuple[int, int], frames: Tensor | None = None
 ) -> Tensor:
-    """Place samples around reference points, (x, y) in [0, 1] over the map. (B, Q, heads, S, 2)
+    """Sampling locations around reference points.
 
     Args:
-        offsets: From the reference point, in cells. (B, Q, heads, S, 2)
-        reference: Begins with the point (x, y) in [0, 1] over the map. (B, Q, D)
+        offsets: Offsets (x, y) from the reference point, in cells. (B, Q, heads, S, 2)
+        reference: References, which start with the point (x, y), [0, 1] over the map. (B, Q, D)
         shape: Rows and columns of the map.
-        frames: Turn the offsets of a query, if given. (B, Q, 2, 2)
+        frames: Matrices that multiply the offsets of each query from the left, or None.
+            (B, Q, 2, 2)
+
+    Returns:
+        Locations (x, y), [0, 1] over the map. (B, Q, heads, S, 2)
     """
     if frames is not None:
         offsets = torch.sum(frames[:, :, None, None] * offsets[..., None, :], -1)
@@ -66,20 +80,23 @@ def place_samples(
 
 
 class SamplingAttention(nn.Module):
-    """The learned parts of deformable attention on one map.
+    """Base class of deformable attention: projections, sampling offsets and attention weights.
 
-    They are those of mmcv's ``MultiScaleDeformableAttention`` for one level.
+    The layers have the names and shapes of ``MultiScaleDeformableAttention`` in mmcv.
 
     Args:
-        embed_dims: Channels C of map and output; ValueError if ``num_heads`` does not divide them.
+        embed_dims: Channels C of the map and the output, divisible by ``num_heads``.
         num_heads: Number of heads.
         num_points: Samples per head and query, in each part.
-        query_dims: Channels of the query; None means ``embed_dims``.
-        dropout: Dropout on the output.
-        num_parts: Parts of the samples, such as levels, which start with the same offsets.
+        query_dims: Channels of the query. None means ``embed_dims``.
+        dropout: Dropout of the output.
+        num_parts: Number of parts of the samples, such as levels, with equal initial offsets.
 
     Attributes:
-        num_points: Samples per head and query, of all parts, S.
+        num_points: Samples S per head and query, in all parts.
+
+    Raises:
+        ValueError: If ``num_heads`` does not divide ``embed_dims``.
     """
 
     def __init__(
@@ -97,7 +114,8 @@ class SamplingAttention(nn.Module):
                 f"embed_dims must be divisible by num_heads, got {embed_dims} and {num_heads}."
             )
         query_dims = query_dims or embed_dims
-        self.num_heads, self.num_parts = num_heads, num_parts
+        self.num_heads = num_heads
+        self.num_parts = num_parts
         self.num_points = num_parts * num_points
         self.sampling_offsets = nn.Linear(query_dims, num_heads * self.num_points * 2)
         self.attention_weights = nn.Linear(query_dims, num_heads * self.num_points)
@@ -107,79 +125,101 @@ class SamplingAttention(nn.Module):
         self.init_weights()
 
     def init_weights(self) -> None:
-        """Let each head look in its own direction, with equal weights."""
+        """Initialise the offsets of each head in another direction, with equal weights."""
         constant_init(self.sampling_offsets, 0.0)
         offsets = directional_offsets(self.num_heads, self.num_points // self.num_parts)
-        with torch.no_grad():  # in place: the weights may lie on a GPU already
+        with torch.no_grad():  # in place, because the weights may be on a GPU
             self.sampling_offsets.bias.copy_(offsets.repeat(1, self.num_parts, 1).flatten())
         constant_init(self.attention_weights, 0.0)
         xavier_init(self.value_proj, distribution="uniform")
         xavier_init(self.output_proj, distribution="uniform")
 
     def offsets_in_cells(self, query: Tensor) -> Tensor:
-        """Return the learned offsets (x, y) in cells. (B, Q, heads, S, 2)"""
+        """Offsets (x, y) in cells. (B, Q, C) -> (B, Q, heads, S, 2)"""
         offsets = at_least_float32(self.sampling_offsets(query))
         return offsets.unflatten(-1, (self.num_heads, self.num_points, 2))
 
     def weights(self, query: Tensor) -> Tensor:
-        """Return the attention weights, of sum one over a head's points. (B, Q, heads, S)"""
+        """Attention weights, with sum 1 over the samples. (B, Q, C) -> (B, Q, heads, S)"""
         logits = at_least_float32(self.attention_weights(query))
         return logits.unflatten(-1, (self.num_heads, self.num_points)).softmax(-1)
 
     def values(self, tokens: Tensor) -> Tensor:
-        """Return a map's projected cells by head. (..., cells, C) -> (..., cells, heads, C')"""
+        """Projected cells of a map, by head. (..., cells, C) -> (..., cells, heads, C')"""
         return at_least_float32(self.value_proj(tokens)).unflatten(-1, (self.num_heads, -1))
 
 
 @MODELS.register_module()
 class BEVDeformableAttention(SamplingAttention):
-    """Multi-head deformable attention on one map; the residual is left to the caller.
+    """Multi-head deformable attention to one map, without the residual.
 
-    Its arguments are those of :class:`SamplingAttention`.
+    It has the arguments of :class:`SamplingAttention`.
     """
 
     def forward(
         self, query: Tensor, reference: Tensor, feats: Tensor, frames: Tensor | None = None
     ) -> Tensor:
-        """Sample the map (B, C, H, W) for each query. (B, Q, C) -> (B, Q, C)
+        """Sample the map for each query.
 
-        Queries have their position; references and frames are as in `place_samples`.
+        Args:
+            query: Queries with their positional encoding. (B, Q, C)
+            reference: References, as in `place_samples`. (B, Q, D)
+            feats: Feature map. (B, C, H, W)
+            frames: Matrices of the offsets, as in `place_samples`, or None. (B, Q, 2, 2)
+
+        Returns:
+            The attention output. (B, Q, C)
         """
         shape = (feats.shape[-2], feats.shape[-1])
         tokens = feats.flatten(2).transpose(1, 2)  # (B, H * W, C)
-        locations = self.locations(query, reference, shape, frames)
+        locations = self.locations(query, reference, shape=shape, frames=frames)
         weights = self.weights(query)
-        # Projection and sampling commute: projecting after it pays when few cells are looked at.
-        few = weights.numel() * _CORNERS < tokens[..., 0].numel() * self.num_heads
-        if few and not (has_kernel(tokens) or has_compiled_op(tokens)):
-            sampled = self._sample_then_project(tokens, shape, locations, weights)
+        # Projection and sampling commute. With few samples, projecting last is faster.
+        num_reads = weights.numel() * _CORNERS
+        num_cells = tokens[..., 0].numel() * self.num_heads
+        if num_reads < num_cells and not (has_kernel(tokens) or has_compiled_op(tokens)):
+            sampled = self._sample_then_project(tokens, shape, locations=locations, weights=weights)
         else:
-            sampled = sample_map(self.values(tokens), shape, locations, weights)
+            value = self.values(tokens)
+            sampled = sample_map(value, shape, locations=locations, weights=weights)
         return self.dropout(self.output_proj(sampled))
 
     def locations(
         self, query: Tensor, reference: Tensor, shape: tuple[int, int], frames: Tensor | None
     ) -> Tensor:
-        """Return where each query looks, (x, y) in [0, 1] over the map. (B, Q, heads, S, 2)"""
-        return place_samples(self.offsets_in_cells(query), reference, shape, frames)
+        """Sampling locations of each query.
+
+        Args:
+            query: Queries with their positional encoding. (B, Q, C)
+            reference: References, as in `place_samples`. (B, Q, D)
+            shape: Rows and columns of the map.
+            frames: Matrices of the offsets, as in `place_samples`, or None. (B, Q, 2, 2)
+
+        Returns:
+            Locations (x, y), [0, 1] over the map. (B, Q, heads, S, 2)
+        """
+        offsets = self.offsets_in_cells(query)
+        return place_samples(offsets, reference, shape=shape, frames=frames)
 
     def _sample_then_project(
         self, tokens: Tensor, shape: tuple[int, int], locations: Tensor, weights: Tensor
     ) -> Tensor:
-        """Return what sampling the projected map would, by projecting each head's sample."""
+        """Sample the unprojected map, then project the sample of each head. (B, Q, C)"""
         cells, cell_weights = bilinear_cells(locations, weights, shape)
         sample = torch.arange(len(tokens), device=tokens.device).view(-1, 1, 1, 1)
         table = at_least_float32(tokens).reshape(-1, tokens.shape[-1])
-        sampled = sum_rows(table, sample * tokens.shape[1] + cells, cell_weights)
+        rows = sample * tokens.shape[1] + cells
+        sampled = sum_rows(table, rows, cell_weights)
         weight = self.value_proj.weight.unflatten(0, (self.num_heads, -1))  # (heads, C', C)
         bias = self.value_proj.bias.view(self.num_heads, -1)
         projected = torch.einsum("bqhc,hdc->bqhd", sampled, weight)
-        return (projected + cell_weights.sum(-1, keepdim=True) * bias).flatten(2)  # (B, Q, C)
+        projected_bias = cell_weights.sum(-1, keepdim=True) * bias
+        return (projected + projected_bias).flatten(2)  # (B, Q, C)
 
 
 @MODELS.register_module()
 class MultiLevelAttention(SamplingAttention):
-    """Deformable attention over several maps, with one softmax over the samples in all of them.
+    """Deformable attention over several maps, with one softmax over the samples of all maps.
 
     Args:
         num_levels: Number of maps.
@@ -197,23 +237,38 @@ class MultiLevelAttention(SamplingAttention):
         feats: Sequence[Tensor],
         frames: Tensor | None = None,
     ) -> Tensor:
-        """Sample all maps (B, C, h, w), offsets in cells of each. (B, Q, C) -> (B, Q, C)
+        """Sample all maps for each query.
 
-        References and frames are as in `place_samples`.
+        Args:
+            query: Queries with their positional encoding. (B, Q, C)
+            reference: References, as in `place_samples`. (B, Q, D)
+            feats: Feature maps; offsets are in cells of each. (B, C, h, w) each
+            frames: Matrices of the offsets, as in `place_samples`, or None. (B, Q, 2, 2)
+
+        Returns:
+            The attention output. (B, Q, C)
         """
-        offsets = self.offsets_in_cells(query).chunk(self.num_parts, 3)
-        weights = self.weights(query).chunk(self.num_parts, 3)
-        seen = torch.zeros_like(query)
-        for level, own, weight in zip(feats, offsets, weights, strict=True):
+        all_offsets = self.offsets_in_cells(query).chunk(self.num_parts, 3)
+        all_weights = self.weights(query).chunk(self.num_parts, 3)
+        total = torch.zeros_like(query)
+        for level, offsets, weights in zip(feats, all_offsets, all_weights, strict=True):
             shape = (level.shape[-2], level.shape[-1])
             value = self.values(level.flatten(2).transpose(1, 2))
-            places = place_samples(own, reference, shape, frames)
-            seen = seen + sample_map(value, shape, places, weight)
-        return self.dropout(self.output_proj(seen))
+            locations = place_samples(offsets, reference, shape=shape, frames=frames)
+            total = total + sample_map(value, shape, locations=locations, weights=weights)
+        return self.dropout(self.output_proj(total))
 
 
 def directional_offsets(num_heads: int, num_points: int) -> Tensor:
-    """Return offsets with the heads spread over a square, sample s at s + 1. (heads, S, 2)"""
+    """Offsets on a square around the origin, in a direction for each head.
+
+    Args:
+        num_heads: Number of heads.
+        num_points: Samples S per head. Sample s has s + 1 times the offset of the first one.
+
+    Returns:
+        Offsets (x, y) in cells. (heads, S, 2)
+    """
     angles = torch.arange(num_heads, dtype=torch.float32) * (2 * math.pi / num_heads)
     directions = torch.stack([angles.cos(), angles.sin()], -1)
     directions = directions / directions.abs().amax(-1, keepdim=True)

@@ -14,10 +14,10 @@ from gsmap.structures.tensors import constant
 
 
 class ClassLoss(nn.Module):
-    """A class loss that reads the matched pairs, not only one-hot targets."""
+    """Base class of classification losses that depend on matched pairs."""
 
     def check(self, head: BuiltHead) -> None:
-        """Raise ValueError if a head does not fit; called when it is built."""
+        """Raise ValueError if a head lacks an input of the loss. Called when the head is built."""
 
     def forward(self, pairs: MatchedPairs) -> Tensor:
         """Weighted loss of every logit. (B, L * N, classes)
@@ -29,10 +29,10 @@ class ClassLoss(nn.Module):
 
 
 class Quality(nn.Module):
-    """Quality of matched predictions, the target of their class scores."""
+    """Base class of qualities of matched predictions, the targets of their class scores."""
 
     def check(self, head: BuiltHead) -> None:
-        """Raise ValueError if a head lacks an input of the quality."""
+        """Raise ValueError if a head lacks an input of the quality. Called when it is built."""
 
     def forward(self, pairs: MatchedPairs) -> Tensor:
         """Quality of each matched pair, 0 to 1, without gradient. (M,)"""
@@ -64,21 +64,21 @@ class DistanceQuality(Quality):
 class QualityClassLoss(ClassLoss):
     r"""Quality focal loss from the second decoder layer on, a plain loss for the first (DAMap).
 
-    For the class of a matched ground truth, with its quality q and the score s:
-    :math:`|q - s|^\beta \mathrm{BCE}(s, q)`; for every other class and query
-    :math:`s^\beta \mathrm{BCE}(s, 0)`. The points of the first layer are far off, so that q would
-    be close to 0 for all.
+    With score s and quality q, the loss of the class of a matched ground truth is
+    :math:`|q - s|^\beta \mathrm{BCE}(s, q)`, and of every other class and query
+    :math:`s^\beta \mathrm{BCE}(s, 0)`. The first layer has a plain loss because its points are far
+    from the ground truth, so that every quality would be close to 0.
 
     Args:
         quality: Config of a `Quality`.
         first_layer: Config of the loss of the first layer, on logits and one-hot targets.
         beta: Exponent of the distance between score and target.
         loss_weight: Weight of the loss.
-        classes: Indices of the classes whose targets are the quality; targets of others are 1. None
-            takes all classes.
+        classes: Indices of the classes with the quality as target; targets of other classes are 1.
+            None means all classes.
 
     Raises:
-        ValueError: If the head lacks one of the classes, or an input of the quality.
+        ValueError: If the head lacks a class or an input of the quality.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class QualityClassLoss(ClassLoss):
         self.classes = classes
 
     def check(self, head: BuiltHead) -> None:
-        """Raise ValueError if a head does not fit, see the class; called when it is built."""
+        """Raise ValueError if the head lacks a class or an input of the quality."""
         check_classes("loss_cls.classes", self.classes or (), head.classes)
         self.quality.check(head)
 
@@ -109,17 +109,19 @@ class QualityClassLoss(ClassLoss):
         """
         scores = pairs.predictions.scores
         targets = self.targets(pairs)
-        per_layer = scores.shape[1] // pairs.num_layers
-        plain = plain_class_loss(
-            self.first_layer, scores[:, :per_layer], pairs.query_labels()[:, :per_layer]
+        num_queries = scores.shape[1] // pairs.num_layers
+        first_labels = pairs.query_labels()[:, :num_queries]
+        first_losses = plain_class_loss(
+            self.first_layer, scores=scores[:, :num_queries], labels=first_labels
         )
-        probabilities = scores[:, per_layer:].sigmoid()
-        later = targets[:, per_layer:]
+        later_scores = scores[:, num_queries:]
+        later_targets = targets[:, num_queries:]
         entropies = F.binary_cross_entropy_with_logits(
-            scores[:, per_layer:], later, reduction="none"
+            later_scores, later_targets, reduction="none"
         )
-        focused = (later - probabilities).abs().pow(self.beta) * entropies
-        return torch.cat([plain, self.loss_weight * focused], 1)
+        distances = (later_targets - later_scores.sigmoid()).abs()
+        later_losses = self.loss_weight * (distances.pow(self.beta) * entropies)
+        return torch.cat([first_losses, later_losses], 1)
 
     def targets(self, pairs: MatchedPairs) -> Tensor:
         """Targets of the scores, without gradient. (B, L * N, classes)"""
@@ -127,22 +129,25 @@ class QualityClassLoss(ClassLoss):
         targets = torch.zeros_like(scores)
         quality = self.quality(pairs).detach().to(targets)
         if self.classes is not None:
-            chosen = [index in self.classes for index in range(scores.shape[-1])]
-            has_quality = constant(pairs.gt_labels, chosen, torch.bool)
+            is_selected = [index in self.classes for index in range(scores.shape[-1])]
+            has_quality = constant(pairs.gt_labels, is_selected, torch.bool)
             quality = torch.where(has_quality[pairs.gt_labels], quality, 1.0)
         targets[pairs.samples, pairs.query_inds, pairs.gt_labels] = quality
         return targets
 
 
 def plain_class_loss(loss: Any, scores: Tensor, labels: Tensor) -> Tensor:
-    """Values of a loss on logits and one-hot targets. (B, N, classes)
+    """Values of a classification loss of mmdet.
 
     Args:
-        loss: Built loss of mmdet's form.
+        loss: Loss module with logits and one-hot targets as inputs.
         scores: Class logits. (B, N, classes)
-        labels: Class of each query, -1 for none. (B, N)
+        labels: Class index of each query, -1 for no class. (B, N)
+
+    Returns:
+        Weighted loss of every logit. (B, N, classes)
     """
-    # one-hot targets take the plain path of mmdet's focal loss, which needs no compiled op
+    # With one-hot targets, mmdet's focal loss does not need its compiled op.
     one_hot = F.one_hot(labels + 1, scores.shape[-1] + 1)[..., 1:]
     values = loss(scores.flatten(0, 1), one_hot.flatten(0, 1), reduction_override="none")
     return values.view_as(scores)

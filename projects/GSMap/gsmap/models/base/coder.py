@@ -1,4 +1,4 @@
-"""From class scores and points of all queries to the best detections."""
+"""Selection of detections from the class scores and points of all queries."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -22,23 +22,33 @@ Metas = Sequence[dict[str, Any]]
 
 
 class Detections(NamedTuple):
-    """The best detections of one sample, highest score first. (M,) each"""
+    """Detections of one sample, highest score first.
 
-    scores: Tensor  # confidence in [0, 1]
-    labels: Tensor  # class index
-    query_inds: Tensor  # the query of each; one may appear with several classes
+    Attributes:
+        scores: Confidences in [0, 1]. (M,)
+        labels: Class indices. (M,)
+        query_inds: Indices of the queries; a query may occur with several classes. (M,)
+    """
+
+    scores: Tensor
+    labels: Tensor
+    query_inds: Tensor
 
 
 class MapCoder:
-    """Keep the best pairs of query and class whose points lie on the map or close to it.
+    """Coder of detections: the pairs of query and class with the highest scores, near the map.
 
     Args:
-        grid: The map's extent.
-        max_num: Largest number of detections per sample; ValueError if it is not positive.
-        margin_m: How far beyond the map a point may lie, in metres, > 0; None keeps all.
-        score_threshold: Smallest score to keep; None keeps all.
-        unfold_classes: Class indices of lines whose points are put in the order of a short way
-            through them (`shortest_orders`), for masks do not see when a line runs back and forth.
+        grid: Extent of the map.
+        max_num: Largest number of detections per sample, >= 1.
+        margin_m: Largest distance of a point beyond the map, in metres, > 0. None keeps all
+            detections.
+        score_threshold: Detections need a higher score. None keeps all detections.
+        unfold_classes: Class indices of lines whose points are reordered to a short path
+            (`shortest_orders`). Losses of masks do not penalise lines that run back and forth.
+
+    Raises:
+        ValueError: If ``max_num`` or ``margin_m`` is out of range.
     """
 
     def __init__(
@@ -53,30 +63,36 @@ class MapCoder:
             raise InputError(f"max_num must be >= 1, got {max_num}.")
         if margin_m is not None and margin_m <= 0:
             raise InputError(f"margin_m must be > 0, got {margin_m}.")
-        self.grid, self.max_num = grid, max_num
-        self.margin_m, self.score_threshold = margin_m, score_threshold
+        self.grid = grid
+        self.max_num = max_num
+        self.margin_m = margin_m
+        self.score_threshold = score_threshold
         self.unfold_classes = tuple(unfold_classes)
 
     def decode(self, scores: Tensor, pts: Tensor) -> Detections:
-        """Select at most ``max_num`` detections; index ``pts`` with their ``query_inds``.
-
-        Class logits (N, classes), points in metres (N, P, 2 or 3).
-        """
-        found = self.best(scores)
-        places = pts if self.margin_m is None else pts[found.query_inds]
-        chosen = self.keep_mask(found.scores, places)
-        kept = chosen.nonzero()[:, 0]  # the one wait for the device
-        return Detections(*(values[kept] for values in found))
-
-    def keep_mask(self, scores: Tensor, pts: Tensor) -> Tensor:
-        """Return which detections lie on the map or close to it, and are sure enough.
+        """Select at most ``max_num`` detections.
 
         Args:
-            scores: Their confidence. (M,)
-            pts: Their points in metres. (M, P, 2 or 3)
+            scores: Class logits. (N, classes)
+            pts: Points in metres. (N, P, 2 or 3)
+        """
+        best = self.best(scores)
+        best_pts = pts if self.margin_m is None else pts[best.query_inds]
+        is_valid = self.keep_mask(best.scores, best_pts)
+        rows = is_valid.nonzero()[:, 0]  # the only synchronisation with the device
+        return Detections(
+            scores=best.scores[rows], labels=best.labels[rows], query_inds=best.query_inds[rows]
+        )
+
+    def keep_mask(self, scores: Tensor, pts: Tensor) -> Tensor:
+        """Mask of the detections near the map with a score above the threshold.
+
+        Args:
+            scores: Confidences in [0, 1]. (M,)
+            pts: Points in metres. (M, P, 2 or 3)
 
         Returns:
-            True for those that count. (M,)
+            True for the detections to keep. (M,)
         """
         keep = torch.ones_like(scores, dtype=torch.bool)
         if self.margin_m is not None:
@@ -88,45 +104,63 @@ class MapCoder:
         return keep
 
     def weigh_scores(self, scores: Tensor, fields: Tensors) -> Tensor:
-        """Return class logits by which detections are chosen. (N, classes) -> (N, classes)
+        """Class logits for the selection of detections; a subclass may change them here.
 
         Args:
             scores: Class logits. (N, classes)
-            fields: What the reference decodes. (N, ...) each
+            fields: Decoded references, by name. (N, ...) each
+
+        Returns:
+            Class logits. (N, classes)
         """
         return scores
 
     def best(self, scores: Tensor) -> Detections:
-        """Return the best pairs of query and class, wherever they lie. (N, classes)"""
-        flat = scores.float().sigmoid().flatten()
-        best, index = flat.topk(min(self.max_num, len(flat)))
-        query = torch.div(index, scores.shape[-1], rounding_mode="floor")
-        return Detections(best, index % scores.shape[-1], query)
-
-    def unfold_lines(self, fields: Tensors, labels: Tensor) -> Tensors:
-        """Put what belongs to points in the order of a short way through them.
+        """Pairs of query and class with the highest scores, at any place.
 
         Args:
-            fields: ``pts`` in metres (M, P, 2 or 3), and what else points have. (M, P, ...)
-            labels: Class indices; of those not in ``unfold_classes``, points stay. (M,)
+            scores: Class logits. (N, classes)
+        """
+        confidences = scores.float().sigmoid().flatten()
+        num = min(self.max_num, len(confidences))
+        best_confidences, inds = confidences.topk(num)
+        num_classes = scores.shape[-1]
+        return Detections(
+            scores=best_confidences,
+            labels=inds % num_classes,
+            query_inds=torch.div(inds, num_classes, rounding_mode="floor"),
+        )
+
+    def unfold_lines(self, fields: Tensors, labels: Tensor) -> Tensors:
+        """Reorder the points of lines to a short path.
+
+        Args:
+            fields: ``pts`` in metres (M, P, 2 or 3), and other fields of the points, by name.
+                (M, P, ...)
+            labels: Class indices. Points of classes not in ``unfold_classes`` keep their order.
+                (M,)
+
+        Returns:
+            The reordered fields, by name.
         """
         if not self.unfold_classes:
             return fields
         points = fields["pts"]
-        lines = torch.isin(labels, constant(labels, self.unfold_classes))
+        is_line = torch.isin(labels, constant(labels, self.unfold_classes))
         orders = torch.arange(points.shape[1], device=points.device).repeat(len(points), 1)
-        orders[lines] = torch.from_numpy(shortest_orders(points[lines].cpu().numpy())).to(orders)
+        line_orders = shortest_orders(points[is_line].cpu().numpy())
+        orders[is_line] = torch.from_numpy(line_orders).to(orders)
         rows = torch.arange(len(points), device=points.device)[:, None]
         return {name: values[rows, orders] for name, values in fields.items()}
 
 
 class DetectionHead(BaseModule, NeedsTargets):
-    """What every head shares: detections of its last layer.
+    """Base class of heads: detections of the last decoder layer.
 
     Attributes:
-        reference: How references of predictions stand for points.
-        coder: The choice of detections.
-        not_exported: Why there is no ONNX file of the head; empty if there is one.
+        reference: Decoding of references to points.
+        coder: Selection of detections.
+        not_exported: Reason why the head has no ONNX export; empty if it has one.
     """
 
     not_exported: str = ""
@@ -135,28 +169,50 @@ class DetectionHead(BaseModule, NeedsTargets):
     coder: MapCoder
 
     def fit_state(self, state: dict[str, Tensor], prefix: str) -> None:
-        """Fit a checkpoint's state to the model's, in place."""
+        """Adapt the state of a checkpoint to the head, in place.
+
+        Args:
+            state: Tensors of the checkpoint, by name.
+            prefix: Prefix of the names of the head.
+        """
 
     def predict(self, bev_outputs: Tensors, batch_data_samples: Samples) -> list[InstanceData]:
-        """Run the head and return its detections."""
+        """Run the head and decode its detections."""
         metas = [sample.metainfo for sample in batch_data_samples]
         return self.predict_by_feat(self(bev_outputs), metas)
 
     def predict_by_feat(self, outputs: Sequence[Any], batch_img_metas: Metas) -> list[InstanceData]:
-        """Decode the last layer's predictions, best first.
+        """Decode the predictions of the last layer.
 
-        They are, per sample, ``scores_3d`` (M,), ``labels_3d`` (M,), ``pts`` (M, P, 2) in metres
-        and what else the reference decodes.
+        Args:
+            outputs: Predictions of each layer.
+            batch_img_metas: Meta dict of each sample.
+
+        Returns:
+            Detections of each sample, highest score first: ``scores_3d`` (M,), ``labels_3d`` (M,),
+            ``pts`` (M, P, 2 or 3) in metres, and the other fields of the reference.
         """
+        last = outputs[-1]
         results = []
-        for scores, references in zip(outputs[-1].scores, outputs[-1].references, strict=True):
+        for scores, references in zip(last.scores, last.references, strict=True):
             fields = self.reference.decode(references)
-            best = self.coder.decode(self.coder.weigh_scores(scores, fields), fields["pts"])
-            chosen = self.coder.unfold_lines(self.select_detections(fields, best), best.labels)
-            chosen.update(scores_3d=best.scores, labels_3d=best.labels)
-            results.append(InstanceData(metainfo=dict(self.reference.metainfo), **chosen))
+            scores = self.coder.weigh_scores(scores, fields)
+            best = self.coder.decode(scores, fields["pts"])
+            detections = self.coder.unfold_lines(self.select_detections(fields, best), best.labels)
+            detections["scores_3d"] = best.scores
+            detections["labels_3d"] = best.labels
+            metainfo = dict(self.reference.metainfo)
+            results.append(InstanceData(metainfo=metainfo, **detections))
         return results
 
     def select_detections(self, fields: Tensors, best: Detections) -> Tensors:
-        """Return what the reference decoded, (N, ...), of the detections. (M, ...)"""
-        return {name: value[best.query_inds] for name, value in fields.items()}
+        """Fields of the detections.
+
+        Args:
+            fields: Decoded references, by name. (N, ...) each
+            best: Selected pairs of query and class.
+
+        Returns:
+            The fields by name. (M, ...) each
+        """
+        return {name: values[best.query_inds] for name, values in fields.items()}

@@ -1,4 +1,4 @@
-"""MapTR's decoder: point queries interact, look at the BEV and refine their reference."""
+"""Decoder of map elements: layers with attention among queries and to the BEV features."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -10,41 +10,65 @@ from mmengine.model import BaseModule, ModuleList
 from torch import Tensor, nn
 
 from gsmap.models.base.layers import feed_forward
+from gsmap.models.base.parts import build_part
 from gsmap.structures.gaussians import GaussianSpace
 
-Refine = Callable[[int, Tensor, Tensor], Tensor]  # layer, point states, reference -> reference
+Refine = Callable[[int, Tensor, Tensor], Tensor]  # (layer, point states, reference) -> reference
 
 
 class Guidance(nn.Module):
-    """What a decoder layer takes from its references, for whichever attentions it has."""
+    """Base class of the conditioning of decoder layers on the references of their queries."""
 
     def position(self, query_pos: Tensor, reference: Tensor) -> Tensor:
-        """Add what references (B, Q, D) say to the queries' position. (B, Q, C) -> (B, Q, C)"""
+        """Add embeddings of references to the positional queries.
+
+        Args:
+            query_pos: Positional queries. (B, Q, C)
+            reference: References. (B, Q, D)
+
+        Returns:
+            Positional queries. (B, Q, C)
+        """
         raise NotImplementedError
 
     def frames(self, reference: Tensor, feats: Tensor) -> Tensor | None:
-        """Return what turns sampling offsets in cells of the features, if anything. (B, Q, 2, 2)"""
+        """Matrices for the sampling offsets of each query.
+
+        Args:
+            reference: References. (B, Q, D)
+            feats: Sampled feature map, or maps.
+
+        Returns:
+            Matrices that multiply offsets in cells from the left, or None. (B, Q, 2, 2)
+        """
         raise NotImplementedError
 
 
 class Queries(NamedTuple):
-    """The queries between two decoder layers, as the layers hand them on."""
+    """Queries between two decoder layers.
 
-    state: Any  # of points (B, N * P, C), of instances (B, N, C), or what the decoder's layers take
-    position: Tensor  # of the same shape
-    reference: Tensor  # (B, N * P, D)
+    Attributes:
+        state: States of points (B, N * P, C) or instances (B, N, C), or another type that the
+            layers of the decoder exchange.
+        position: Positional queries, in the shape of the states of points or instances.
+        reference: References of the points. (B, N * P, D)
+    """
+
+    state: Any
+    position: Tensor
+    reference: Tensor
 
 
 @dataclass(eq=False)
 class Decoded:
-    """What a decoder layer returns, for all samples of a batch.
+    """Output of a decoder layer for a batch.
 
-    A decoder that returns more has a subclass, whose fields all start with (B, N).
+    Decoders with further outputs have a subclass, whose fields have the leading dimensions (B, N).
 
     Args:
-        point_states: They move the references. (B, N, P, C)
-        references: What the layer has refined, float32. (B, N, P, D)
-        instance_states: They say the class. (B, N, C)
+        point_states: States of the points, from which references are refined. (B, N, P, C)
+        references: Refined references in float32. (B, N, P, D)
+        instance_states: States of the instances, from which classes are predicted. (B, N, C)
     """
 
     point_states: Tensor
@@ -52,41 +76,46 @@ class Decoded:
     instance_states: Tensor
 
     def of_queries(self, queries: slice) -> "Decoded":
-        """Return what belongs to some of the instance queries."""
-        return type(self)(**{name: value[:, queries] for name, value in vars(self).items()})
+        """Output for some of the instance queries."""
+        fields = {name: values[:, queries] for name, values in vars(self).items()}
+        return type(self)(**fields)
 
 
 class JoinedDecoded(Decoded):
-    """What several layers returned: each field is joined along the queries when it is first read.
+    """Outputs of several layers, concatenated along the queries.
+
+    Fields are concatenated on first access and cached.
 
     Args:
-        layers: What each layer returned, L of them, with fields (B, N, ...).
+        layers: Output of each of L layers, with fields (B, N, ...).
     """
 
     def __init__(self, layers: Sequence[Decoded]) -> None:
         self._layers = layers
 
     def __getattr__(self, name: str) -> Tensor:
-        """Return a field of all layers. (B, L * N, ...)"""
-        joined = torch.cat([getattr(layer, name) for layer in self._layers], 1)
-        setattr(self, name, joined)
-        return joined
+        """Field of all layers. (B, L * N, ...)"""
+        values = torch.cat([getattr(layer, name) for layer in self._layers], 1)
+        setattr(self, name, values)
+        return values
 
 
 @MODELS.register_module()
 class MapDecoderLayer(BaseModule):
-    """Self-attention, cross-attention to the BEV and feed-forward, each with its LayerNorm.
+    """Decoder layer: self-attention, cross-attention to the BEV features, feed-forward network.
+
+    Each of the three is followed by LayerNorm.
 
     Args:
         embed_dims: Channels C.
-        num_heads: Heads of both attentions.
+        num_heads: Heads of each attention.
         num_points: Points per instance P.
         ffn_dims: Hidden channels of the feed-forward network.
-        dropout: Dropout of every sublayer.
-        self_attn: Config of the self-attention (`PointSelfAttention`).
-        cross_attn: Config of the cross-attention (`BEVDeformableAttention`).
-        guidance: Config of a `Guidance`, or None for a layer that is not guided.
-        space: How the reference stands for a Gaussian; the guidance takes it.
+        dropout: Probability to drop a value in training, in every sublayer.
+        self_attn: Config of the self-attention. Default: `PointSelfAttention`.
+        cross_attn: Config of the cross-attention. Default: `BEVDeformableAttention`.
+        guidance: Config of a `Guidance`, or None for a layer without.
+        space: Encoding of Gaussians in references, an argument of the guidance.
     """
 
     def __init__(
@@ -103,15 +132,15 @@ class MapDecoderLayer(BaseModule):
     ) -> None:
         super().__init__()
         shared = {"embed_dims": embed_dims, "num_heads": num_heads, "dropout": dropout}
-        own = {"type": "PointSelfAttention", "num_points": num_points, **shared}
-        self.self_attn = MODELS.build({**own, **(self_attn or {})})
-        own = {"type": "BEVDeformableAttention", **shared}
-        self.cross_attn = MODELS.build({**own, **(cross_attn or {})})
+        self.self_attn = build_part(
+            self_attn, type="PointSelfAttention", num_points=num_points, **shared
+        )
+        self.cross_attn = build_part(cross_attn, type="BEVDeformableAttention", **shared)
         self.ffn = feed_forward(embed_dims, ffn_dims, dropout)
         self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in range(3))
         self.guidance: Guidance | None = None
         if guidance is not None:
-            self.guidance = MODELS.build({"space": space, "embed_dims": embed_dims, **guidance})
+            self.guidance = build_part(guidance, space=space, embed_dims=embed_dims)
 
     def forward(
         self,
@@ -121,31 +150,46 @@ class MapDecoderLayer(BaseModule):
         bev_feats: Tensor,
         attn_mask: Tensor | None = None,
     ) -> Tensor:
-        """Update the point queries; arguments as in `MapDecoder.forward`. -> (B, N * P, C)"""
+        """Update the point queries.
+
+        Args:
+            query: States of the points. (B, N * P, C)
+            query_pos: Positional queries. (B, N * P, C)
+            reference: References. (B, N * P, D)
+            bev_feats: BEV features. (B, C, H, W)
+            attn_mask: True where an instance (row) may not attend to another (column), or None.
+                (N, N)
+
+        Returns:
+            The updated states. (B, N * P, C)
+        """
         frames = None
         if self.guidance is not None:
             query_pos = self.guidance.position(query_pos, reference)
             frames = self.guidance.frames(reference, bev_feats)
-        query = self.norms[0](self.self_attn(query, query_pos, attn_mask))
+        attended = self.self_attn(query, query_pos, attn_mask)
+        query = self.norms[0](attended)
         sampled = self.cross_attn(query + query_pos, reference, bev_feats, frames)
-        return self.norms[2](self.ffn(self.norms[1](query + sampled)))
+        query = self.norms[1](query + sampled)
+        return self.norms[2](self.ffn(query))
 
 
 @MODELS.register_module()
 class MapDecoder(BaseModule):
-    """A stack of decoder layers that refine one reference.
+    """Stack of decoder layers, each followed by the refinement of the references.
 
     Args:
-        layer: Config of the layer.
+        layer: Config of the layers.
         num_layers: Number of layers L.
         num_points: Points per instance P.
-        detach_reference: Cut the gradient through the reference between layers, as MapTR does.
-        shared: What the head hands on to every layer: ``embed_dims`` and ``space``.
+        detach_reference: Stop the gradient through the references between layers, as in MapTR.
+        shared: Arguments of every layer that are set by the head: ``embed_dims`` and ``space``.
 
     Attributes:
-        point_queries: Whether it takes point queries (B, N * P, C), or instance queries (B, N, C).
-        layer_class: Class of its layers, where their config names none.
-        branches: For each output, the number of the branches that read it.
+        point_queries: True if the queries are of points (B, N * P, C), False if they are of
+            instances (B, N, C).
+        layer_class: Class of the layers if their config has no type.
+        branches: Index of the prediction branches of each output.
     """
 
     point_queries = True
@@ -160,14 +204,15 @@ class MapDecoder(BaseModule):
         **shared: Any,
     ) -> None:
         super().__init__()
-        self.num_points, self.detach_reference = num_points, detach_reference
-        layer = {"type": self.layer_class, "num_points": num_points, **shared, **layer}
-        self.layers = ModuleList(MODELS.build(layer) for _ in range(num_layers))
+        self.num_points = num_points
+        self.detach_reference = detach_reference
+        defaults = {"type": self.layer_class, "num_points": num_points, **shared}
+        self.layers = ModuleList(build_part(layer, **defaults) for _ in range(num_layers))
         self.branches = list(range(num_layers))
 
     @classmethod
     def reference_settings(cls, num_points: int) -> dict[str, Any]:
-        """Return settings of the reference that follow from what the states stand for.
+        """Settings of the reference that follow from the number of points of a state.
 
         Args:
             num_points: Points per instance P.
@@ -175,20 +220,34 @@ class MapDecoder(BaseModule):
         return {}
 
     def start(self, query: Tensor, reference: Tensor, bev_feats: Tensor) -> tuple[Any, Tensor, Any]:
-        """Return queries, reference and features as the layers take them."""
+        """Inputs of the first layer.
+
+        Args:
+            query: Content of the queries. (B, Q, C)
+            reference: Initial references. (B, Q, D)
+            bev_feats: BEV features. (B, C, H, W)
+
+        Returns:
+            States, references and features, in the types that the layers need.
+        """
         return query, reference, bev_feats
 
     def point_states(self, state: Any) -> Tensor:
-        """Return the states of the points of a layer's output. (B, N * P, C)"""
+        """States of the points, from the states of a layer. (B, N * P, C)"""
         return state
 
     def read(self, state: Any, references: Tensor) -> Decoded:
-        """Return a layer's output, with the references that it has refined. (B, N * P, D)"""
+        """Output of a layer.
+
+        Args:
+            state: States after the layer.
+            references: Refined references. (B, N * P, D)
+        """
         points = self.by_instance(self.point_states(state))
         return Decoded(points, self.by_instance(references), points.mean(2))
 
     def by_instance(self, values: Tensor) -> Tensor:
-        """Sort values of points by their instance. (B, N * P, ...) -> (B, N, P, ...)"""
+        """Split values of points by instance. (B, N * P, ...) -> (B, N, P, ...)"""
         return values.unflatten(1, (-1, self.num_points))
 
     def forward(
@@ -201,18 +260,19 @@ class MapDecoder(BaseModule):
         attn_mask: Tensor | None = None,
         between: Callable[[int, Queries], Queries] | None = None,
     ) -> list[Decoded]:
-        """Run all layers, each on the reference that the one before refined.
+        """Run all layers, each with the references of the previous one.
 
         Args:
-            query: Content of the queries, Q of points (N * P) or of instances (N). (B, Q, C)
-            query_pos: Their learned position. (B, Q, C)
-            reference: Initial reference of each. (B, Q, D)
+            query: Content of the queries, of points (Q = N * P) or instances (Q = N). (B, Q, C)
+            query_pos: Positional queries. (B, Q, C)
+            reference: Initial references. (B, N * P, D)
             bev_feats: BEV features. (B, C, H, W)
-            refine: Maps a layer's number, its point states (B, N * P, C) and a reference (B, N * P,
-                D) to the refined one.
-            attn_mask: True where an instance may not attend to another, or None. (N, N)
-            between: Takes a layer's number and the queries after it, and returns those of the next
-                layer; None leaves them.
+            refine: Function of the index of a layer, its point states (B, N * P, C) and references
+                (B, N * P, D). It returns the refined references.
+            attn_mask: True where an instance (row) may not attend to another (column), or None.
+                (N, N)
+            between: Function of the index of a layer and the queries after it. It returns the
+                queries of the next layer. None leaves the queries unchanged.
 
         Returns:
             The output of every layer.

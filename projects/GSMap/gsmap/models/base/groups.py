@@ -7,17 +7,19 @@ from gsmap.utils.errors import InputError
 
 @dataclass(frozen=True)
 class QueryGroup:
-    """Instance queries that are matched together; no group attends to another.
+    """Settings of a group of instance queries that are matched together.
+
+    Queries of different groups do not attend to each other.
 
     Args:
-        num: Instance queries.
-        name: Suffix of its losses; empty for the group that predicts.
-        repeats: How often each ground truth may be matched.
+        num: Number of instance queries, >= 1.
+        name: Suffix of the names of its losses. The group that predicts has the empty name.
+        repeats: Number of queries that each ground truth is matched to, >= 1.
         weight: Weight of its losses.
-        losses: Names of the losses that it has; None means all.
+        losses: Names of its losses. None means all losses of the head.
 
     Raises:
-        ValueError: If a number is not positive.
+        ValueError: If ``num`` or ``repeats`` is not positive.
     """
 
     num: int

@@ -1,4 +1,4 @@
-"""Hooks into the flow of a head: memory, queries made of the ground truth, known matches, masks."""
+"""Hooks into the flow of a head, for memory or for further queries with known matches."""
 
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
@@ -24,7 +24,7 @@ class FlowStart(NamedTuple):
 
 
 class FlowHead(BuiltHead, Protocol):
-    """Interface of a head to the hooks that take part in its flow."""
+    """Interface of a head to its hooks."""
 
     embed_dims: int
     num_points: int
@@ -38,48 +38,57 @@ class FlowHead(BuiltHead, Protocol):
         truths: GroundTruth,
         matches: Sequence[tuple[Tensor, Tensor]],
     ) -> dict[str, Tensor]:
-        """Return the losses of queries whose matches are known, see `MapHead`."""
+        """Losses of queries with known matches (`MapHead.known_losses`).
+
+        Args:
+            group: Name, weight and losses of the queries.
+            layers: Predictions of the queries, after each layer.
+            truths: Ground truth of the batch.
+            matches: Matched pairs of each sample: indices of the queries, increasing, and indices
+                of the ground truths, on the CPU. 2 x (m,)
+        """
         ...
 
 
 class FlowHook:
-    """Base class of hooks into the flow of a head for one batch; its own methods do nothing.
+    """Base class of hooks into the flow of a head for one batch.
 
-    Hooks are called in their order, `outputs` in the reverse order, so that each one removes the
-    queries that it has appended.
+    The methods of the base class change nothing. Hooks are called in their order, except for
+    `outputs`: there the order is reversed, so that each hook removes the queries that it has
+    appended.
     """
 
     def start(self, head: FlowHead, start: FlowStart) -> FlowStart:
-        """Return the input of the first decoder layer; further queries are appended.
+        """Input of the first decoder layer. Further queries are appended to the given ones.
 
         Args:
             head: The head.
-            start: The queries of the head and of the hooks before.
+            start: Queries of the head and of the previous hooks.
         """
         return start
 
     def refine(self, head: FlowHead, layer: int, refined: Tensor) -> Tensor:
-        """Return the references after a layer.
+        """References after a layer.
 
         Args:
             head: The head.
-            layer: Number of the layer.
-            refined: References that the head has refined. (B, N * P, D)
+            layer: Index of the layer.
+            refined: References refined by the head. (B, N * P, D)
         """
         return refined
 
     def between(self, head: FlowHead, layer: int, queries: Queries) -> Queries:
-        """Return the queries of the next layer.
+        """Queries of the next layer. Also called after the last layer.
 
         Args:
             head: The head.
-            layer: Number of the layer that has just run, the last one included.
-            queries: Queries after it.
+            layer: Index of the previous layer.
+            queries: Queries after the previous layer.
         """
         return queries
 
     def outputs(self, head: FlowHead, layers: list[Predictions]) -> list[Predictions]:
-        """Return the predictions of the head, without queries that the hook has appended.
+        """Predictions of the head, without the queries that the hook has appended.
 
         Args:
             head: The head.
@@ -88,7 +97,7 @@ class FlowHook:
         return layers
 
     def targets(self, head: FlowHead, pairs: MatchedPairs) -> None:
-        """Read the matches of the predicting queries in the last layer.
+        """Receive the matches of the first query group in the last layer.
 
         Args:
             head: The head.
@@ -96,29 +105,32 @@ class FlowHook:
         """
 
     def losses(self, head: FlowHead, truths: GroundTruth) -> dict[str, Tensor]:
-        """Return further losses by name, in which ``loss`` occurs.
+        """Further losses by name. The names contain ``loss``.
 
         Args:
             head: The head.
-            truths: The ground truth of the batch.
+            truths: Ground truth of the batch.
         """
         return {}
 
 
 class FlowPart(Protocol):
-    """A part of a head, a module with a ``name``, that gives training batches a `FlowHook`.
+    """Interface of modules of a head that make a `FlowHook` for each training batch.
 
-    It is built with ``embed_dims`` and ``num_classes`` beside its settings. Prediction does not
-    call it.
+    The module is built with its settings and with ``embed_dims`` and ``num_classes``. It is not
+    used in prediction.
+
+    Attributes:
+        name: Name of the module, unique in a head.
     """
 
     name: str
 
     def hook(self, head: FlowHead, truths: GroundTruth) -> FlowHook:
-        """Return the hook of a training batch.
+        """Hook of a training batch.
 
         Args:
             head: The head.
-            truths: The ground truth of the batch.
+            truths: Ground truth of the batch.
         """
         ...

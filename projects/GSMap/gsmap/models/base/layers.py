@@ -1,4 +1,4 @@
-"""The small networks that turn states into predictions, codes and embeddings; enlarging maps."""
+"""Small networks of heads and encoders, resizing of feature maps, and initialisation."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -10,56 +10,88 @@ from torch import Tensor, nn
 
 
 def mlp(*dims: int) -> nn.Sequential:
-    """Return matrices from each number of channels to the next, with ReLUs in between.
+    """Multilayer perceptron with a ReLU between its linear layers.
 
-    The ReLUs are not in place: a matrix returns a view of its result, and a change of a view in
-    place costs zeros and two copies in the backward pass.
+    The ReLUs do not run in place. A linear layer returns a view, and an in-place change of a view
+    costs a tensor of zeros and two copies in the backward pass.
+
+    Args:
+        dims: Channels of the input, of each hidden layer, and of the output.
     """
     layers: list[nn.Module] = []
-    for inputs, outputs in pairwise(dims):
-        layers += [nn.Linear(inputs, outputs), nn.ReLU()]
-    return nn.Sequential(*layers[:-1])
+    for in_dims, out_dims in pairwise(dims):
+        layers.append(nn.Linear(in_dims, out_dims))
+        layers.append(nn.ReLU())
+    layers.pop()  # no ReLU after the output
+    return nn.Sequential(*layers)
 
 
 def feed_forward(embed_dims: int, ffn_dims: int, dropout: float) -> FFN:
-    """Return mmcv's feed-forward network with its residual; its ReLU as in `mlp`.
+    """Feed-forward network of mmcv, with its residual; the ReLU does not run in place (`mlp`).
 
     Args:
-        embed_dims: Channels of input and output.
-        ffn_dims: Channels between.
-        dropout: Share of values set to zero in training.
+        embed_dims: Channels of the input and the output.
+        ffn_dims: Hidden channels.
+        dropout: Probability to drop a value in training.
     """
     return FFN(embed_dims, ffn_dims, act_cfg={"type": "ReLU"}, ffn_drop=dropout)
 
 
 def classification_branch(embed_dims: int, num_classes: int) -> nn.Sequential:
-    """Return a classifier of two hidden layers, each with LayerNorm; it gives logits."""
+    """Classifier with two hidden layers, each followed by LayerNorm and ReLU.
+
+    Args:
+        embed_dims: Channels of the input and the hidden layers.
+        num_classes: Number of logits.
+    """
     layers: list[nn.Module] = []
     for _ in range(2):
-        layers += [nn.Linear(embed_dims, embed_dims), nn.LayerNorm(embed_dims), nn.ReLU(True)]
-    return nn.Sequential(*layers, nn.Linear(embed_dims, num_classes))
+        layers.append(nn.Linear(embed_dims, embed_dims))
+        layers.append(nn.LayerNorm(embed_dims))
+        layers.append(nn.ReLU(True))
+    layers.append(nn.Linear(embed_dims, num_classes))
+    return nn.Sequential(*layers)
 
 
 def resnet_stages(
     block: type[nn.Module], inputs: int, widths: Sequence[int]
 ) -> tuple[nn.Sequential, nn.ModuleList]:
-    """Return a ResNet's stem without pooling, and stages of two blocks; each further one halves.
+    """Stem of a ResNet without pooling, and stages of two blocks.
+
+    The stem halves the resolution of its input, and so does each stage but the first.
 
     Args:
         block: Class of the blocks.
-        inputs: Channels of the map.
-        widths: Channels of each stage.
+        inputs: Channels of the input.
+        widths: Channels of each stage; the stem has the channels of the first one.
+
+    Returns:
+        The stem and the stages.
     """
     stem = nn.Sequential(
-        nn.Conv2d(inputs, widths[0], 7, 2, 3, bias=False), nn.BatchNorm2d(widths[0]), nn.ReLU(True)
+        nn.Conv2d(inputs, widths[0], kernel_size=7, stride=2, padding=3, bias=False),
+        nn.BatchNorm2d(widths[0]),
+        nn.ReLU(True),
     )
-    sizes = zip((widths[0], *widths), widths, strict=False)
-    stages = [ResLayer(block, *size, 2, stride=1 + (i > 0)) for i, size in enumerate(sizes)]
-    return stem, nn.ModuleList(stages)
+    stages = nn.ModuleList()
+    in_width = widths[0]
+    for width in widths:
+        stride = 2 if len(stages) else 1
+        stages.append(ResLayer(block, in_width, width, num_blocks=2, stride=stride))
+        in_width = width
+    return stem, stages
 
 
 def resize_map(feats: Tensor, shape: Sequence[int]) -> Tensor:
-    """Resize a map, the centres of its corner cells staying where they are. (B, C, *shape)"""
+    """Resize a feature map bilinearly, with fixed centres of the corner cells.
+
+    Args:
+        feats: Feature map. (B, C, H, W)
+        shape: Rows and columns of the result.
+
+    Returns:
+        The resized map. (B, C, *shape)
+    """
     return F.interpolate(feats, size=tuple(shape), mode="bilinear", align_corners=True)
 
 
@@ -67,7 +99,10 @@ _SAMPLING = ("sampling_offsets.weight", "attention_weights.weight", "height_offs
 
 
 def init_matrices(module: nn.Module) -> None:
-    """Initialise all matrices of a transformer (Xavier) but those that place and weigh samples."""
+    """Initialise the matrices of a transformer from Xavier's uniform distribution.
+
+    Matrices of sampling offsets and attention weights in deformable attention are left as they are.
+    """
     for name, parameter in module.named_parameters():
         if parameter.dim() > 1 and not name.endswith(_SAMPLING):
             nn.init.xavier_uniform_(parameter)

@@ -1,4 +1,4 @@
-"""The base class of losses of matched pairs."""
+"""Base class of losses of matched pairs."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,21 +13,23 @@ from gsmap.utils.targets import NeedsTargets
 
 
 class MapLoss(nn.Module, NeedsTargets):
-    """A loss of matched pairs: the weighted sum of its `values` over the number of pairs.
+    """Loss of matched pairs: the weighted sum of `values`, divided by the number of pairs.
 
-    The pairs are of all decoder layers at once.
+    A subclass overrides `values` for a sum over pairs, or `forward` for any other loss. The pairs
+    of all decoder layers are processed together.
 
     Args:
-        loss_weight: Weight of the loss, or one for each class; a pair has that of its ground truth.
-        last_layer_only: Leave it out of all decoder layers but the last.
-        first_group_only: Leave it out of all query groups but the one that predicts.
+        loss_weight: Weight of the loss, or a weight for each class, applied to the pairs of the
+            class.
+        last_layer_only: Compute the loss for the last decoder layer only.
+        first_group_only: Compute the loss for the first query group only, which predicts.
 
     Attributes:
-        name: It is logged as ``loss_<name>``; unique in a head.
+        name: Name of the loss, unique in a head. It is logged as ``loss_<name>``.
 
     Raises:
-        TypeError: If a class sets a flag as its attribute, where a misspelt one would be silent, or
-            a loss that is no sum over pairs has a weight for each class.
+        TypeError: If a subclass sets a flag as a class attribute, where a misspelt name would have
+            no effect; or if a loss that is not a sum over pairs has a weight for each class.
     """
 
     name: str
@@ -40,14 +42,13 @@ class MapLoss(nn.Module, NeedsTargets):
         first_group_only: bool = False,
     ) -> None:
         super().__init__()
-        own = {name: getattr(type(self), name) for name in ("forward", "by_layer")}
-        is_sum = own == {name: getattr(MapLoss, name) for name in own}
+        kind = type(self)
+        is_sum = kind.forward is MapLoss.forward and kind.by_layer is MapLoss.by_layer
         if isinstance(loss_weight, Sequence) and not is_sum:
-            raise InputTypeError(
-                f"{type(self).__name__} is no sum over pairs: give one loss_weight."
-            )
+            raise InputTypeError(f"{kind.__name__} is no sum over pairs: give one loss_weight.")
         self.loss_weight = loss_weight
-        self.last_layer_only, self.first_group_only = last_layer_only, first_group_only
+        self.last_layer_only = last_layer_only
+        self.first_group_only = first_group_only
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
@@ -59,31 +60,41 @@ class MapLoss(nn.Module, NeedsTargets):
             )
 
     def check(self, head: BuiltHead) -> None:
-        """Raise ValueError if a head lacks what the loss reads; called when the head is built."""
+        """Raise ValueError if a head lacks an input of the loss. Called when the head is built."""
 
     def reads(self, pairs: MatchedPairs) -> bool:
-        """Return whether a layer has what the loss reads."""
+        """Whether the predictions of a layer have the inputs of the loss.
+
+        Args:
+            pairs: Pairs of the layer.
+        """
         return True
 
     def values(self, pairs: MatchedPairs) -> Tensor:
-        """Return the values that are summed, of each pair. (M, ...)"""
+        """Values of each pair, which are summed. (M, ...)"""
         raise NotImplementedError
 
     def forward(self, pairs: MatchedPairs) -> Tensor:
-        """Return the weighted loss of one layer, 0 with a gradient of 0 without pairs. ()"""
+        """Weighted loss of one layer. Without pairs, it is 0 with a gradient of 0. ()"""
         (loss,) = self.by_layer(pairs)
         return loss
 
     def by_layer(self, pairs: MatchedPairs) -> Tensor:
-        """Return the weighted loss of each layer. (L,)
+        """Weighted loss of each layer.
 
-        A loss that overrides `forward` is called with the pairs of one layer after another.
+        Args:
+            pairs: Pairs of all layers. If a subclass overrides `forward`, it is called for the
+                pairs of each layer.
+
+        Returns:
+            The losses. (L,)
         """
         if type(self).forward is not MapLoss.forward:
             return torch.stack([self(pairs.layer(number)) for number in range(pairs.num_layers)])
         values = self.values(pairs)
-        if isinstance(self.loss_weight, Sequence):
+        has_class_weights = isinstance(self.loss_weight, Sequence)
+        if has_class_weights:
             weights = class_weights(self.loss_weight, pairs.gt_labels)
             values = (weights * values.movedim(0, -1)).movedim(-1, 0)
         sums = pairs.by_layer(values).flatten(1).sum(1) / pairs.avg_factor
-        return sums if isinstance(self.loss_weight, Sequence) else self.loss_weight * sums
+        return sums if has_class_weights else self.loss_weight * sums

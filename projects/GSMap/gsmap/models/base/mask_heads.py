@@ -1,7 +1,7 @@
-"""Auxiliary heads of masks in bird's-eye and camera view. They only help training.
+"""Auxiliary heads that predict masks in bird's-eye and camera view, used in training only.
 
-Each has a ``name``, the ``transforms`` that make its target, and ``loss(bev_outputs, samples)``;
-predictions do not run them.
+Each has a ``name``, the ``transforms`` that make its target, and a method
+``loss(bev_outputs, samples)``.
 """
 
 from collections.abc import Sequence
@@ -36,28 +36,36 @@ def stack_targets(head: Any, samples: Samples, name: str, device: torch.device) 
     Raises:
         ValueError: If a sample lacks the target.
     """
+    targets = []
     for sample in samples:
         if name not in sample:
             raise InputError(
                 f"sample {sample.metainfo.get('token')!r} has no {name}: add its transform "
                 f"{head.transforms[0]} to the training pipeline, or remove its loss from the model."
             )
-    return torch.stack([torch.as_tensor(sample.get(name)) for sample in samples]).to(device)
+        targets.append(torch.as_tensor(sample.get(name)))
+    return torch.stack(targets).to(device)
 
 
 @MODELS.register_module()
 class BEVMaskHead(nn.Sequential, NeedsTargets):
-    """Elements drawn in bird's-eye view, all in one mask or one mask a class.
+    """Head of masks of the map elements in bird's-eye view.
 
     Args:
         embed_dims: Channels C of the features.
         loss_weight: Weight of the cross-entropy.
-        pos_weight: Weight of the drawn cells in it.
-        dice_weight: Weight of the dice loss of all masks together.
-        num_masks: 1 for all elements in one mask, else the number of classes.
+        pos_weight: Weight of foreground cells in the cross-entropy.
+        dice_weight: Weight of the dice loss, which treats the masks of a sample as one.
+        num_masks: Number of classes for one mask per class, or 1 for one mask of all elements.
+        name: Name of the loss.
+
+    Attributes:
+        feats: Key of the features in the outputs of the BEV encoder.
+        target: Field of the target in a sample.
     """
 
-    feats, target = "bev_feats", "gt_seg"  # (B, C, H, W) and (B, classes or 1, H, W)
+    feats = "bev_feats"  # (B, C, H, W)
+    target = "gt_seg"  # (B, classes or 1, H, W)
     transforms = ("MakeBEVMask",)
 
     def __init__(
@@ -69,24 +77,36 @@ class BEVMaskHead(nn.Sequential, NeedsTargets):
         num_masks: int = 1,
         name: str = "seg",
     ) -> None:
-        super().__init__(*self.layers(embed_dims, num_masks))
-        self.loss_weight, self.pos_weight, self.dice_weight = loss_weight, pos_weight, dice_weight
-        self.num_masks, self.name = num_masks, name
+        network = self.layers(embed_dims, num_masks)
+        super().__init__(*network)
+        self.loss_weight = loss_weight
+        self.pos_weight = pos_weight
+        self.dice_weight = dice_weight
+        self.num_masks = num_masks
+        self.name = name
 
     @staticmethod
     def layers(embed_dims: int, num_masks: int) -> nn.Sequential:
-        """Return the network: a 3x3 and a 1x1 convolution. (B, C, H, W) -> (B, num_masks, H, W)"""
+        """Network of a 3x3 and a 1x1 convolution. (B, C, H, W) -> (B, num_masks, H, W)"""
         return nn.Sequential(
-            nn.Conv2d(embed_dims, embed_dims, 3, padding=1, bias=False),
+            nn.Conv2d(embed_dims, embed_dims, kernel_size=3, padding=1, bias=False),
             nn.ReLU(True),
-            nn.Conv2d(embed_dims, num_masks, 1),
+            nn.Conv2d(embed_dims, num_masks, kernel_size=1),
         )
 
     def loss(self, bev_outputs: dict[str, Any], batch_data_samples: Samples) -> Tensor:
-        """Return the weighted loss on the encoder's features."""
+        """Weighted loss of the features of the encoder. ()
+
+        Args:
+            bev_outputs: Outputs of the BEV encoder.
+            batch_data_samples: Samples with targets.
+
+        Raises:
+            ValueError: If a sample has no target, or a target of another number of masks.
+        """
         feats = bev_outputs[self.feats]
-        target = stack_targets(self, batch_data_samples, self.target, feats.device)
-        target = target.reshape(-1, *target.shape[-3:])
+        target = stack_targets(self, batch_data_samples, name=self.target, device=feats.device)
+        target = target.flatten(0, -4)  # (B * V, masks, H, W)
         if self.num_masks == 1:
             target = target.amax(1, keepdim=True)
         elif target.shape[1] != self.num_masks:
@@ -94,16 +114,25 @@ class BEVMaskHead(nn.Sequential, NeedsTargets):
                 f"{self.target} has {target.shape[1]} channels, {self.num_masks} masks are "
                 f"predicted: set num_classes={self.num_masks} in its transform."
             )
-        logits = self(feats.reshape(-1, *feats.shape[-3:]))
-        cross_entropy, dice = class_mask_losses(logits, target, self.pos_weight)
+        logits = self(feats.flatten(0, -4))
+        cross_entropy, dice = class_mask_losses(logits, target, pos_weight=self.pos_weight)
         return self.loss_weight * cross_entropy + self.dice_weight * dice
 
 
 @MODELS.register_module()
 class PVMaskHead(BEVMaskHead):
-    """Elements drawn in the view of each camera; learned from the encoder's image features."""
+    """Head of masks of the map elements in the view of each camera, from its image features.
 
-    feats, target = "img_feats", "gt_pv_seg"  # (B, V, C, h, w) and (B, V, classes or 1, h, w)
+    Args:
+        embed_dims: Channels C of the features.
+        loss_weight: Weight of the cross-entropy.
+        pos_weight: Weight of foreground cells in the cross-entropy.
+        name: Name of the loss.
+        kwargs: Further arguments of `BEVMaskHead`.
+    """
+
+    feats = "img_feats"  # (B, V, C, h, w)
+    target = "gt_pv_seg"  # (B, V, classes or 1, h, w)
     transforms = ("MakePVMask",)
 
     def __init__(
@@ -114,20 +143,30 @@ class PVMaskHead(BEVMaskHead):
         name: str = "pv_seg",
         **kwargs: Any,
     ) -> None:
-        super().__init__(embed_dims, loss_weight, pos_weight, name=name, **kwargs)
+        super().__init__(embed_dims, loss_weight, pos_weight=pos_weight, name=name, **kwargs)
 
 
 def class_mask_losses(
     logits: Tensor, targets: Tensor, pos_weight: float = 1.0
 ) -> tuple[Tensor, Tensor]:
-    """Return the mean binary cross-entropy of class masks, and the dice of all classes together.
+    """Binary cross-entropy and dice loss of class masks.
 
-    Targets are 0 or 1, of any dtype; ``pos_weight`` is the weight of cells of 1 in the
-    cross-entropy; dice is a mean over samples. ValueError if the shapes disagree.
-    2 x (B, classes, H, W) -> (), ()
+    Args:
+        logits: Logits of the masks. (B, classes, H, W)
+        targets: Masks of 0 and 1, of any dtype. (B, classes, H, W)
+        pos_weight: Weight of the cells of 1 in the cross-entropy.
+
+    Returns:
+        The mean cross-entropy of the cells (), and the dice loss of all classes of a sample
+        together, averaged over the samples. ()
+
+    Raises:
+        ValueError: If the shapes disagree.
     """
     check_same_shape(logits=logits, targets=targets)
-    logits, targets = logits.float(), targets.float()
+    logits = logits.float()
+    targets = targets.float()
     weight = constant(logits, pos_weight, torch.float)
     cross_entropy = F.binary_cross_entropy_with_logits(logits, targets, pos_weight=weight)
-    return cross_entropy, dice_loss(logits.sigmoid().flatten(1, 2), targets.flatten(1, 2)).mean()
+    dice = dice_loss(logits.sigmoid().flatten(1, 2), targets.flatten(1, 2))
+    return cross_entropy, dice.mean()

@@ -1,4 +1,4 @@
-"""Masks of map elements: their rasters, and how the ground truth is drawn."""
+"""Masks of map elements: rasters, and drawing of the ground truth."""
 
 from collections.abc import Sequence
 from typing import Any, ClassVar
@@ -14,23 +14,24 @@ from gsmap.utils.errors import InputError
 
 
 class ElementMasks:
-    """The rasters on which predictions and ground truth are compared, and how the latter is drawn.
+    """Rasters for the comparison of predictions with the ground truth, which is drawn on them.
 
     Args:
-        grid: The map's extent.
-        pixel_m: Side of a pixel of the losses' masks in metres, or its sizes along x and y; by
-            default a 200th of the map's longer side.
-        cost_pixel_m: The same for matching; by default a 128th.
-        line_width_m: Width of a line in the ground-truth mask, in metres.
-        filled_classes: Classes whose ground-truth mask is filled; the others are bands.
-        source: ``"full"``: the ground truth is drawn at full resolution; ``"points"``: by its P
-            points in the matched order (in matching, in the annotated one).
+        grid: Extent of the map.
+        pixel_m: Pixel size of the masks of losses in metres: one number, or sizes along x and y.
+            Default: 1/200 of the longer side of the map.
+        cost_pixel_m: Pixel size of the masks of matching costs. Default: 1/128 of the longer side.
+        line_width_m: Width of a line in ground-truth masks, in metres.
+        filled_classes: Class indices of elements drawn as filled polygons. Others are drawn as
+            bands.
+        source: ``"full"`` draws the ground truth at full resolution. ``"points"`` draws its P
+            points, in the matched order for losses and in the annotated order for matching costs.
 
     Attributes:
-        sources: Values of ``source``; a subclass may add its own.
+        sources: Valid values of ``source``.
 
     Raises:
-        ValueError: If ``source`` is unknown, or the pixels do not divide the map.
+        ValueError: If ``source`` is unknown, or if the pixels do not divide the map.
     """
 
     sources: ClassVar[tuple[str, ...]] = ("full", "points")
@@ -55,12 +56,14 @@ class ElementMasks:
 
     @classmethod
     def of(cls, grid: BEVGrid, masks: "ElementMasks | dict[str, Any] | None") -> "ElementMasks":
-        """Return masks as they are, or build them from their settings."""
-        return masks if isinstance(masks, ElementMasks) else cls(grid, **(masks or {}))
+        """Build masks from their settings; an `ElementMasks` object is returned as it is."""
+        if isinstance(masks, ElementMasks):
+            return masks
+        return cls(grid, **(masks or {}))
 
     @property
     def of_points(self) -> bool:
-        """Whether the ground truth's P points are drawn, in the matched order."""
+        """Whether the P points of the ground truth are drawn, in the matched order."""
         return self.source != "full"
 
     @property
@@ -70,44 +73,70 @@ class ElementMasks:
 
     @property
     def half_pixel_m(self) -> float:
-        """Half the longer side of a pixel of the losses' masks, in metres."""
+        """Half the longer side of a pixel of the masks of losses, in metres."""
         return max(self.grid.pixel_size_m) / 2
 
     def draw(self, polylines: Tensor, labels: Tensor, grid: BEVGrid) -> Tensor:
-        """Draw ground truths as bands, or filled. (K, M, 2) -> (K, H, W)"""
+        """Draw map elements as bands or filled polygons.
+
+        Args:
+            polylines: Points in metres. (K, M, 2 or 3)
+            labels: Class indices. (K,)
+            grid: The raster.
+
+        Returns:
+            One mask per element, in [0, 1]. (K, H, W)
+        """
         filled = None
         if self.filled_classes:
             filled = torch.isin(labels, constant(labels, self.filled_classes))
-        return draw_polylines(polylines[..., :2].float(), grid, self.line_width_m, filled)
+        return draw_polylines(
+            polylines[..., :2].float(), grid, width_m=self.line_width_m, filled=filled
+        )
 
     def rendered_references(self, references: Tensor, labels: Tensor, coords: int) -> Tensor:
-        """References of which predicted masks are rendered; a subclass may stop gradients here.
+        """References for the rendering of predicted masks; a subclass may stop gradients here.
 
         Args:
             references: References of the decoder, ``coords`` coordinates first. (M, P, D)
-            labels: Class indices of their ground truths. (M,)
+            labels: Class indices of the matched ground truths. (M,)
             coords: Number of coordinates of a point.
         """
         return references
 
     def draw_batch(self, gt_instances: Sequence[InstanceData], grid: BEVGrid) -> Tensor:
-        """Draw the ground truth of all samples, before its matching is known. (T, H, W)"""
+        """Draw the ground truth of a batch before the matching.
+
+        Args:
+            gt_instances: Ground truth of each sample.
+            grid: The raster.
+
+        Returns:
+            Masks of the elements, sample after sample. (T, H, W)
+
+        Raises:
+            ValueError: If ``source`` is ``"full"`` and a sample has no polylines.
+        """
         labels = torch.cat([sample.labels_3d for sample in gt_instances])
         if self.of_points:
-            return self.draw(torch.cat([sample.pts for sample in gt_instances]), labels, grid)
-        if any("polylines" not in sample for sample in gt_instances):
-            raise InputError(
-                "masks of source 'full' need gt_instances_3d.polylines: make the targets with "
-                "FormatMapTargets."
-            )
-        lines = [sample.polylines for sample in gt_instances]
-        most = max(own.shape[1] for own in lines)
-        return self.draw(torch.cat([_lengthened(own, most) for own in lines]), labels, grid)
+            points = torch.cat([sample.pts for sample in gt_instances])
+            return self.draw(points, labels, grid)
+        for sample in gt_instances:
+            if "polylines" not in sample:
+                raise InputError(
+                    "masks of source 'full' need gt_instances_3d.polylines: make the targets with "
+                    "FormatMapTargets."
+                )
+        length = max(sample.polylines.shape[1] for sample in gt_instances)
+        polylines = torch.cat([_pad_lines(sample.polylines, length) for sample in gt_instances])
+        return self.draw(polylines, labels, grid)
 
 
-def _lengthened(lines: Tensor, length: int) -> Tensor:
-    """Repeat the last points of lines up to a length. (K, M, 2 or 3) -> (K, length, 2 or 3)"""
+def _pad_lines(lines: Tensor, length: int) -> Tensor:
+    """Pad lines to a length with their last points. (K, M, 2 or 3) -> (K, length, 2 or 3)"""
     if not len(lines):
         return lines.new_zeros(0, length, lines.shape[2])
-    ends = lines[:, -1:].expand(-1, length - lines.shape[1], -1)
-    return torch.cat([lines, ends], 1) if ends.shape[1] else lines
+    num_missing = length - lines.shape[1]
+    if num_missing == 0:
+        return lines
+    return torch.cat([lines, lines[:, -1:].expand(-1, num_missing, -1)], 1)

@@ -1,8 +1,8 @@
-"""Assignment of predictions to annotated map elements."""
+"""Assignment of predictions to ground-truth map elements."""
 
 from collections.abc import Sequence
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -17,12 +17,25 @@ from gsmap.structures.tensors import upload
 from gsmap.utils.errors import InputError, NotFiniteError
 
 
+class HostCosts(NamedTuple):
+    """Inputs of the assignment on the CPU.
+
+    Attributes:
+        samples: Costs of each sample: one matrix per cost, of the predictions of all layers with
+            the ground truths of the sample. (n, L * N, K) each
+        labels: Class indices of all ground truths. (T,)
+    """
+
+    samples: list[Tensor]
+    labels: Tensor
+
+
 class MapAssigner:
-    """Hungarian assignment under summed costs, then each pair's point order (MapTR Eqs. 3-5).
+    """Hungarian assignment with summed costs, and the closest point order (MapTR Eqs. 3-5).
 
     Args:
-        match_costs: Configs of the costs. Each is called for every sample, with the predictions of
-            all layers, the ground truth and the meta dict, and returns (N, K).
+        match_costs: Configs of the costs. A cost is called for each sample with the predictions of
+            all layers, the ground truth and the meta dict, and returns a matrix. (N, K)
 
     Raises:
         ValueError: If there is no cost.
@@ -33,8 +46,12 @@ class MapAssigner:
             raise InputError("match_costs must hold at least one cost.")
         self.match_costs = [TASK_UTILS.build(cost) for cost in match_costs]
         self.names = [type(cost).__name__ for cost in self.match_costs]
-        of_points = (cost for cost in self.match_costs if isinstance(cost, PointsCost))
-        self.between_points = next(of_points, PointsCost()).between_points
+        points_cost = PointsCost()
+        for cost in self.match_costs:
+            if isinstance(cost, PointsCost):
+                points_cost = cost
+                break
+        self.between_points = points_cost.between_points
 
     @torch.no_grad()
     def assign(
@@ -43,33 +60,37 @@ class MapAssigner:
         truths: GroundTruth,
         metas: Sequence[dict[str, Any]],
         repeats: int = 1,
-    ) -> tuple[MapMatches, list[int]]:
-        """Match each ground truth to ``repeats`` predictions of its sample, in every layer.
+    ) -> MapMatches:
+        """Match each ground truth with ``repeats`` predictions of its sample, in every layer.
 
-        All costs are read from the device in one copy, and all matches return in one.
+        There is one copy of all costs from the device, and one copy of all matches to it.
 
         Args:
             predictions: Predictions of L layers, N queries each.
             truths: Ground truth, K elements of a sample.
-            metas: Meta dict of each sample; its ``token`` names the sample in errors.
-            repeats: How often each ground truth may be matched.
+            metas: Meta dict of each sample, with the ``token`` of the sample for errors.
+            repeats: Number of predictions that each ground truth is matched with.
 
         Returns:
-            The matches, and how many each sample has in a layer: min(N, K * repeats).
+            The matches, min(N, K * repeats) of each sample in a layer.
 
         Raises:
-            FloatingPointError: If a cost (or, without ground truth, a score) is not finite.
+            FloatingPointError: If a cost is not finite, or a score of a sample without ground
+                truth.
         """
-        layers = len(predictions.layers)
-        num_queries = predictions.scores.shape[1] // layers
+        num_layers = len(predictions.layers)
+        num_queries = predictions.scores.shape[1] // num_layers
+        host_costs = self.costs(predictions, truths, metas)
         pairs = []
-        of_samples, labels = self.costs(predictions, truths, metas)
-        for index, costs in enumerate(of_samples):
-            by_layer = costs.unflatten(1, (layers, num_queries)).unbind(1)
-            found = [solve_assignment(own, self.names, metas[index], repeats) for own in by_layer]
-            query, gt = (torch.stack(part) for part in zip(*found, strict=True))  # (L, m)
-            pairs.append((query, gt))
-        return self.choose_orders(predictions, truths, pairs, labels)
+        for sample_costs, meta in zip(host_costs.samples, metas, strict=True):
+            queries = []
+            gts = []
+            for costs in sample_costs.unflatten(1, (num_layers, num_queries)).unbind(1):
+                rows, cols = solve_assignment(costs, self.names, img_meta=meta, repeats=repeats)
+                queries.append(rows)
+                gts.append(cols)
+            pairs.append((torch.stack(queries), torch.stack(gts)))  # (L, m) each
+        return self.choose_orders(predictions, truths, pairs=pairs, labels=host_costs.labels)
 
     @torch.no_grad()
     def assign_known(
@@ -77,169 +98,210 @@ class MapAssigner:
         predictions: Predictions,
         truths: GroundTruth,
         pairs: Sequence[tuple[Tensor, Tensor]],
-    ) -> tuple[MapMatches, list[int]]:
-        """Return matches that are known before the decoder runs, in the closest point order.
+    ) -> MapMatches:
+        """Matches of pairs that are known before the decoder runs.
 
         Args:
             predictions: Predictions of L layers, N queries each.
             truths: Ground truth.
-            pairs: Of each sample the numbers of its matched queries, increasing, and the number of
-                the ground truth of each, on the CPU. 2 x (m,)
-
-        Returns:
-            As `assign`.
+            pairs: Matched pairs of each sample: indices of the queries, increasing, and indices of
+                the ground truths, on the CPU. 2 x (m,)
         """
-        layers = len(predictions.layers)
-        by_layer = [tuple(part.expand(layers, -1) for part in sample) for sample in pairs]
-        return self.choose_orders(predictions, truths, by_layer, truths.labels.cpu())
+        num_layers = len(predictions.layers)
+        layer_pairs = []
+        for queries, gts in pairs:
+            layer_pairs.append((queries.expand(num_layers, -1), gts.expand(num_layers, -1)))
+        labels = truths.labels.cpu()
+        return self.choose_orders(predictions, truths, pairs=layer_pairs, labels=labels)
 
     def choose_orders(
         self,
         predictions: Predictions,
         truths: GroundTruth,
-        pairs: Sequence[tuple[Tensor, ...]],
+        pairs: Sequence[tuple[Tensor, Tensor]],
         labels: Tensor,
-    ) -> tuple[MapMatches, list[int]]:
-        """Return pairs as matches, each in the point order that is closest.
+    ) -> MapMatches:
+        """Choose the closest point order of each matched pair.
 
         Args:
             predictions: Predictions of L layers, N queries each.
             truths: Ground truth.
-            pairs: Of each sample the numbers of queries and of ground truths, on the CPU. 2 x
-                (L, m)
-            labels: Classes of all ground truth, on the CPU. (T,)
+            pairs: Matched pairs of each sample: indices of the queries and of the ground truths, on
+                the CPU. 2 x (L, m)
+            labels: Class indices of all ground truths, on the CPU. (T,)
 
         Returns:
-            As `assign`.
+            The matches.
         """
-        layers = len(predictions.layers)
-        first_query = predictions.scores.shape[1] // layers * torch.arange(layers)[:, None]
-        matches = []
+        num_layers = len(predictions.layers)
+        num_queries = predictions.scores.shape[1] // num_layers
+        first_query = num_queries * torch.arange(num_layers)[:, None]  # of each layer
+        indices = []
+        counts = []
         for index, (query, gt) in enumerate(pairs):
             sample = torch.full_like(query, index)
             row = gt + truths.first[index]
-            matches.append(torch.stack([sample, query, query + first_query, gt, row]))
-        counts = [query.shape[1] for query, _ in pairs]
-        on_host = torch.cat(matches, 2)  # (5, L, M)
-        (packed,) = upload([on_host], predictions.scores.device)
-        samples, queries, joined, gts, rows = packed.unbind(0)
+            indices.append(torch.stack([sample, query, query + first_query, gt, row]))
+            counts.append(query.shape[1])
+        host_indices = torch.cat(indices, 2)  # (5, L, M)
+        (device_indices,) = upload([host_indices], predictions.scores.device)
+        samples, query_inds, joined_inds, gt_inds, rows = device_indices.unbind(0)
         orders = truths.pts_shifts[rows]  # (L, M, S, P, 2 or 3)
-        pts = predictions.pts[samples, joined]
+        pts = predictions.pts[samples, joined_inds]
         distances = self.between_points(pts[:, :, None].expand_as(orders), orders)
-        order = distances.sum((-1, -2)).argmin(-1)
-        host_labels = labels[on_host[-1]]
-        return MapMatches(samples, queries, joined, gts, rows, order, host_labels), counts
+        return MapMatches(
+            samples=samples,
+            query_inds=query_inds,
+            joined_inds=joined_inds,
+            gt_inds=gt_inds,
+            rows=rows,
+            order_inds=distances.sum((-1, -2)).argmin(-1),
+            host_labels=labels[host_indices[-1]],
+            counts=counts,
+        )
 
     def costs(
         self, predictions: Predictions, truths: GroundTruth, metas: Sequence[dict[str, Any]]
-    ) -> tuple[list[Tensor], Tensor]:
-        """Return what the assignment reads, on the host: the one wait for the device.
+    ) -> HostCosts:
+        """Compute all costs and copy them to the CPU, with one synchronisation.
 
-        Returns:
-            The costs of each sample, (n, L * N, K), and the classes of all ground truth. (T,)
+        Args:
+            predictions: Predictions of L layers, N queries each.
+            truths: Ground truth.
+            metas: Meta dict of each sample.
 
         Raises:
             FloatingPointError: If a score of a sample without ground truth is not finite.
         """
-        shape = predictions.scores.shape
-        flat = SimpleNamespace(scores=predictions.scores.flatten(0, 1))
-        classes = SimpleNamespace(labels=torch.arange(shape[2], device=predictions.scores.device))
-        by_class = [
-            cost(flat, classes).view(shape) if depends_on_class_only(cost) else None
-            for cost in self.match_costs
-        ]
-        parts: list[Tensor] = []
+        class_costs = self._class_costs(predictions)
+        num_rows = predictions.scores.shape[1]
+        blocks: list[Tensor] = []
         for index, count in enumerate(truths.counts):
-            pred, truth = predictions.sample(index), truths.sample(index)
+            pred = predictions.sample(index)
+            truth = truths.sample(index)
             if not count:
-                parts.append((pred.scores * 0).sum(0))  # not a number if a score is not finite
+                blocks.append((pred.scores * 0).sum(0))  # NaN if a score is not finite
                 continue
-            for cost, of_classes in zip(self.match_costs, by_class, strict=True):
-                if of_classes is None:
-                    parts.append(cost(pred, truth, metas[index]).float())
+            for cost, by_class in zip(self.match_costs, class_costs, strict=True):
+                if by_class is None:
+                    blocks.append(cost(pred, truth, metas[index]).float())
                 else:
-                    parts.append(of_classes[index][:, truth.labels].float())
-        parts.append(truths.labels.float())
-        host = torch.cat([part.flatten() for part in parts]).cpu()
-        read = iter(host.split([part.numel() for part in parts]))
-        found = []
+                    blocks.append(by_class[index][:, truth.labels].float())
+        blocks.append(truths.labels.float())
+        values = torch.cat([block.flatten() for block in blocks]).cpu()
+        host_blocks = iter(values.split([block.numel() for block in blocks]))
+        samples = []
         for count, meta in zip(truths.counts, metas, strict=True):
             if not count:
-                check_finite(next(read)[None], ["class scores"], meta)
-            own = [next(read).view(shape[1], count) for _ in self.match_costs if count]
-            found.append(torch.stack(own) if own else host.new_zeros(1, shape[1], 0))
-        return found, next(read).long()
+                check_finite(next(host_blocks)[None], ["class scores"], img_meta=meta)
+                samples.append(values.new_zeros(1, num_rows, 0))
+                continue
+            matrices = [next(host_blocks).view(num_rows, count) for _ in self.match_costs]
+            samples.append(torch.stack(matrices))
+        return HostCosts(samples, labels=next(host_blocks).long())
+
+    def _class_costs(self, predictions: Predictions) -> list[Tensor | None]:
+        """Costs of every class, None for costs that depend on more. (B, L * N, classes) each"""
+        scores = predictions.scores
+        all_scores = SimpleNamespace(scores=scores.flatten(0, 1))
+        all_classes = SimpleNamespace(labels=torch.arange(scores.shape[2], device=scores.device))
+        costs: list[Tensor | None] = []
+        for cost in self.match_costs:
+            if depends_on_class_only(cost):
+                costs.append(cost(all_scores, all_classes).view(scores.shape))
+            else:
+                costs.append(None)
+        return costs
 
 
 def depends_on_class_only(cost: Any) -> bool:
-    """Return whether a cost of mmdet depends on scores and label alone, so one a class will do."""
+    """Whether a cost of mmdet depends on scores and labels only, so that it is computed by class.
+
+    Args:
+        cost: Built cost.
+    """
     return type(cost) is FocalLossCost and not cost.binary_input
 
 
 def solve_assignment(
     costs: Tensor, names: Sequence[str], img_meta: dict[str, Any] | None, repeats: int = 1
 ) -> tuple[Tensor, Tensor]:
-    """Return the pairs of least summed cost: predictions in order, and the ground truth of each.
+    """Pairs of predictions and ground truths with the least sum of costs.
 
     Args:
         costs: Costs of N predictions with K ground truths, on the CPU. (n, N, K)
-        names: What each cost is, for the message. (n,)
-        img_meta: Has the token of the sample, likewise.
-        repeats: How often each ground truth may be matched.
+        names: Names of the costs, for the message. (n,)
+        img_meta: Meta dict with the token of the sample, for the message.
+        repeats: Number of predictions that each ground truth is matched with.
+
+    Returns:
+        Indices of the predictions, increasing, and indices of the ground truths. (m,) each
 
     Raises:
         FloatingPointError: If a cost is not finite.
     """
-    check_finite(costs, names, img_meta)
-    rows, cols = linear_sum_assignment(np.tile(costs.sum(0).numpy(), repeats))
-    return torch.from_numpy(rows), torch.from_numpy(cols % max(costs.shape[2], 1))
+    check_finite(costs, names, img_meta=img_meta)
+    repeated_costs = np.tile(costs.sum(0).numpy(), repeats)
+    rows, cols = linear_sum_assignment(repeated_costs)
+    num_truths = max(costs.shape[2], 1)
+    return torch.from_numpy(rows), torch.from_numpy(cols % num_truths)
 
 
 def check_finite(values: Tensor, names: Sequence[str], img_meta: dict[str, Any] | None) -> None:
-    """Refuse values that the assignment cannot order.
+    """Raise an error if values are not finite.
 
     Args:
         values: Costs or predictions. (n, ...)
-        names: What each entry of the first axis is. (n,)
-        img_meta: Has the token of the sample, for the message.
+        names: Name of each entry of the first axis. (n,)
+        img_meta: Meta dict with the token of the sample, for the message.
 
     Raises:
         FloatingPointError: If a value is not finite.
     """
-    finite = values.isfinite().flatten(1).all(1)
-    if not finite.all():
+    is_finite = values.isfinite().flatten(1).all(1)
+    if not is_finite.all():
         token = (img_meta or {}).get("token", "unknown")
-        what = names[int(finite.int().argmin())]
+        name = names[int(is_finite.int().argmin())]
         raise NotFiniteError(
-            f"{what} of sample {token!r} is not finite before the assignment: look at the "
+            f"{name} of sample {token!r} is not finite before the assignment: look at the "
             "sample's images and ground truth, then at the learning rate and at the loss scale "
             "of mixed precision."
         )
 
 
 class MapCost:
-    """A matching cost that says what it needs when the head is built; others may be costs as well.
+    """Base class of matching costs with a check of the head. Costs need not derive from it.
 
     Args:
-        weight: Weight of the cost, or one for each class; a pair has that of its ground truth.
+        weight: Weight of the cost, or a weight for each class, applied to the ground truths of the
+            class.
     """
 
     def __init__(self, weight: WEIGHT = 1.0) -> None:
         self.weight = weight
 
     def check(self, head: BuiltHead) -> None:
-        """Raise ValueError if a head lacks what the cost reads; called when the head is built."""
+        """Raise ValueError if a head lacks an input of the cost. Called when the head is built."""
 
     def __call__(
         self, pred_instances: SampleView, gt_instances: SampleView, img_meta: Any = None
     ) -> Tensor:
-        """Return the weighted cost of each prediction with each ground truth. (N, K)"""
+        """Weighted cost of each prediction with each ground truth.
+
+        Args:
+            pred_instances: Predictions of a sample.
+            gt_instances: Ground truth of the sample.
+            img_meta: Meta dict of the sample.
+
+        Returns:
+            The costs. (N, K)
+        """
         raise NotImplementedError
 
 
 class PointsCost(MapCost):
-    """A matching cost of points, whose distance also chooses the point order of a matched pair."""
+    """Base class of matching costs of points. Its distance chooses the order of matched points."""
 
     def between_points(self, pts: Tensor, targets: Tensor) -> Tensor:
-        """Return the distance of each coordinate. 2 x (..., P, 2 or 3) -> (..., P, 2 or 3)"""
+        """Distance of each coordinate. 2 x (..., P, 2 or 3) -> (..., P, 2 or 3)"""
         return (pts - targets).abs()

@@ -1,4 +1,4 @@
-"""What costs and losses read: predictions of all layers, ground truth, and the pairs of both."""
+"""Inputs of costs and losses: predictions of all layers, ground truth, and matched pairs."""
 
 from collections.abc import Sequence
 from functools import cached_property
@@ -16,7 +16,7 @@ from gsmap.utils.errors import InputError
 
 
 class BuiltHead(Protocol):
-    """What a cost or a loss may ask of the head that it belongs to, once that is built."""
+    """Interface of a built head to the checks of its costs and losses."""
 
     classes: tuple[str, ...]
     reference: RefinedReference
@@ -25,19 +25,20 @@ class BuiltHead(Protocol):
 
 
 class Predictions:
-    """What the head predicts after one decoder layer, or after several, for a batch.
+    """Predictions of the head after one or several decoder layers, for a batch.
 
-    Several layers count as further queries: N is L * N then, layer after layer (`joined`).
+    Predictions of several layers are concatenated along the queries, so that N stands for L * N
+    (`join`).
 
     Args:
         scores: Class logits. (B, N, classes)
-        decoded: What the decoder layer returned: states and references.
+        decoded: Output of the decoder layer, with states and references.
         bev_feats: BEV features. (B, C, H, W)
-        reference: What ``decoded.references`` stand for.
-        masks: The rasters on which predictions and ground truth are compared.
+        reference: Decoding of ``decoded.references``.
+        masks: Rasters for the comparison with the ground truth.
 
     Attributes:
-        references: What the decoder refines: a point, or a Gaussian. (B, N, P, D)
+        references: References of points or Gaussians. (B, N, P, D)
         pts: Points, [0, 1] over the map. (B, N, P, 2 or 3)
     """
 
@@ -49,64 +50,83 @@ class Predictions:
         reference: RefinedReference,
         masks: ElementMasks,
     ) -> None:
-        self.scores, self.decoded, self.bev_feats = scores, decoded, bev_feats
-        self.reference, self.masks = reference, masks
+        self.scores = scores
+        self.decoded = decoded
+        self.bev_feats = bev_feats
+        self.reference = reference
+        self.masks = masks
         self.references = decoded.references
         self.pts = decoded.references[..., : reference.coords]
         self._layers: Sequence[Predictions] = ()
 
     @property
     def layers(self) -> Sequence["Predictions"]:
-        """The predictions of each layer, L of them."""
+        """Predictions of each of the L layers."""
         return self._layers or [self]
 
     @classmethod
     def join(cls, layers: Sequence["Predictions"]) -> "Predictions":
-        """Return the predictions of several layers as one."""
+        """Concatenate the predictions of several layers along the queries."""
         if len(layers) == 1:
             return layers[0]
         last = layers[-1]
         scores = torch.cat([layer.scores for layer in layers], 1)
         decoded = JoinedDecoded([layer.decoded for layer in layers])
-        all_layers = cls(scores, decoded, last.bev_feats, last.reference, last.masks)
+        all_layers = cls(
+            scores=scores,
+            decoded=decoded,
+            bev_feats=last.bev_feats,
+            reference=last.reference,
+            masks=last.masks,
+        )
         all_layers._layers = layers
         return all_layers
 
     @cached_property
     def cost_masks(self) -> Tensor:
-        """Rendered masks for matching, without gradient. (B, N, h, w)"""
+        """Rendered masks of matching costs, without gradient. (B, N, h, w)"""
         return self.reference.render(self.references.detach(), self.masks.cost_grid)
 
     def of_queries(self, queries: slice) -> "Predictions":
-        """Return the predictions of some of the instance queries, scores in float32."""
-        scores, decoded = self.scores[:, queries].float(), self.decoded.of_queries(queries)
-        return Predictions(scores, decoded, self.bev_feats, self.reference, self.masks)
+        """Predictions of some of the instance queries, with scores in float32."""
+        return Predictions(
+            scores=self.scores[:, queries].float(),
+            decoded=self.decoded.of_queries(queries),
+            bev_feats=self.bev_feats,
+            reference=self.reference,
+            masks=self.masks,
+        )
 
     def sample(self, index: int) -> "SampleView":
-        """Return the predictions of one sample, as matching costs read them."""
+        """Predictions of the sample of an index, for matching costs."""
         return SampleView(self, index)
 
 
 class GroundTruth:
-    """The ground truth of a batch, T elements, sample after sample; masks are drawn when read.
+    """Ground truth of a batch: T elements, sample after sample.
+
+    Masks are drawn on first access and cached.
 
     Args:
-        instances: Of each sample ``labels_3d`` (K,), ``pts`` (K, P, 2 or 3) and ``pts_shifts``
-            (K, S, P, 2 or 3) in metres; for masks also ``polylines`` (K, M, 2 or 3) in metres.
-        reference: It brings points to [0, 1] over the map.
-        masks: How masks are drawn.
+        instances: Elements of each sample, with ``labels_3d`` (K,), ``pts`` (K, P, 2 or 3) and
+            ``pts_shifts`` (K, S, P, 2 or 3) in metres. Masks also need ``polylines``
+            (K, M, 2 or 3) in metres.
+        reference: Normalisation of points to [0, 1] over the map.
+        masks: Rasters and drawing of masks.
 
     Attributes:
         counts: Number K of elements of each sample.
-        first: Number of each sample's first element.
+        first: Index of the first element of each sample among all elements.
         labels: Class indices. (T,)
-        pts_shifts: Equivalent point orders, [0, 1] over the map. (T, S, P, 2 or 3)
+        pts_shifts: Points in all equivalent orders, [0, 1] over the map. (T, S, P, 2 or 3)
     """
 
     def __init__(
         self, instances: Sequence[InstanceData], reference: RefinedReference, masks: ElementMasks
     ) -> None:
-        self._instances, self._reference, self._drawing = instances, reference, masks
+        self._instances = instances
+        self._reference = reference
+        self._element_masks = masks
         self.counts = [len(sample.labels_3d) for sample in instances]
         self.first = list(accumulate(self.counts, initial=0))[:-1]
         self.labels = torch.cat([sample.labels_3d for sample in instances])
@@ -116,49 +136,58 @@ class GroundTruth:
     @cached_property
     def first_pts(self) -> Tensor:
         """Points in the annotated order, [0, 1] over the map. (T, P, 2 or 3)"""
-        return self._reference.norm(torch.cat([own.pts for own in self._instances]).float())
+        points_m = torch.cat([sample.pts for sample in self._instances])
+        return self._reference.norm(points_m.float())
 
     @cached_property
     def masks(self) -> Tensor:
-        """Masks of the losses. (T, H, W)"""
-        return self._drawing.draw_batch(self._instances, self._drawing.grid)
+        """Masks of losses. (T, H, W)"""
+        return self._element_masks.draw_batch(self._instances, self._element_masks.grid)
 
     @cached_property
     def cost_masks(self) -> Tensor:
-        """Coarser masks, for matching. (T, h, w)"""
-        return self._drawing.draw_batch(self._instances, self._drawing.cost_grid)
+        """Masks of matching costs, of a lower resolution. (T, h, w)"""
+        return self._element_masks.draw_batch(self._instances, self._element_masks.cost_grid)
 
     @cached_property
     def pipeline_masks(self) -> Tensor:
-        """Masks that the pipeline drew; ValueError if it did not. (T, H, W)"""
-        if any("masks" not in sample for sample in self._instances):
-            raise InputError(
-                "a loss needs gt_instances_3d.masks: add MakeInstanceMasks to the training "
-                "pipeline, behind FormatMapTargets, or remove the loss from the model."
-            )
-        return torch.cat([sample.masks for sample in self._instances])
+        """Masks from the data pipeline. (T, H, W)
+
+        Raises:
+            ValueError: If the pipeline does not make masks.
+        """
+        masks = []
+        for sample in self._instances:
+            if "masks" not in sample:
+                raise InputError(
+                    "a loss needs gt_instances_3d.masks: add MakeInstanceMasks to the training "
+                    "pipeline, behind FormatMapTargets, or remove the loss from the model."
+                )
+            masks.append(sample.masks)
+        return torch.cat(masks)
 
     def sample(self, index: int) -> "SampleView":
-        """Return the ground truth of one sample, as matching costs read it."""
+        """Ground truth of the sample of an index, for matching costs."""
         start = self.first[index]
         return SampleView(self, slice(start, start + self.counts[index]))
 
 
 class SampleView:
-    """One sample's part of predictions or ground truth, as matching costs read it.
+    """View of the predictions or the ground truth of one sample, for matching costs.
 
-    Its attributes are those of the batch, without the other samples. Of predictions: ``scores``
-    (N, classes), ``pts`` (N, P, 2 or 3), ``references`` (N, P, D) and ``cost_masks`` (N, h, w). Of
-    ground truth: ``labels`` (K,), ``first_pts`` (K, P, 2 or 3), ``pts_shifts`` (K, S, P, 2 or 3)
-    and ``cost_masks`` (K, h, w).
+    Its attributes are the rows of the sample in the attributes of the batch. Predictions have
+    ``scores`` (N, classes), ``pts`` (N, P, 2 or 3), ``references`` (N, P, D) and ``cost_masks``
+    (N, h, w). Ground truth has ``labels`` (K,), ``first_pts`` (K, P, 2 or 3), ``pts_shifts``
+    (K, S, P, 2 or 3) and ``cost_masks`` (K, h, w).
 
     Args:
         batch: Predictions or ground truth of the batch.
-        rows: Where the sample's are.
+        rows: Index of the sample, or slice of its elements.
     """
 
     def __init__(self, batch: Predictions | GroundTruth, rows: int | slice) -> None:
-        self._batch, self._rows = batch, rows
+        self._batch = batch
+        self._rows = rows
 
     def __getattr__(self, name: str) -> Tensor:
         values: Tensor = getattr(self._batch, name)[self._rows]
@@ -166,41 +195,49 @@ class SampleView:
 
 
 class MapMatches(NamedTuple):
-    """The matched pairs of L layers; a layer has as many as any other, M. (L, M) each
+    """Indices of the matched pairs of L layers, M in each, sorted by sample and query.
 
-    They are sorted by sample and query.
+    Attributes:
+        samples: Index of the sample in the batch. (L, M)
+        query_inds: Index of the query in its layer. (L, M)
+        joined_inds: Index of the query among the queries of all layers. (L, M)
+        gt_inds: Index of the ground truth in its sample. (L, M)
+        rows: Index of the ground truth in the batch. (L, M)
+        order_inds: Index of the closest equivalent point order of the ground truth. (L, M)
+        host_labels: Class index of the ground truth, on the CPU. (L, M)
+        counts: Number of pairs of each sample, in one layer: B integers.
     """
 
-    samples: Tensor  # number of the sample in the batch
-    query_inds: Tensor  # number of the query in its layer
-    joined_inds: Tensor  # number of the query among those of all layers
-    gt_inds: Tensor  # number of the ground truth in its sample
-    rows: Tensor  # number of the ground truth in the batch
-    order_inds: Tensor  # the closest equivalent point order of that ground truth
-    host_labels: Tensor  # class of the ground truth, on the host
+    samples: Tensor
+    query_inds: Tensor
+    joined_inds: Tensor
+    gt_inds: Tensor
+    rows: Tensor
+    order_inds: Tensor
+    host_labels: Tensor
+    counts: list[int]
 
 
 class MatchedPairs:
-    """Matched pairs of a batch, of one layer or of several, layer after layer: M in all.
+    """Matched pairs of a batch: M pairs of one or several layers, layer after layer.
 
-    A layer's are sorted by sample and query, and as many as any other's. Their attributes are
-    computed when they are first read.
+    All layers have an equal number of pairs, sorted by sample and query. Attributes are computed
+    on first access and cached.
 
     Args:
         predictions: Predictions of the layers, of one query group.
         truths: Ground truth of the batch.
-        matches: What is matched.
-        counts: Number of pairs of each sample, in one layer.
+        matches: Indices of the pairs.
         avg_factor: Number of pairs of a layer, averaged over the ranks, at least 1. ()
 
     Attributes:
         num_layers: Number L of layers.
-        counts: Number of pairs of each sample, in every layer: (L * B,) integers.
-        samples: Number of each pair's sample in the batch. (M,)
-        query_inds: Number of each pair's query among the sample's of all layers. (M,)
-        gt_inds: Number of each pair's ground truth in its sample. (M,)
-        order_inds: Number of its point order. (M,)
-        host_labels: Class indices, on the host. (M,)
+        counts: Number of pairs of each sample, in every layer: L * B integers.
+        samples: Index of the sample in the batch. (M,)
+        query_inds: Index of the query among the queries of all layers. (M,)
+        gt_inds: Index of the ground truth in its sample. (M,)
+        order_inds: Index of the point order of the ground truth. (M,)
+        host_labels: Class indices, on the CPU. (M,)
     """
 
     def __init__(
@@ -208,48 +245,69 @@ class MatchedPairs:
         predictions: Predictions,
         truths: GroundTruth,
         matches: MapMatches,
-        counts: Sequence[int],
         avg_factor: Tensor,
     ) -> None:
-        self.predictions, self.truths, self.avg_factor = predictions, truths, avg_factor
+        self.predictions = predictions
+        self.truths = truths
+        self.avg_factor = avg_factor
         self.num_layers = len(predictions.layers)
-        self.counts = list(counts) * self.num_layers
+        self.counts = matches.counts * self.num_layers
         self.samples = matches.samples.flatten()
-        self.query_inds, self.gt_inds = matches.joined_inds.flatten(), matches.gt_inds.flatten()
-        self.order_inds, self._rows = matches.order_inds.flatten(), matches.rows.flatten()
+        self.query_inds = matches.joined_inds.flatten()
+        self.gt_inds = matches.gt_inds.flatten()
+        self.order_inds = matches.order_inds.flatten()
         self.host_labels = matches.host_labels.flatten()
-        self._matches, self._by_layer = matches, dict[int, MatchedPairs]()
+        self._rows = matches.rows.flatten()
+        self._matches = matches
+        self._layer_pairs: dict[int, MatchedPairs] = {}
 
     def layer(self, number: int) -> "MatchedPairs":
-        """Return the pairs of one layer, with what is computed of them already."""
+        """Pairs of one layer, including the attributes that are already computed.
+
+        Args:
+            number: Index of the layer. Negative indices count from the last layer.
+        """
         if self.num_layers == 1:
             return self
         number %= self.num_layers
-        if number not in self._by_layer:
-            matches = MapMatches(*(values[number, None] for values in self._matches))
-            self._by_layer[number] = MatchedPairs(
-                self.predictions.layers[number],
-                self.truths,
-                matches._replace(joined_inds=matches.query_inds),
-                self.counts[: len(self.counts) // self.num_layers],
-                self.avg_factor,
-            )
-        own = vars(self._by_layer[number])
+        if number not in self._layer_pairs:
+            self._layer_pairs[number] = self._select_layer(number)
+        layer_pairs = self._layer_pairs[number]
         for name, values in vars(self).items():
             if isinstance(getattr(type(self), name, None), cached_property):
-                own.setdefault(name, self.by_layer(values)[number])
-        return self._by_layer[number]
+                vars(layer_pairs).setdefault(name, self.by_layer(values)[number])
+        return layer_pairs
+
+    def _select_layer(self, number: int) -> "MatchedPairs":
+        """Pairs of one of several layers."""
+        row = slice(number, number + 1)
+        matches = MapMatches(
+            samples=self._matches.samples[row],
+            query_inds=self._matches.query_inds[row],
+            joined_inds=self._matches.query_inds[row],  # the layer has no other queries
+            gt_inds=self._matches.gt_inds[row],
+            rows=self._matches.rows[row],
+            order_inds=self._matches.order_inds[row],
+            host_labels=self._matches.host_labels[row],
+            counts=self._matches.counts,
+        )
+        return MatchedPairs(
+            predictions=self.predictions.layers[number],
+            truths=self.truths,
+            matches=matches,
+            avg_factor=self.avg_factor,
+        )
 
     def by_layer(self, values: Tensor) -> Tensor:
-        """Sort values of the pairs by layer. (M, ...) -> (L, M / L, ...)"""
+        """Split values of the pairs by layer. (M, ...) -> (L, M / L, ...)"""
         return values.unflatten(0, self._matches.rows.shape)
 
     def of_queries(self, values: Tensor) -> Tensor:
-        """Take what belongs to the matched queries. (B, N, ...) -> (M, ...)"""
+        """Select values of the matched queries. (B, N, ...) -> (M, ...)"""
         return values[self.samples, self.query_inds]
 
     def of_truths(self, values: Tensor) -> Tensor:
-        """Take what belongs to the matched ground truths. (T, ...) -> (M, ...)"""
+        """Select values of the matched ground truths. (T, ...) -> (M, ...)"""
         return values[self._rows]
 
     @cached_property
@@ -259,7 +317,7 @@ class MatchedPairs:
 
     @cached_property
     def pred_references(self) -> Tensor:
-        """What the decoder refines: a point, or a Gaussian. (M, P, D)"""
+        """Predicted references of points or Gaussians. (M, P, D)"""
         return self.of_queries(self.predictions.references)
 
     @cached_property
@@ -275,7 +333,8 @@ class MatchedPairs:
     @cached_property
     def pred_masks(self) -> Tensor:
         """Masks rendered from the predicted Gaussians. (M, H, W)"""
-        reference, masks = self.predictions.reference, self.predictions.masks
+        reference = self.predictions.reference
+        masks = self.predictions.masks
         references = masks.rendered_references(
             self.pred_references, self.gt_labels, reference.coords
         )
@@ -283,7 +342,7 @@ class MatchedPairs:
 
     @cached_property
     def pred_instance_states(self) -> Tensor:
-        """States of the matched instances, float32. (M, C)"""
+        """States of the matched instances in float32. (M, C)"""
         return self.of_queries(self.predictions.decoded.instance_states).float()
 
     @cached_property
@@ -303,14 +362,14 @@ class MatchedPairs:
 
     @cached_property
     def gt_masks(self) -> Tensor:
-        """Masks drawn of the ground truth. (M, H, W)"""
+        """Masks of the ground truth. (M, H, W)"""
         masks = self.predictions.masks
         if masks.of_points:
             return masks.draw(self.gt_pts_m, self.gt_labels, masks.grid)
         return self.of_truths(self.truths.masks)
 
     def query_labels(self) -> Tensor:
-        """Return the class that every query should say, -1 for none. (B, N)"""
+        """Target class index of every query, -1 for queries without a match. (B, N)"""
         scores = self.predictions.scores
         labels = torch.full(scores.shape[:2], -1, dtype=torch.long, device=scores.device)
         labels[self.samples, self.query_inds] = self.gt_labels

@@ -1,4 +1,4 @@
-"""Embeddings of points, and settings that a method adds to every head."""
+"""Embeddings of points, and settings that methods add to all heads."""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,9 +7,9 @@ from torch import Tensor, nn
 
 from gsmap.models.base.parts import PARTS
 
-HeadSetting = Callable[[Any], PARTS]  # from its value to settings of `MapHead`
+HeadSetting = Callable[[Any], PARTS]  # from a value to settings of `MapHead`
 
-_ADDED: dict[str, HeadSetting] = {}
+_ADDED_SETTINGS: dict[str, HeadSetting] = {}
 
 
 class PointTable(nn.Embedding):
@@ -17,43 +17,46 @@ class PointTable(nn.Embedding):
 
     Args:
         num_points: Points per instance P.
-        embed_dims: Channels C of a query; an embedding has twice as many.
+        embed_dims: Channels C of a query; an embedding has 2 C channels.
     """
 
     def __init__(self, num_points: int, embed_dims: int) -> None:
         super().__init__(num_points, 2 * embed_dims)
 
     def forward(self, instances: Tensor) -> Tensor:
-        """Return the embeddings of the points of instances. (N, 2 C) -> (N, P, 2 C)"""
+        """Add the embeddings of the points to embeddings of instances. (N, 2 C) -> (N, P, 2 C)"""
         return instances[:, None] + self.weight
 
 
 def head_setting(name: str) -> Callable[[HeadSetting], HeadSetting]:
-    """Return a decorator that adds a setting to `MapHead` and the heads derived from it.
+    """Decorator that adds a setting to `MapHead` and its subclasses.
+
+    The decorated function returns the settings of `MapHead` for a value of the added setting.
 
     Args:
         name: Name of the setting.
     """
 
     def add(setting: HeadSetting) -> HeadSetting:
-        _ADDED[name] = setting
+        _ADDED_SETTINGS[name] = setting
         return setting
 
     return add
 
 
-def resolve_added_settings(given: PARTS) -> PARTS:
-    """Return the settings of `MapHead` that added settings stand for.
+def resolve_added_settings(values: PARTS) -> PARTS:
+    """Settings of `MapHead` that stand for added settings.
 
     Args:
-        given: Values of added settings, by name.
+        values: Values of added settings, by name.
 
     Raises:
-        TypeError: If there is no such setting.
+        TypeError: If a setting does not exist.
     """
-    found: PARTS = {}
-    for name, value in given.items():
-        if name not in _ADDED:
+    head_settings: PARTS = {}
+    for name, value in values.items():
+        if name not in _ADDED_SETTINGS:
             raise TypeError(f"MapHead.__init__() got an unexpected keyword argument '{name}'")
-        found.update(_ADDED[name](value))
-    return found
+        setting = _ADDED_SETTINGS[name]
+        head_settings.update(setting(value))
+    return head_settings

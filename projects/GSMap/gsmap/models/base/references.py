@@ -1,4 +1,4 @@
-"""Interfaces of references: geometry that predictions stand for, refined by decoder layers."""
+"""Interfaces of references: the geometry that queries predict and decoder layers refine."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -22,17 +22,25 @@ class Reference:
     metainfo: Mapping[str, Any] = MappingProxyType({})
 
     def decode(self, references: Tensor) -> dict[str, Tensor]:
-        """Return ``pts`` in metres (N, P, 2 or 3), and the other fields of `outputs`. (N, ...)"""
+        """Decode the references of a sample.
+
+        Args:
+            references: References. (N, P, D)
+
+        Returns:
+            ``pts`` in metres (N, P, 2 or 3), and the other fields of `outputs`. (N, ...)
+        """
         raise NotImplementedError
 
 
 class RefinedReference(Reference):
-    """References that decoder layers refine, one per point query.
+    """References that decoder layers refine, n per query.
 
     Attributes:
-        coords: Number of coordinates of a point, the first entries of a reference: 2 or 3.
-        space: How a reference stands for a Gaussian, None for points.
-        coder_class: Class of the coder of its detections, None for `MapCoder`.
+        coords: Number of coordinates of a point, which are the first entries of a reference: 2 or
+            3.
+        space: Encoding of Gaussians in references, None for references of points.
+        coder_class: Class of the coder of detections. None means `MapCoder`.
     """
 
     coords: int
@@ -40,34 +48,62 @@ class RefinedReference(Reference):
     coder_class: ClassVar[type[Any] | None] = None
 
     def start(self, query_pos: Tensor) -> Tensor:
-        """Return the reference that the first layer starts from. (..., Q, C) -> (..., Q * n, D)"""
+        """Initial references, from the positional queries. (..., Q, C) -> (..., Q * n, D)"""
         raise NotImplementedError
 
     def refine(self, layer: int, point_states: Tensor, reference: Tensor) -> Tensor:
-        """Return the reference after a layer. (..., Q, C), (..., Q * n, D) -> (..., Q * n, D)"""
+        """Refine references after a layer.
+
+        Args:
+            layer: Index of the layer.
+            point_states: States of the points. (..., Q, C)
+            reference: References of the previous layer. (..., Q * n, D)
+
+        Returns:
+            The refined references. (..., Q * n, D)
+        """
         raise NotImplementedError
 
     def metres(self, points: Tensor) -> Tensor:
-        """Bring normalised points to metres. (..., coords) -> (..., coords)"""
+        """Convert normalised points to metres. (..., coords) -> (..., coords)"""
         raise NotImplementedError
 
     def norm(self, points_m: Tensor) -> Tensor:
-        """Bring points in metres to [0, 1] over the map. (..., coords) -> (..., coords)"""
+        """Normalise points in metres to [0, 1] over the map. (..., coords) -> (..., coords)"""
         raise NotImplementedError
 
     def transform_references(self, references: Tensor, motion: Tensor) -> Tensor:
-        """Return references of an earlier frame as they lie now. (B, ..., D) -> (B, ..., D)
+        """Transform references of an earlier frame to the current frame.
 
         Args:
             references: References of the earlier frame. (B, ..., D)
-            motion: Takes metres then to metres now. (B, 4, 4)
+            motion: Transform from the earlier to the current frame, in metres. (B, 4, 4)
+
+        Returns:
+            References of the current frame. (B, ..., D)
         """
         raise NotImplementedError
 
     def transform_points(self, points: Tensor, motion: Tensor) -> Tensor:
-        """Return normalised points (B, ..., coords) after a motion (B, 4, 4), put onto the map."""
+        """Transform normalised points and clamp them to the map.
+
+        Args:
+            points: Normalised points. (B, ..., coords)
+            motion: Transform in metres. (B, 4, 4)
+
+        Returns:
+            Normalised points. (B, ..., coords)
+        """
         raise NotImplementedError
 
     def render(self, references: Tensor, grid: BEVGrid) -> Tensor:
-        """Return the masks of references with an extent. (..., P, D) -> (..., H, W)"""
+        """Render the masks of elements whose references have an extent.
+
+        Args:
+            references: References. (..., P, D)
+            grid: The raster.
+
+        Returns:
+            Masks in [0, 1]. (..., H, W)
+        """
         raise NotImplementedError

@@ -1,0 +1,232 @@
+"""Matching and losses of the predictions of all decoder layers and query groups."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any, cast
+
+import torch
+from mmdet.utils import reduce_mean
+from mmengine.structures import InstanceData
+from torch import Tensor, nn
+
+from gsmap.models.base.class_losses import ClassLoss, plain_class_loss
+from gsmap.models.base.coder import DetectionHead, Metas, Tensors
+from gsmap.models.base.groups import QueryGroup
+from gsmap.models.base.hooks import FlowHook
+from gsmap.models.base.losses import MapLoss
+from gsmap.models.base.masks import ElementMasks
+from gsmap.models.base.matching import MapAssigner
+from gsmap.models.base.pairs import GroundTruth, MapMatches, MatchedPairs, Predictions
+from gsmap.models.base.references import RefinedReference
+
+Instances = Sequence[InstanceData]
+
+
+class LossHead(DetectionHead):
+    """Base class of heads with losses of matched pairs.
+
+    Attributes:
+        query_groups: Groups of queries that are matched together. The first one predicts.
+        instance_embedding: Embeddings of the instance queries.
+        masks: Rasters for losses and costs of masks.
+        loss_cls: Classification loss.
+        losses: Further losses, by name.
+        assigner: Assignment of predictions to the ground truth.
+    """
+
+    reference: RefinedReference
+    query_groups: list[QueryGroup]
+    instance_embedding: nn.Embedding
+    masks: ElementMasks
+    loss_cls: nn.Module
+    losses: nn.ModuleDict
+    assigner: MapAssigner
+
+    def loss_by_feat(
+        self,
+        outputs: Sequence[Predictions],
+        batch_gt_instances: Instances,
+        batch_img_metas: Metas,
+        hooks: Sequence[FlowHook] = (),
+    ) -> Tensors:
+        """Losses of every decoder layer and query group.
+
+        Names of losses have the prefix ``d<layer>.`` in all layers but the last, and the name of
+        the group as suffix in all groups but the first.
+
+        Args:
+            outputs: Predictions of each layer, of all query groups.
+            batch_gt_instances: Ground truth of each sample, see `GroundTruth`.
+            batch_img_metas: Meta dict of each sample.
+            hooks: Hooks that receive the matches of the first query group.
+
+        Returns:
+            Scalars by name.
+
+        Raises:
+            FloatingPointError: If a matching cost is not finite.
+        """
+        truths = self.prepare_gts(batch_gt_instances)
+        return self.losses_by_feat(outputs, truths, metas=batch_img_metas, hooks=hooks)
+
+    def losses_by_feat(
+        self,
+        outputs: Sequence[Predictions],
+        truths: GroundTruth,
+        metas: Metas,
+        hooks: Sequence[FlowHook] = (),
+    ) -> Tensors:
+        """Losses of every decoder layer and query group, as in `loss_by_feat`.
+
+        Args:
+            outputs: Predictions of each layer, of all query groups.
+            truths: Ground truth of the batch.
+            metas: Meta dict of each sample.
+            hooks: Hooks that receive the matches of the first query group.
+
+        Returns:
+            Scalars by name.
+        """
+        losses: Tensors = {}
+        with torch.autocast(outputs[-1].scores.device.type, enabled=False):
+            for group, layers in self.split_groups(outputs):
+                pairs = self.match(layers, truths, metas=metas, repeats=group.repeats)
+                if group is self.query_groups[0]:
+                    for hook in hooks:
+                        hook.targets(self, pairs.layer(-1))
+                losses.update(self.group_losses(group, pairs))
+        return losses
+
+    def known_losses(
+        self,
+        group: QueryGroup,
+        layers: Sequence[Predictions],
+        truths: GroundTruth,
+        matches: Sequence[tuple[Tensor, Tensor]],
+    ) -> Tensors:
+        """Losses of a group of queries with known matches.
+
+        All ranks must call it in each step, because the number of pairs is averaged over them.
+
+        Args:
+            group: Name, weight and losses of the group.
+            layers: Predictions of the queries, after each layer.
+            truths: Ground truth of the batch.
+            matches: Matched pairs of each sample: indices of the queries, increasing, and indices
+                of the ground truths, on the CPU. 2 x (m,)
+
+        Returns:
+            Scalars by name.
+        """
+        predictions = Predictions.join([layer.of_queries(slice(None)) for layer in layers])
+        with torch.autocast(predictions.scores.device.type, enabled=False):
+            known_matches = self.assigner.assign_known(predictions, truths, pairs=matches)
+            pairs = self.pairs(predictions, truths, matches=known_matches)
+            return self.group_losses(group, pairs)
+
+    def split_groups(
+        self, outputs: Sequence[Predictions]
+    ) -> Iterator[tuple[QueryGroup, list[Predictions]]]:
+        """Yield each query group with its predictions of each layer."""
+        start = 0
+        for group in self.query_groups:
+            queries = slice(start, start + group.num)
+            yield group, [layer.of_queries(queries) for layer in outputs]
+            start += group.num
+
+    def prepare_gts(self, batch_gt_instances: Instances) -> GroundTruth:
+        """Ground truth of a batch, for costs and losses."""
+        with torch.autocast(self.instance_embedding.weight.device.type, enabled=False):
+            return GroundTruth(batch_gt_instances, reference=self.reference, masks=self.masks)
+
+    def match(
+        self,
+        layers: Sequence[Predictions],
+        truths: GroundTruth,
+        metas: Metas,
+        repeats: int = 1,
+    ) -> MatchedPairs:
+        """Match the predictions of each layer with the ground truth.
+
+        Args:
+            layers: Predictions of a query group, after each layer.
+            truths: Ground truth of the batch.
+            metas: Meta dict of each sample.
+            repeats: Number of queries that each ground truth is matched with.
+        """
+        predictions = Predictions.join(layers)
+        matches = self.assigner.assign(predictions, truths, metas=metas, repeats=repeats)
+        return self.pairs(predictions, truths, matches=matches)
+
+    def pairs(
+        self, predictions: Predictions, truths: GroundTruth, matches: MapMatches
+    ) -> MatchedPairs:
+        """Matched pairs, with their number averaged over the ranks.
+
+        Args:
+            predictions: Predictions of the matched layers.
+            truths: Ground truth of the batch.
+            matches: Indices of the pairs.
+        """
+        count = float(sum(matches.counts))
+        num_pairs = torch.full((), count, device=predictions.scores.device)
+        avg_factor = reduce_mean(num_pairs).clamp(min=1.0)
+        return MatchedPairs(predictions, truths, matches=matches, avg_factor=avg_factor)
+
+    def group_losses(self, group: QueryGroup, pairs: MatchedPairs) -> Tensors:
+        """Weighted losses of a query group in all layers, and statistics of the first group.
+
+        Args:
+            group: Query group.
+            pairs: Matched pairs of the group, of all layers.
+
+        Returns:
+            Scalars by name.
+        """
+        layer_losses: list[Tensors] = [{} for _ in range(pairs.num_layers)]
+        is_first = group is self.query_groups[0]
+        names = ("cls", *self.losses) if group.losses is None else group.losses
+        if "cls" in names:
+            for index, value in enumerate(self.class_losses(pairs)):
+                layer_losses[index]["loss_cls"] = group.weight * value
+        for name, loss in cast(Any, self.losses.items()):
+            if name in names and (is_first or not loss.first_group_only):
+                for index, value in self._values_by_layer(loss, pairs).items():
+                    layer_losses[index][f"loss_{name}"] = group.weight * value
+        if is_first:
+            layer_losses[-1].update(self.statistics(pairs.layer(-1)))
+        suffix = f"_{group.name}" if group.name else ""
+        losses = {}
+        for index, values in enumerate(layer_losses):
+            is_last = index == pairs.num_layers - 1
+            prefix = "" if is_last else f"d{index}."
+            for name, value in values.items():
+                losses[f"{prefix}{name}{suffix}"] = value
+        return losses
+
+    @staticmethod
+    def _values_by_layer(loss: MapLoss, pairs: MatchedPairs) -> dict[int, Tensor]:
+        """Values of a loss, by the index of each layer that has the loss."""
+        first = pairs.num_layers - 1 if loss.last_layer_only else 0
+        layers = range(first, pairs.num_layers)
+        layers_with_loss = [index for index in layers if loss.reads(pairs.layer(index))]
+        if len(layers_with_loss) == pairs.num_layers:
+            return dict(enumerate(loss.by_layer(pairs)))
+        return {index: loss(pairs.layer(index)) for index in layers_with_loss}
+
+    def class_losses(self, pairs: MatchedPairs) -> Tensor:
+        """Classification loss of each layer. (L,)"""
+        scores = pairs.predictions.scores  # (B, L * N, classes)
+        if isinstance(self.loss_cls, ClassLoss):
+            values = self.loss_cls(pairs)
+        else:
+            values = plain_class_loss(self.loss_cls, scores, labels=pairs.query_labels())
+        by_layer = values.view(len(scores), pairs.num_layers, -1).transpose(0, 1)
+        return by_layer.flatten(1).sum(1) / pairs.avg_factor
+
+    def statistics(self, pairs: MatchedPairs) -> Tensors:
+        """Statistics to log, by names that do not start with ``loss``; none in this class.
+
+        Args:
+            pairs: Matched pairs of the last layer.
+        """
+        return {}
