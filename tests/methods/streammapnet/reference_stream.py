@@ -72,8 +72,8 @@ class Recorder:
         )
         own_match = self.head.match
 
-        def match(*args: Any) -> Any:
-            pairs = own_match(*args)
+        def match(*args: Any, **kwargs: Any) -> Any:
+            pairs = own_match(*args, **kwargs)
             for layer, matches in enumerate(triples(pairs)):
                 for slot, each in enumerate(matches):
                     self.matches[f"match_t{frame}_l{layer}_b{slot}"] = each

@@ -270,7 +270,7 @@ def directional_offsets(num_heads: int, num_points: int) -> Tensor:
         Offsets (x, y) in cells. (heads, S, 2)
     """
     angles = torch.arange(num_heads, dtype=torch.float32) * (2 * math.pi / num_heads)
-    directions = torch.stack([angles.cos(), angles.sin()], -1)
+    directions = torch.stack([angles.cos(), angles.sin()], dim=-1)
     directions = directions / directions.abs().amax(-1, keepdim=True)
     steps = torch.arange(1, num_points + 1, dtype=torch.float32)
     return directions[:, None] * steps[:, None]

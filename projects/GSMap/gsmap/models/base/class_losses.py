@@ -121,7 +121,7 @@ class QualityClassLoss(ClassLoss):
         )
         distances = (later_targets - later_scores.sigmoid()).abs()
         later_losses = self.loss_weight * (distances.pow(self.beta) * entropies)
-        return torch.cat([first_losses, later_losses], 1)
+        return torch.cat([first_losses, later_losses], dim=1)
 
     def targets(self, pairs: MatchedPairs) -> Tensor:
         """Targets of the scores, without gradient. (B, L * N, classes)"""

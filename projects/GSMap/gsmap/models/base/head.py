@@ -275,8 +275,9 @@ class MapHead(LossHead):
         missing = initial.detach()[len(common) :].to(common)
         state[key] = torch.cat([common, missing])
         print_log(
-            f"{key}: the checkpoint has {len(loaded)} instance queries, the model {len(initial)}; the "
-            f"{num_predicting} that predict are taken, the further ones cut off or left as new.",
+            f"{key}: the checkpoint has {len(loaded)} instance queries, the model "
+            f"{len(initial)}; the {num_predicting} that predict are taken, the further ones cut "
+            "off or left as new.",
             logger="current",
             level=logging.WARNING,
         )

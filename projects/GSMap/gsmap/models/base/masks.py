@@ -139,4 +139,4 @@ def _pad_lines(lines: Tensor, length: int) -> Tensor:
     num_missing = length - lines.shape[1]
     if num_missing == 0:
         return lines
-    return torch.cat([lines, lines[:, -1:].expand(-1, num_missing, -1)], 1)
+    return torch.cat([lines, lines[:, -1:].expand(-1, num_missing, -1)], dim=1)

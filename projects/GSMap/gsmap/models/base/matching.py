@@ -143,7 +143,7 @@ class MapAssigner:
             row = gt + truths.first[index]
             indices.append(torch.stack([sample, query, query + first_query, gt, row]))
             counts.append(query.shape[1])
-        host_indices = torch.cat(indices, 2)  # (5, L, M)
+        host_indices = torch.cat(indices, dim=2)  # (5, L, M)
         (device_indices,) = upload([host_indices], predictions.scores.device)
         samples, query_inds, joined_inds, gt_inds, rows = device_indices.unbind(0)
         orders = truths.pts_shifts[rows]  # (L, M, S, P, 2 or 3)

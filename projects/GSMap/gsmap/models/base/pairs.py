@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from functools import cached_property
-from itertools import accumulate
 from typing import NamedTuple, Protocol
 
 import torch
@@ -70,7 +69,7 @@ class Predictions:
         if len(layers) == 1:
             return layers[0]
         last = layers[-1]
-        scores = torch.cat([layer.scores for layer in layers], 1)
+        scores = torch.cat([layer.scores for layer in layers], dim=1)
         decoded = JoinedDecoded([layer.decoded for layer in layers])
         all_layers = cls(
             scores=scores,
@@ -127,11 +126,17 @@ class GroundTruth:
         self._instances = instances
         self._reference = reference
         self._element_masks = masks
-        self.counts = [len(sample.labels_3d) for sample in instances]
-        self.first = list(accumulate(self.counts, initial=0))[:-1]
-        self.labels = torch.cat([sample.labels_3d for sample in instances])
-        shifts = torch.cat([sample.pts_shifts for sample in instances])
-        self.pts_shifts = reference.norm(shifts.float())
+        self.counts: list[int] = []
+        self.first: list[int] = []
+        labels = []
+        pts_shifts_m = []
+        for sample in instances:
+            self.first.append(sum(self.counts))
+            self.counts.append(len(sample.labels_3d))
+            labels.append(sample.labels_3d)
+            pts_shifts_m.append(sample.pts_shifts)
+        self.labels = torch.cat(labels)
+        self.pts_shifts = reference.norm(torch.cat(pts_shifts_m).float())
 
     @cached_property
     def first_pts(self) -> Tensor:

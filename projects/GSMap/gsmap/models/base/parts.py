@@ -112,8 +112,9 @@ def modules_by_name(modules: Sequence[Any]) -> nn.ModuleDict:
     Raises:
         ValueError: If two modules have one name.
     """
-    check_unique_names([module.name for module in modules], "parts")
-    return nn.ModuleDict({module.name: module for module in modules})
+    names = [module.name for module in modules]
+    check_unique_names(names, kind="parts")
+    return nn.ModuleDict(zip(names, modules, strict=True))
 
 
 def check_unique_names(names: Sequence[str], kind: str) -> None:

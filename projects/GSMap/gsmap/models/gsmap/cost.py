@@ -1,4 +1,4 @@
-"""The matching cost of rendered masks (GSMap Eq. 9)."""
+"""Matching cost of rendered masks (GSMap Eq. 9)."""
 
 from typing import Any
 
@@ -15,11 +15,11 @@ from gsmap.utils.errors import InputError
 
 @TASK_UTILS.register_module()
 class IoUCost(MapCost):
-    """Cost of the overlap of rendered and drawn masks (GSMap Eq. 9).
+    """Matching cost of the overlap of predicted and ground-truth masks (GSMap Eq. 9).
 
     Args:
-        weight: Weight of the cost.
-        kind: ``"iou"`` for 1 - sum min / sum max, ``"dice"`` for one less their dice coefficient.
+        weight: Weight of the cost, or a weight for each class.
+        kind: ``"iou"`` for one minus the soft IoU, ``"dice"`` for one minus the dice coefficient.
 
     Raises:
         ValueError: If ``kind`` is unknown.
@@ -32,15 +32,25 @@ class IoUCost(MapCost):
         self.kind = kind
 
     def check(self, head: BuiltHead) -> None:
-        """Raise ValueError if the head has no Gaussians to render."""
+        """Raise ValueError if the head has no Gaussians."""
         require_gaussians(self, head)
 
     def __call__(
         self, pred_instances: SampleView, gt_instances: SampleView, img_meta: Any = None
     ) -> Tensor:
-        """Compare the masks of matching, (N, h, w) and (K, h, w). (N, K)"""
-        preds, targets = pred_instances.cost_masks, gt_instances.cost_masks
+        """Weighted cost of each prediction with each ground truth.
+
+        Args:
+            pred_instances: Predictions of a sample, with ``cost_masks`` (N, h, w).
+            gt_instances: Ground truth of the sample, with ``cost_masks`` (K, h, w).
+            img_meta: Meta dict of the sample, not used.
+
+        Returns:
+            The costs. (N, K)
+        """
         weights = class_weights(self.weight, gt_instances.labels)
+        preds = pred_instances.cost_masks
+        targets = gt_instances.cost_masks
         if self.kind == "dice":
             return weights * pairwise_dice_loss(preds, targets)
         return weights * (1 - pairwise_soft_iou(preds, targets))

@@ -1,4 +1,4 @@
-"""How one layer's Gaussians guide where the next looks (GSMap section 3.4)."""
+"""Conditioning of decoder layers on Gaussians (GSMap section 3.4)."""
 
 from mmdet3d.registry import MODELS
 from mmengine.model import constant_init
@@ -13,22 +13,21 @@ from gsmap.utils.errors import InputError
 
 @MODELS.register_module()
 class GaussianGuidance(Guidance, AddsWeights):
-    """What a decoder layer takes from the Gaussians, for whichever attentions it has.
+    """Conditioning of a decoder layer on the Gaussians of its queries, for any attention.
 
-    Both parts start neutral: the sampling frame is the identity and the embedding zero, so a layer
-    with the weights of a MapTR layer computes what that layer computes. The settings are those of
-    `GaussianDecoderLayer`.
+    It starts without effect: the matrices of the offsets are identities and the embedding is zero,
+    so that a layer with the weights of MapTR has the output of MapTR.
 
     Args:
-        space: How the reference stands for a Gaussian.
+        space: Encoding of Gaussians in references.
         embed_dims: Channels C.
-        sampling: As ``guide_sampling``.
-        embedding: As ``embed_gaussians``.
-        invariant: As ``invariant_frame``.
-        hidden_dims: As ``embed_hidden_dims``.
+        sampling: Transform sampling offsets by the orientation and size of each Gaussian.
+        embedding: Add an embedding of (mu, sigma, theta) to the positional queries.
+        invariant: Use matrices of the offsets that are equal for theta and theta + pi.
+        hidden_dims: Hidden channels of the embedding.
 
     Raises:
-        ValueError: If the reference holds no Gaussians.
+        ValueError: If the references have no Gaussians.
     """
 
     neutral_keys = ("embedding.",)
@@ -45,29 +44,45 @@ class GaussianGuidance(Guidance, AddsWeights):
         super().__init__()
         if space is None:
             raise InputError("a guided decoder layer needs a reference that holds Gaussians.")
-        self.space, self.sampling, self.invariant = space, sampling, invariant
+        self.space = space
+        self.sampling = sampling
+        self.invariant = invariant
         self.embedding = mlp(6, hidden_dims, embed_dims) if embedding else None
         self.init_weights()
 
     def init_weights(self) -> None:
-        """Make what GSMap adds neutral."""
+        """Initialise the embedding to zero."""
         if self.embedding is not None:
             constant_init(self.embedding[-1], 0.0)
 
     def position(self, query_pos: Tensor, reference: Tensor) -> Tensor:
-        """Add the embedded Gaussians to the queries' position. (B, Q, C), (B, Q, D) -> (B, Q, C)"""
+        """Add embeddings of the Gaussians to the positional queries.
+
+        Args:
+            query_pos: Positional queries. (B, Q, C)
+            reference: References. (B, Q, D)
+
+        Returns:
+            Positional queries. (B, Q, C)
+        """
         if self.embedding is None:
             return query_pos
         return query_pos + self.embedding(self.space.describe(reference))
 
     def frames(self, reference: Tensor, feats: Tensor) -> Tensor | None:
-        """Return what turns sampling offsets in cells into each Gaussian's frame, or None.
+        """Matrices that transform sampling offsets to the frame of each Gaussian.
 
-        The matrices (B, Q, 2, 2) of references (B, Q, D) multiply offsets (x, y) in cells of the
-        sampled map (B, C, H, W) from the left.
+        Args:
+            reference: References. (B, Q, D)
+            feats: Sampled feature map (B, C, H, W), or maps, of which the first has the cells of
+                the offsets.
+
+        Returns:
+            Matrices that multiply offsets (x, y) in cells from the left, or None. (B, Q, 2, 2)
         """
         if not self.sampling:
             return None
-        finest = feats if isinstance(feats, Tensor) else feats[0]  # of levels
-        cell_m = self.space.grid.with_size(*finest.shape[-2:]).pixel_size_m
-        return self.space.frames(reference, self.invariant, cell_m)
+        finest = feats if isinstance(feats, Tensor) else feats[0]
+        height, width = finest.shape[-2:]
+        cell_m = self.space.grid.with_size(height, width).pixel_size_m
+        return self.space.frames(reference, invariant=self.invariant, cell_m=cell_m)

@@ -1,4 +1,4 @@
-"""GSMap's head: elements as ordered Gaussians, supervised as polylines and as rendered masks."""
+"""Head of GSMap: elements as ordered Gaussians, with losses of polylines and rendered masks."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -9,7 +9,14 @@ from torch import Tensor
 from gsmap.models.base.coder import Detections
 from gsmap.models.base.head import MapHead
 from gsmap.models.base.pairs import MatchedPairs
-from gsmap.models.base.parts import DEFAULTS, PARTS, WEIGHT, optional_part, set_points_weight
+from gsmap.models.base.parts import (
+    DEFAULTS,
+    PARTS,
+    WEIGHT,
+    optional_part,
+    set_points_weight,
+    with_defaults,
+)
 from gsmap.models.gsmap.cost import IoUCost
 from gsmap.models.gsmap.layer import add_guidance
 from gsmap.models.gsmap.losses import MaskLoss, RasterLoss
@@ -26,28 +33,33 @@ from gsmap.utils.errors import InputError
 
 @MODELS.register_module()
 class GSMapHead(MapHead):
-    """The map head with GSMap's parts as defaults, on whatever decoder and losses there are.
+    """Map head with the parts of GSMap as defaults, for any decoder and losses.
 
-    A query's reference becomes a Gaussian (paper, Eq. 1), the decoder's layers are guided by it,
-    matching adds the IoU cost of rendered masks (Eq. 9) and the losses the raster loss (Eqs. 10 and
-    12). Nothing is rendered at inference. Besides `MapHead`'s arguments:
+    References are Gaussians (GSMap Eq. 1), on which the decoder layers are conditioned. Matching
+    has the IoU cost of rendered masks (Eq. 9), and training the raster loss (Eqs. 10 and 12).
+    Prediction does not render.
 
     Args:
-        loss_raster: Settings of the loss of the rendered masks, `RasterLoss` if they name no other,
-            or None to train without it.
-        iou_cost: Settings of the matching cost of the rendered masks, `IoUCost` of weight 2 if they
-            say nothing else, or None to match without it.
-        points_weight: Weight of the points in losses and in matching (the paper's lambda_v), or
-            one for each class, or None to leave those of ``losses`` and ``match_costs``; ValueError
-            if a weight is given and they have no points.
+        grid: Extent of the map.
+        decoder: Config of the decoder.
+        losses: Configs of the other losses.
+        match_costs: Configs of the other matching costs.
+        loss_raster: Settings of the loss of rendered masks, by default `RasterLoss`. None trains
+            without it.
+        iou_cost: Settings of the matching cost of rendered masks, by default `IoUCost` with weight
+            2. None matches without it.
+        points_weight: Weight of the points in losses and matching (lambda_v of the paper), or a
+            weight for each class. None keeps the weights of ``losses`` and ``match_costs``.
         masks: Settings of `GaussianMasks`.
-        reference: Settings of `GaussianReference`; its smallest sigma is half a pixel of the masks
-            by default.
-        temperatures: Factors, > 0, of the sigmas of detections, along and across the line, of each
-            class (`tools/calibrate.py` fits them), or None. C x (2,)
+        reference: Settings of `GaussianReference`. The default of the smallest sigma is half a
+            pixel of the masks.
+        temperatures: Factors > 0 of the sigmas of detections along and across the line, two for
+            each class, or None. `tools/calibrate.py` fits them.
+        kwargs: Further arguments of `MapHead`.
 
     Raises:
-        ValueError: If there are not two temperatures for each class.
+        ValueError: If there are not two temperatures for each class, or if ``points_weight`` is
+            given and there is no loss or cost of points.
     """
 
     def __init__(
@@ -64,49 +76,77 @@ class GSMapHead(MapHead):
         temperatures: Sequence[Sequence[float]] | None = None,
         **kwargs: Any,
     ) -> None:
-        drawing = GaussianMasks(grid, **(masks or {}))
-        # Half a pixel of the masks: smaller Gaussians get no gradient. On rasters so coarse that
-        # the usual first Gaussian comes close to that, it grows with it.
-        smallest = (reference or {}).get("min_scale_m", drawing.half_pixel_m)
-        gaussian = {
-            "type": GaussianReference,
-            "min_scale_m": smallest,
-            "init_scales_m": (max(1.0, 3 * smallest), max(0.4, 1.5 * smallest)),
-        }
-        losses = set_points_weight(losses, PointsLoss, points_weight, "loss_weight")
+        element_masks = GaussianMasks(grid, **(masks or {}))
+        # Gaussians smaller than half a pixel of the masks have no gradient. On coarse rasters, the
+        # initial Gaussian is larger than usual, so that it stays above the smallest one.
+        min_scale_m = (reference or {}).get("min_scale_m", element_masks.half_pixel_m)
+        reference = with_defaults(
+            reference,
+            type=GaussianReference,
+            min_scale_m=min_scale_m,
+            init_scales_m=(max(1.0, 3 * min_scale_m), max(0.4, 1.5 * min_scale_m)),
+        )
+        losses = set_points_weight(losses, PointsLoss, weight=points_weight, key="loss_weight")
         match_costs = set_points_weight(
-            match_costs, OrderedPointsCost, points_weight, "weight", TASK_UTILS
+            match_costs,
+            OrderedPointsCost,
+            weight=points_weight,
+            key="weight",
+            registry=TASK_UTILS,
         )
         super().__init__(
             grid=grid,
             decoder=add_guidance(decoder),
             losses=[*losses, *optional_part(RasterLoss, loss_raster)],
             match_costs=[*match_costs, *optional_part(IoUCost, iou_cost, weight=2.0)],
-            masks=drawing,
-            reference={**gaussian, **(reference or {})},
+            masks=element_masks,
+            reference=reference,
             **kwargs,
         )
-        if temperatures is not None:
-            fits = [len(pair) == 2 and min(pair) > 0 for pair in temperatures]
-            if fits != [True] * len(self.classes):
-                raise InputError(
-                    f"temperatures must be two numbers > 0 for each of the {len(self.classes)} "
-                    f"classes, got {temperatures}."
-                )
+        self.check_temperatures(temperatures)
         self.temperatures = temperatures
 
+    def check_temperatures(self, temperatures: Sequence[Sequence[float]] | None) -> None:
+        """Raise ValueError if temperatures are not two positive numbers for each class."""
+        if temperatures is None:
+            return
+        is_valid = len(temperatures) == len(self.classes)
+        for pair in temperatures:
+            is_valid = is_valid and len(pair) == 2 and min(pair) > 0
+        if not is_valid:
+            raise InputError(
+                f"temperatures must be two numbers > 0 for each of the {len(self.classes)} "
+                f"classes, got {temperatures}."
+            )
+
     def select_detections(self, fields: dict[str, Tensor], best: Detections) -> dict[str, Tensor]:
-        """Return what the reference decoded of the detections, sigmas at their temperatures."""
-        found = super().select_detections(fields, best)
+        """Fields of the detections, with sigmas multiplied by the temperatures.
+
+        Args:
+            fields: Decoded references, by name. (N, ...) each
+            best: Selected pairs of query and class.
+
+        Returns:
+            The fields by name. (M, ...) each
+        """
+        detections = super().select_detections(fields, best)
         if self.temperatures is None:
-            return found
-        factors = constant(found["scales"], self.temperatures)[best.labels][:, None]  # (M, 1, 2)
-        means, scales, rotations = found["pts"][..., :2], found["scales"], found["rotations"]
-        _, scales, rotations = stretch_along_line(Gaussians(means, scales, rotations), factors)
-        return {**found, "scales": scales, "rotations": rotations}
+            return detections
+        factors = constant(detections["scales"], self.temperatures)[best.labels]
+        gaussians = Gaussians(
+            means=detections["pts"][..., :2],
+            scales=detections["scales"],
+            rotations=detections["rotations"],
+        )
+        stretched = stretch_along_line(gaussians, factors[:, None])
+        return {**detections, "scales": stretched.scales, "rotations": stretched.rotations}
 
     def statistics(self, pairs: MatchedPairs) -> dict[str, Tensor]:
-        """Return what says whether the Gaussians live (see `gaussian_statistics`)."""
+        """Statistics of the predicted Gaussians (`gaussian_statistics`), if masks are rendered.
+
+        Args:
+            pairs: Matched pairs of the last layer.
+        """
         space = self.reference.space
         if space is None or not any(isinstance(loss, MaskLoss) for loss in self.losses.values()):
             return {}

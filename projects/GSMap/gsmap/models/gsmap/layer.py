@@ -1,23 +1,23 @@
-"""The decoder layer that Gaussians guide (GSMap section 3.4)."""
+"""Decoder layer conditioned on Gaussians (GSMap section 3.4)."""
 
 from typing import Any
 
 from mmdet3d.registry import MODELS
 
 from gsmap.models.base.decoder import MapDecoder, MapDecoderLayer
-from gsmap.models.base.parts import PARTS, class_of
+from gsmap.models.base.parts import PARTS, class_of, with_defaults
 from gsmap.models.gsmap.guidance import GaussianGuidance
 
 
 @MODELS.register_module()
 class GaussianDecoderLayer(MapDecoderLayer):
-    """The layer guided by Gaussians (GSMap section 3.4), whatever its attentions are.
+    """Decoder layer conditioned on the Gaussians of its queries, with any attention.
 
     Args:
-        guide_sampling: Sample the BEV features in each Gaussian's own frame.
-        embed_gaussians: Add an embedding of (mu, sigma, theta) to the query's position.
-        invariant_frame: Take the sampling frame that is the same for theta and theta + pi.
-        embed_hidden_dims: Hidden channels of that embedding.
+        guide_sampling: Transform sampling offsets by the orientation and size of each Gaussian.
+        embed_gaussians: Add an embedding of (mu, sigma, theta) to the positional queries.
+        invariant_frame: Use matrices of the offsets that are equal for theta and theta + pi.
+        embed_hidden_dims: Hidden channels of the embedding.
         kwargs: Arguments of `MapDecoderLayer`.
     """
 
@@ -40,11 +40,16 @@ class GaussianDecoderLayer(MapDecoderLayer):
 
 
 def add_guidance(decoder: PARTS) -> PARTS:
-    """Return a decoder's config with layers that Gaussians guide, where it says nothing else."""
-    kind, layer = class_of({"type": MapDecoder, **decoder}), decoder.get("layer", {})
+    """Copy the config of a decoder, with layers that are conditioned on Gaussians by default.
+
+    Args:
+        decoder: Config of a decoder. Its settings take precedence.
+    """
+    layer = decoder.get("layer", {})
+    kind = class_of(with_defaults(decoder, type=MapDecoder))
     if kind is None or not issubclass(kind, MapDecoder) or kind.layer_class is MapDecoderLayer:
-        return {**decoder, "layer": {"type": GaussianDecoderLayer, **layer}}
+        return {**decoder, "layer": with_defaults(layer, type=GaussianDecoderLayer)}
     guidance = layer.get("guidance", {})
     if guidance is not None:
-        guidance = {"type": GaussianGuidance, **guidance}
+        guidance = with_defaults(guidance, type=GaussianGuidance)
     return {**decoder, "layer": {**layer, "guidance": guidance}}

@@ -1,4 +1,4 @@
-"""Losses of rendered masks: GSMap's raster loss (Eq. 12), and overlap in its place."""
+"""Losses of rendered masks: the raster loss of GSMap (Eq. 12), and a loss of the overlap."""
 
 from typing import Any
 
@@ -16,41 +16,45 @@ from gsmap.utils.errors import InputError
 
 
 class MaskLoss(MapLoss):
-    """A loss of the rendered masks of matched instances.
+    """Base class of losses of the rendered masks of matched instances.
 
-    Masks that hardly meet push a prediction anywhere, so such a pair's loss may count less.
+    The gradient of masks without overlap has no useful direction, so that the loss of pairs with a
+    small overlap can be reduced.
 
     Args:
-        loss_weight: Weight of the loss, or one for each class.
-        full_iou: Soft IoU of a pair's masks from which on its loss counts in full; below, it is
-            multiplied with the share of it that is reached. 0: all count in full. Or one for each
-            class.
-        flags: As in `MapLoss`.
+        loss_weight: Weight of the loss, or a weight for each class.
+        full_iou: Smallest soft IoU of a pair with the full loss, or one for each class. With a
+            smaller IoU, the loss is multiplied by IoU / full_iou. 0 means the full loss for all
+            pairs.
+        flags: Flags of `MapLoss`.
     """
 
     name = "raster"
 
     def __init__(self, loss_weight: WEIGHT = 10.0, full_iou: WEIGHT = 0.0, **flags: bool) -> None:
-        super().__init__(loss_weight, **flags)
+        super().__init__(loss_weight=loss_weight, **flags)
         self.full_iou = full_iou
 
     def check(self, head: BuiltHead) -> None:
-        """Raise ValueError if the head has no Gaussians to render, or other classes."""
+        """Raise ValueError if the head has no Gaussians, or another number of classes."""
         require_gaussians(self, head)
-        check_weight(self, self.full_iou, head.classes)
+        check_weight(self, self.full_iou, classes=head.classes)
 
-    def per_instance(self, preds: Tensor, targets: Tensor) -> Tensor:
-        """Return one value per instance. 2 x (M, H, W) -> (M,)"""
-        raise NotImplementedError
+    def reduce_small_overlaps(self, losses: Tensor, pairs: MatchedPairs) -> Tensor:
+        """Reduce the losses of pairs whose soft IoU is below ``full_iou``.
 
-    def values(self, pairs: MatchedPairs) -> Tensor:
-        """Compare rendered and drawn masks. (M,)"""
-        losses = self.per_instance(pairs.pred_masks, pairs.gt_masks)
+        Args:
+            losses: Loss of each pair. (M,)
+            pairs: Matched pairs.
+
+        Returns:
+            The reduced losses. (M,)
+        """
         if self.full_iou == 0:
             return losses
-        full = class_weights(self.full_iou, pairs.gt_labels)
+        full_iou = class_weights(self.full_iou, pairs.gt_labels)
         iou = soft_iou(pairs.pred_masks.detach(), pairs.gt_masks)
-        return losses * torch.where(iou < full, iou / full, 1)
+        return losses * torch.where(iou < full_iou, iou / full_iou, 1)
 
 
 @MODELS.register_module()
@@ -58,15 +62,16 @@ class RasterLoss(MaskLoss):
     """Raster loss of matched instances, averaged over them (GSMap Eq. 12).
 
     Args:
-        loss_weight: Weight of the loss: the paper's lambda_r.
-        alpha: Share of the weighted L1 term: the paper's lambda_alpha. 0 and 1 switch a term off.
-        foreground_weight: Weight of a ground-truth pixel in the L1 term; 1 is plain L1.
-        normalize: What the sums over pixels are divided by: ``"both"``, ``"foreground"`` or
-            ``"pixels"`` (see `gsmap.ops.raster_loss.raster_loss`).
-        window_size: Side of SSIM's window in pixels, odd.
-        window_sigma: Standard deviation of SSIM's window in pixels.
-        full_iou: As in `MaskLoss`.
-        flags: As in `MapLoss`.
+        loss_weight: Weight of the loss (lambda_r of the paper), or a weight for each class.
+        alpha: Share of the weighted L1 term (lambda_alpha of the paper), in [0, 1]. The rest is the
+            SSIM term.
+        foreground_weight: Weight of a foreground pixel in the L1 term, > 0. 1 is plain L1.
+        normalize: Divisor of the sums over pixels: ``"both"``, ``"foreground"`` or ``"pixels"``
+            (`gsmap.ops.raster_loss.raster_loss`).
+        window_size: Side of the window of SSIM in pixels, odd.
+        window_sigma: Standard deviation of the window of SSIM in pixels, > 0.
+        full_iou: Smallest soft IoU of a pair with the full loss (`MaskLoss`).
+        flags: Flags of `MapLoss`.
 
     Raises:
         ValueError: If an argument is outside its range.
@@ -83,7 +88,7 @@ class RasterLoss(MaskLoss):
         full_iou: WEIGHT = 0.0,
         **flags: bool,
     ) -> None:
-        super().__init__(loss_weight, full_iou, **flags)
+        super().__init__(loss_weight=loss_weight, full_iou=full_iou, **flags)
         if not 0 <= alpha <= 1:
             raise InputError(f"alpha must lie in [0, 1], got {alpha}.")
         if foreground_weight <= 0:
@@ -102,20 +107,21 @@ class RasterLoss(MaskLoss):
             "window_sigma": window_sigma,
         }
 
-    def per_instance(self, preds: Tensor, targets: Tensor) -> Tensor:
-        """Return one value per instance. 2 x (M, H, W) -> (M,)"""
-        return raster_loss(preds, targets, **self.settings)
+    def values(self, pairs: MatchedPairs) -> Tensor:
+        """Raster loss of each pair. (M,)"""
+        losses = raster_loss(pairs.pred_masks, pairs.gt_masks, **self.settings)
+        return self.reduce_small_overlaps(losses, pairs)
 
 
 @MODELS.register_module()
 class MaskOverlapLoss(MaskLoss):
-    """Dice or IoU loss of the rendered masks of matched instances, in place of Eq. 12.
+    """Dice or IoU loss of the rendered masks of matched instances, an alternative to Eq. 12.
 
     Args:
-        loss_weight: Weight of the loss.
-        kind: ``"dice"`` (`dice_loss`), or ``"iou"``: 1 - sum min / sum max.
-        full_iou: As in `MaskLoss`.
-        flags: As in `MapLoss`.
+        loss_weight: Weight of the loss, or a weight for each class.
+        kind: ``"dice"`` for one minus the dice coefficient, ``"iou"`` for one minus the soft IoU.
+        full_iou: Smallest soft IoU of a pair with the full loss (`MaskLoss`).
+        flags: Flags of `MapLoss`.
 
     Raises:
         ValueError: If ``kind`` is unknown.
@@ -128,13 +134,15 @@ class MaskOverlapLoss(MaskLoss):
         full_iou: WEIGHT = 0.0,
         **flags: bool,
     ) -> None:
-        super().__init__(loss_weight, full_iou, **flags)
+        super().__init__(loss_weight=loss_weight, full_iou=full_iou, **flags)
         if kind not in ("dice", "iou"):
             raise InputError(f"kind must be 'dice' or 'iou', got {kind!r}.")
         self.kind = kind
 
-    def per_instance(self, preds: Tensor, targets: Tensor) -> Tensor:
-        """Return one value per instance. 2 x (M, H, W) -> (M,)"""
+    def values(self, pairs: MatchedPairs) -> Tensor:
+        """Dice or IoU loss of each pair. (M,)"""
         if self.kind == "dice":
-            return dice_loss(preds, targets)
-        return 1 - soft_iou(preds, targets)
+            losses = dice_loss(pairs.pred_masks, pairs.gt_masks)
+        else:
+            losses = 1 - soft_iou(pairs.pred_masks, pairs.gt_masks)
+        return self.reduce_small_overlaps(losses, pairs)

@@ -1,4 +1,4 @@
-"""Masks of map elements for Gaussians: their ground truth, and the gradients that they pass on."""
+"""Masks of map elements for heads with Gaussians."""
 
 import math
 from collections.abc import Sequence
@@ -19,10 +19,11 @@ class GaussianMasks(ElementMasks):
 
     Args:
         grid: Extent of the map.
-        held_classes: Classes whose masks move no point: their losses reach sigma and theta alone.
-        **kwargs: Settings of `ElementMasks`. ``source="gaussians"`` draws as ``"points"`` does, by
-            Gaussians along the points (GSMap Eq. 6). Such a mask has the line's width in mass, so
-            that a prediction can equal it.
+        held_classes: Class indices of elements whose masks have no gradient in the points, only in
+            sigma and theta.
+        kwargs: Settings of `ElementMasks`. ``source="gaussians"`` is like ``"points"``, with
+            Gaussians along the points as masks (GSMap Eq. 6). Their integral across a line is its
+            width, and a prediction can equal such a mask.
     """
 
     sources: ClassVar[tuple[str, ...]] = ("full", "points", "gaussians")
@@ -37,15 +38,26 @@ class GaussianMasks(ElementMasks):
         return {**super().class_settings, "held_classes": self.held_classes}
 
     def draw(self, polylines: Tensor, labels: Tensor, grid: BEVGrid) -> Tensor:
-        """Draw ground truths as bands, filled or by Gaussians. (K, M, 2) -> (K, H, W)"""
+        """Draw map elements as bands, filled polygons or Gaussians.
+
+        Args:
+            polylines: Points in metres. (K, M, 2 or 3)
+            labels: Class indices. (K,)
+            grid: The raster.
+
+        Returns:
+            One mask per element, in [0, 1]. (K, H, W)
+        """
         if self.source != "gaussians":
             return super().draw(polylines, labels, grid)
         across_m = self.line_width_m / math.sqrt(2 * math.pi)
         gaussians = gaussians_along(polylines[..., :2].float(), across_m)
-        return render_gaussians(*gaussians, grid)
+        return render_gaussians(
+            gaussians.means, gaussians.scales, rotations=gaussians.rotations, grid=grid
+        )
 
     def rendered_references(self, references: Tensor, labels: Tensor, coords: int) -> Tensor:
-        """References whose points get no gradient if their class is held.
+        """References for the rendering, whose points have no gradient for ``held_classes``.
 
         Args:
             references: References of the decoder, ``coords`` coordinates first. (M, P, D)

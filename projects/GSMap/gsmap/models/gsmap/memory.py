@@ -1,6 +1,6 @@
-"""Gaussians as memory: moved with their covariance, refined, then fused with what was remembered.
+"""Memory of Gaussians: transformation to the next frame, refinement, and fusion.
 
-This is ours: the published memory of queries hands on points.
+This is not in the paper. The published memory of queries propagates points.
 """
 
 import math
@@ -22,16 +22,18 @@ COVARIANCES = ("points", "moved", "fused")
 
 @MODELS.register_module()
 class GaussianMemory(QueryMemory):
-    """`QueryMemory` of a head with Gaussians. Besides its arguments:
+    """Memory of queries of a head with Gaussians.
 
     Args:
-        covariance: What becomes of the Gaussians that are handed on. ``"points"``: only their
-            centres are, each starts with the Gaussian of a new query. ``"moved"``: they move and
-            turn with the vehicle, and grow by the noise. ``"fused"``: so, and what the decoder has
-            refined is fused with them (`fuse_gaussians`), point by point, in their order.
-        noise_m: How far a remembered Gaussian has drifted after one second, standard deviation in
-            metres; the variance grows with the time.
-        noise_deg: The same for the vehicle's heading, in degrees.
+        embed_dims: Channels C of the queries.
+        covariance: Propagation of the Gaussians. ``"points"`` propagates only the centres, and each
+            query starts with the initial Gaussian. ``"moved"`` transforms the Gaussians with the
+            motion of the vehicle and adds the noise. ``"fused"`` also fuses the refined Gaussians
+            with the transformed ones (`fuse_gaussians`), point by point in their order.
+        noise_m: Standard deviation of the drift of a Gaussian after one second, in metres. The
+            variance grows linearly with time.
+        noise_deg: Standard deviation of the drift of the heading after one second, in degrees.
+        kwargs: Further arguments of `QueryMemory`.
 
     Raises:
         ValueError: If ``covariance`` is unknown, or a noise is negative.
@@ -39,49 +41,69 @@ class GaussianMemory(QueryMemory):
 
     def __init__(
         self,
-        *args: Any,
+        embed_dims: int,
+        *,
         covariance: str = "fused",
         noise_m: float = 0.3,
         noise_deg: float = 1.0,
         **kwargs: Any,
     ) -> None:
-        super().__init__(*args, **kwargs)
+        super().__init__(embed_dims, **kwargs)
         if covariance not in COVARIANCES:
             raise InputError(f"covariance must be one of {COVARIANCES}, got {covariance!r}.")
         if not (noise_m >= 0 and noise_deg >= 0):
             raise InputError(f"noise_m and noise_deg must be >= 0, got {noise_m} and {noise_deg}.")
         self.covariance = covariance
-        self.noise_m, self.noise_rad = noise_m, math.radians(noise_deg)
+        self.noise_m = noise_m
+        self.noise_rad = math.radians(noise_deg)
 
     def check(self, head: FlowHead) -> None:
-        """Raise ValueError also if the head has no Gaussians."""
+        """Raise ValueError if the head has no Gaussians, too few layers or too few queries."""
         require_gaussians(self, head)
         super().check(head)
 
     def transform_references(self, head: FlowHead, references: Tensor, past: Past) -> Tensor:
-        """Transform Gaussians of the previous frame to the current one. (B, K, P, D)"""
+        """Transform Gaussians of the previous frame to the current frame.
+
+        Args:
+            head: The head.
+            references: References of the previous frame. (B, K, P, D)
+            past: Memory of the previous frame, and the motion since.
+
+        Returns:
+            References of the current frame. (B, K, P, D)
+        """
         points = super().transform_references(head, references, past)
         if self.covariance == "points":
-            return torch.cat([points[..., :-3], torch.zeros_like(points[..., -3:])], -1)
+            return torch.cat([points[..., :-3], torch.zeros_like(points[..., -3:])], dim=-1)
         space = require_gaussians(self, head).space
-        spread = past.seconds.sqrt()
+        scale = past.seconds.sqrt()
         with torch.autocast(points.device.type, enabled=False):
             gaussians = move_gaussians(
                 space.decode(references),
-                past.now_from_then,
-                self.noise_m * spread,
-                self.noise_rad * spread,
+                motion=past.now_from_then,
+                drift_m=self.noise_m * scale,
+                drift_rad=self.noise_rad * scale,
             )
             return space.encode(gaussians, points)
 
     def fuse_references(self, refined: Tensor, before: Tensor, head: FlowHead) -> Tensor:
-        """Return refined Gaussians fused with those before, but where these left the map."""
+        """Fuse refined Gaussians with the transformed ones, if their centres are on the map.
+
+        Args:
+            refined: References refined by the decoder. (B, K, P, D)
+            before: Transformed references of the previous frame. (B, K, P, D)
+            head: The head.
+
+        Returns:
+            The fused references. (B, K, P, D)
+        """
         if self.covariance != "fused":
             return refined
         space = require_gaussians(self, head).space
         with torch.autocast(refined.device.type, enabled=False):
             gaussians = fuse_gaussians(space.decode(before), space.decode(refined))
             fused = space.encode(gaussians, refined)
-        # a centre that left the map was put onto its border, where the element need not be
+        # Centres outside of the map have been moved to its border, away from the element.
         inside = (before[..., :2] - 0.5).abs().amax(-1, keepdim=True) < 0.5
         return torch.where(inside, fused, refined)

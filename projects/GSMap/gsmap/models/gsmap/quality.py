@@ -1,4 +1,4 @@
-"""Qualities of matched Gaussians, for class losses with targets of quality."""
+"""Qualities of matched Gaussians, for classification losses with a quality as target."""
 
 from collections.abc import Sequence
 from typing import cast
@@ -16,13 +16,14 @@ from gsmap.structures.gaussians import extents_along_line, line_errors
 
 @MODELS.register_module()
 class ErrorQuality(Quality):
-    r"""Quality by the sigmas of the points' errors: the mean of :math:`\exp(-d^2 / 2 \sigma^2)`.
+    r"""Quality by the predicted uncertainty of points: the mean of :math:`\exp(-d^2 / 2 \sigma^2)`.
 
-    The mean is over the points of an element; d and sigma are across its line, in metres.
+    The mean is over the points of an element, with error d and standard deviation sigma across its
+    line, in metres.
 
     Args:
-        largest_m: Sigmas above this count as this, so that a model cannot raise the quality of a
-            bad line by a large sigma.
+        largest_m: Upper limit of sigma in metres, so that a large sigma cannot raise the quality of
+            an inaccurate line.
     """
 
     def __init__(self, largest_m: float = 1.0) -> None:
@@ -44,7 +45,7 @@ class ErrorQuality(Quality):
 
 @MODELS.register_module()
 class MaskQuality(Quality):
-    """Quality by the soft IoU of the rendered mask with that of the ground truth (AP_raster)."""
+    """Quality by the soft IoU of the rendered mask and the ground-truth mask, as in AP_raster."""
 
     def check(self, head: BuiltHead) -> None:
         """Raise ValueError if the head has no Gaussians."""

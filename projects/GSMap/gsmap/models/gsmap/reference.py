@@ -1,4 +1,4 @@
-"""A Gaussian per query as what the decoder's layers refine (GSMap Eqs. 1, 8)."""
+"""References of Gaussians, one per point, refined by decoder layers (GSMap Eqs. 1, 8)."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -21,15 +21,21 @@ from gsmap.utils.errors import InputError
 
 @MODELS.register_module()
 class GaussianReference(PointReference, AddsWeights):
-    """A Gaussian per query: its centre is the point, sigma and theta follow it (GSMap Eq. 1).
+    """References of Gaussians: the point, which is the centre, then sigma and theta (GSMap Eq. 1).
 
-    What it adds to points starts neutral: every query has the same Gaussian, every layer leaves it.
-    The points may have a height, the Gaussians lie in the plane. Besides `PointReference`'s:
+    At the start of a training all Gaussians are equal, and layers do not change sigma and theta.
+    Points may have a height; the Gaussians lie in the plane.
 
     Args:
-        mlp: Predict sigma and theta by branches like the points' (GSMap Eq. 8) in place of one
-            linear layer each.
-        space: Settings of `GaussianSpace`: ``min_scale_m`` and so on.
+        grid: Extent of the map.
+        embed_dims: Channels C of the point states.
+        num_layers: Number of decoder layers.
+        mlp: Predict sigma and theta by networks like the networks of the points (GSMap Eq. 8)
+            instead of one linear layer each.
+        coords: 2, or 3 for points with height.
+        z_range: Lowest and highest z in metres, for points with height.
+        points_per_state: Number of points n that one query initialises and one state refines.
+        space: Settings of `GaussianSpace`, for example ``min_scale_m``.
     """
 
     space: GaussianSpace
@@ -49,64 +55,117 @@ class GaussianReference(PointReference, AddsWeights):
         points_per_state: int = 1,
         **space: Any,
     ) -> None:
-        super().__init__(grid, embed_dims, num_layers, coords, z_range, points_per_state)
+        super().__init__(
+            grid,
+            embed_dims,
+            num_layers=num_layers,
+            coords=coords,
+            z_range=z_range,
+            points_per_state=points_per_state,
+        )
         self.space = GaussianSpace(grid, **space)
         self.metainfo = {"min_scale_m": self.space.floor_m}
-        self.gaussian_init = nn.Linear(embed_dims, 3 * points_per_state)
-        hidden = [embed_dims, embed_dims] if mlp else []
-        self.gaussian_branches = nn.ModuleList(
-            layers.mlp(embed_dims, *hidden, 3 * points_per_state) for _ in range(num_layers)
-        )
+        entries = 3 * points_per_state
+        self.gaussian_init = nn.Linear(embed_dims, entries)
+        dims = [embed_dims, embed_dims, embed_dims, entries] if mlp else [embed_dims, entries]
+        self.gaussian_branches = nn.ModuleList(layers.mlp(*dims) for _ in range(num_layers))
         self.reset_gaussian_parts()
 
     def init_weights(self) -> None:
-        """Initialise as for points; what the Gaussians add starts neutral."""
+        """Initialise the networks of the points, and of sigma and theta without effect."""
         super().init_weights()
         self.reset_gaussian_parts()
 
     def reset_gaussian_parts(self) -> None:
-        """Let every query start with the same Gaussian, and every layer leave it as it is."""
+        """Initialise equal Gaussians for all queries, and no change by the layers."""
         constant_init(self.gaussian_init, 0.0)
         for branch in self.gaussian_branches:
             *_, last = branch.children()
             constant_init(last, 0.0)
 
     def start(self, query_pos: Tensor) -> Tensor:
-        """Return the Gaussians that the first layer starts from. (..., C) -> (..., D)"""
+        """Initial references, from the positional queries. (..., Q, C) -> (..., Q * n, D)"""
         shapes = self.by_point(self.gaussian_init(query_pos))
-        return torch.cat([super().start(query_pos), shapes], -1)
+        return torch.cat([super().start(query_pos), shapes], dim=-1)
 
     def refine(self, layer: int, point_states: Tensor, reference: Tensor) -> Tensor:
-        """Return the Gaussians after a layer (Eq. 8). (..., C), (..., D) -> (..., D)"""
+        """Refine the Gaussians after a layer (GSMap Eq. 8).
+
+        Args:
+            layer: Index of the layer.
+            point_states: States of the points. (..., Q, C)
+            reference: References of the previous layer. (..., Q * n, D)
+
+        Returns:
+            The refined references. (..., Q * n, D)
+        """
         points = super().refine(layer, point_states, reference[..., : self.coords])
         changes = self.by_point(self.gaussian_branches[layer](point_states))
-        return torch.cat([points, reference[..., self.coords :] + changes], -1)
+        return torch.cat([points, reference[..., self.coords :] + changes], dim=-1)
 
     def transform_references(self, references: Tensor, motion: Tensor) -> Tensor:
-        """Return Gaussians of an earlier frame as they lie now, turned with the vehicle."""
-        moved = super().transform_references(references, motion)
-        turn = torch.atan2(motion[:, 1, 0], motion[:, 0, 0]).to(moved)
-        turn = turn.view(-1, *[1] * (moved.dim() - 1)).expand_as(moved[..., :1])
-        return torch.cat([moved[..., :-1], moved[..., -1:] + turn], -1)
+        """Transform Gaussians of an earlier frame to the current frame, and rotate them.
+
+        Args:
+            references: References of the earlier frame. (B, ..., D)
+            motion: Transform from the earlier to the current frame, in metres. (B, 4, 4)
+
+        Returns:
+            References of the current frame. (B, ..., D)
+        """
+        transformed = super().transform_references(references, motion)
+        rotation = torch.atan2(motion[:, 1, 0], motion[:, 0, 0]).to(transformed)
+        while rotation.dim() < transformed.dim():
+            rotation = rotation[..., None]
+        theta = transformed[..., -1:] + rotation
+        return torch.cat([transformed[..., :-1], theta], dim=-1)
 
     def errors(self, references: Tensor) -> Gaussians:
-        """Return the Gaussians that stand for the points' errors. (..., P, D) -> (..., P)"""
+        """Gaussians of the errors of points, here the rendered ones. (..., P, D) -> (..., P)"""
         return self.space.decode(references)
 
     def decode(self, references: Tensor) -> dict[str, Tensor]:
-        """Add the Gaussians' ``scales`` (N, P, 2) in metres and ``rotations`` (N, P) in radians."""
+        """Decode the points and Gaussians of a sample.
+
+        Args:
+            references: References. (N, P, D)
+
+        Returns:
+            ``pts`` in metres (N, P, coords), ``scales`` in metres (N, P, 2) and ``rotations`` in
+            radians (N, P).
+        """
+        fields = super().decode(references)
         gaussians = self.errors(references)
-        shapes = {"scales": gaussians.scales, "rotations": gaussians.rotations}
-        return super().decode(references) | shapes
+        fields["scales"] = gaussians.scales
+        fields["rotations"] = gaussians.rotations
+        return fields
 
     def render(self, references: Tensor, grid: BEVGrid) -> Tensor:
-        """Render the masks of elements (GSMap Eq. 6). (..., P, D) -> (..., H, W)"""
-        means, scales, rotations = self.space.decode(references)
-        return render_gaussians(means, scales, rotations, grid)
+        """Render the masks of elements (GSMap Eq. 6).
+
+        Args:
+            references: References. (..., P, D)
+            grid: The raster.
+
+        Returns:
+            Masks in [0, 1]. (..., H, W)
+        """
+        gaussians = self.space.decode(references)
+        return render_gaussians(
+            gaussians.means, gaussians.scales, rotations=gaussians.rotations, grid=grid
+        )
 
 
 def require_gaussians(part: Any, head: BuiltHead) -> GaussianReference:
-    """Return a head's Gaussians; ValueError if a part of a model needs them and gets points."""
+    """Reference of a head with Gaussians.
+
+    Args:
+        part: Part of the model that needs Gaussians, for the message.
+        head: The head.
+
+    Raises:
+        ValueError: If the head has points instead of Gaussians.
+    """
     if isinstance(head.reference, GaussianReference):
         return head.reference
     raise InputError(

@@ -1,4 +1,4 @@
-"""Figures of matched Gaussians that are logged beside the losses."""
+"""Statistics of matched Gaussians, for the log."""
 
 from collections.abc import Sequence
 
@@ -19,20 +19,20 @@ def gaussian_statistics(
     class_names: Sequence[str],
     floor_m: float,
 ) -> dict[str, Tensor]:
-    """Summarise matched elements by class; a class without one is left out.
+    """Statistics of the Gaussians of matched predictions, by class.
 
     Args:
         gaussians: Gaussians of the predictions. (M, P)
-        rendered: Their masks in [0, 1]. (M, H, W)
-        masks: Masks of their ground truths in [0, 1]. (M, H, W)
-        labels: Class indices, on the host. (M,)
+        rendered: Masks of the predictions in [0, 1]. (M, H, W)
+        masks: Masks of the ground truths in [0, 1]. (M, H, W)
+        labels: Class indices, on the CPU. (M,)
         class_names: Names of the classes.
         floor_m: Smallest sigma in metres.
 
     Returns:
-        Scalars: per class ``soft_iou/<name>`` (mean), ``sigma_along/<name>`` and
-        ``sigma_across/<name>`` (medians in metres); of all ``at_floor``, the share of Gaussians
-        whose sigmas both lie within 10 % of the smallest.
+        Scalars by name. For each class with pairs: ``soft_iou/<name>`` (mean),
+        ``sigma_along/<name>`` and ``sigma_across/<name>`` (medians in metres). For all pairs:
+        ``at_floor``, the share of Gaussians with both sigmas less than 10 % above the smallest one.
     """
     if not len(labels):
         return {}
@@ -41,10 +41,11 @@ def gaussian_statistics(
     iou = soft_iou(rendered, masks)[order].split(counts)
     extents = extents_along_line(gaussians)[order].split(counts)  # (n, P, 2) of each class
     figures = {}
-    for name, count, own_iou, own_extents in zip(class_names, counts, iou, extents, strict=True):
-        if count:
-            along, across = own_extents.flatten(0, 1).median(0).values
-            figures[f"soft_iou/{name}"] = own_iou.mean()
-            figures[f"sigma_along/{name}"], figures[f"sigma_across/{name}"] = along, across
+    for index, name in enumerate(class_names):
+        if counts[index]:
+            along, across = extents[index].flatten(0, 1).median(0).values
+            figures[f"soft_iou/{name}"] = iou[index].mean()
+            figures[f"sigma_along/{name}"] = along
+            figures[f"sigma_across/{name}"] = across
     at_floor = (gaussians.scales < AT_FLOOR * floor_m).all(-1)
     return {**figures, "at_floor": at_floor.float().mean()}

@@ -1,4 +1,4 @@
-"""How far off a predicted vertex may be: Gaussians of its error, and their loss."""
+"""Uncertainty of predicted points: Gaussians of their errors, and the loss of the Gaussians."""
 
 from typing import Any, cast
 
@@ -20,64 +20,75 @@ from gsmap.structures.gaussians import (
     extents_along_line,
     line_errors,
 )
+from gsmap.structures.grid import BEVGrid
 
 
 @MODELS.register_module()
 class ErrorReference(GaussianReference):
-    """Gaussians that are rendered, and beside them the sigma of each point's error.
+    """Rendered Gaussians, with separate sigmas for the errors of the points.
 
-    Rendering wants Gaussians as wide as a drawn line; an error is smaller near the vehicle and
-    larger far from it. So the sigmas of the error, along and across the line, are two numbers of
-    their own. They follow from a point's state and its Gaussian after each layer, without a
-    gradient into both: what they learn changes no point. `decode` returns them as the Gaussians.
+    Rendered Gaussians are as wide as a drawn line, but errors grow with the distance to the
+    vehicle. A reference therefore has two further entries: sigmas of the error along and across the
+    line. A network predicts them after each layer from the state and the Gaussian of the point,
+    without a gradient in these inputs, so that the loss of the sigmas does not change the points.
+    `decode` returns the Gaussians of the errors.
 
     Args:
-        kwargs: Arguments of `GaussianReference`.
+        grid: Extent of the map.
+        embed_dims: Channels C of the point states.
+        kwargs: Further arguments of `GaussianReference`.
     """
 
     neutral_keys = (*GaussianReference.neutral_keys, "error_branches.")
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.error_space = GaussianSpace(
-            self.grid, min_scale_m=0.05, max_scale_m=20.0, activation="exp"
-        )
+    def __init__(self, grid: BEVGrid, embed_dims: int = 256, **kwargs: Any) -> None:
+        super().__init__(grid, embed_dims, **kwargs)
+        self.error_space = GaussianSpace(grid, min_scale_m=0.05, max_scale_m=20.0, activation="exp")
         self.metainfo = {"min_scale_m": self.error_space.floor_m}
-        channels = self.gaussian_init.in_features
         self.error_branches = nn.ModuleList(
-            layers.mlp(channels + 6, channels, 2) for _ in self.branches
+            layers.mlp(embed_dims + 6, embed_dims, 2) for _ in self.branches
         )
         self.reset_errors()
 
     def init_weights(self) -> None:
-        """Initialise as Gaussians, with errors alike everywhere."""
+        """Initialise the Gaussians, and equal sigmas of all errors."""
         super().init_weights()
         self.reset_errors()
 
     def reset_errors(self) -> None:
-        """Let every error start with the same sigma."""
+        """Initialise equal sigmas of all errors."""
         for branch in self.error_branches:
             constant_init(cast(nn.Sequential, branch)[-1], 0.0)
 
     def start(self, query_pos: Tensor) -> Tensor:
-        """Return the Gaussians that the first layer starts from. (..., C) -> (..., D)"""
+        """Initial references, from the positional queries. (..., Q, C) -> (..., Q * n, D)"""
         start = super().start(query_pos)
         return self._with_errors(start, torch.zeros_like(start[..., :2]))
 
     def refine(self, layer: int, point_states: Tensor, reference: Tensor) -> Tensor:
-        """Return the Gaussians after a layer, and the errors that it says. (..., D) -> (..., D)"""
-        points, gaussians = reference[..., : self.coords], reference[..., -3:]
-        refined = super().refine(layer, point_states, torch.cat([points, gaussians], -1))
+        """Refine the Gaussians after a layer, and predict the sigmas of the errors.
+
+        Args:
+            layer: Index of the layer.
+            point_states: States of the points. (..., Q, C)
+            reference: References of the previous layer. (..., Q * n, D)
+
+        Returns:
+            The refined references. (..., Q * n, D)
+        """
+        points = reference[..., : self.coords]
+        gaussians = reference[..., -3:]
+        refined = super().refine(layer, point_states, torch.cat([points, gaussians], dim=-1))
         states = point_states.repeat_interleave(self.points_per_state, -2)
-        seen = torch.cat([states, self.space.describe(refined)], -1).detach()
-        return self._with_errors(refined, self.error_branches[layer](seen).to(refined))
+        inputs = torch.cat([states, self.space.describe(refined)], dim=-1).detach()
+        return self._with_errors(refined, self.error_branches[layer](inputs).to(refined))
 
     def _with_errors(self, reference: Tensor, errors: Tensor) -> Tensor:
-        """Put the numbers of the errors between point and Gaussian."""
-        return torch.cat([reference[..., :-3], errors, reference[..., -3:]], -1)
+        """Insert the entries of the errors between point and Gaussian."""
+        return torch.cat([reference[..., :-3], errors, reference[..., -3:]], dim=-1)
 
     def errors(self, references: Tensor) -> Gaussians:
-        """Return the Gaussians of the points' errors, along the line. (..., P, D) -> (..., P)"""
+        """Gaussians of the errors of points, oriented along the line. (..., P, D) -> (..., P)"""
         means = self.space.decode(references).means
         scales = self.error_space.scales(references[..., -5:-3])
         return Gaussians(means, scales, angles_of_line(means))
@@ -85,18 +96,19 @@ class ErrorReference(GaussianReference):
 
 @MODELS.register_module()
 class GaussianNLLLoss(MapLoss):
-    """Negative log-likelihood of the points' errors across and along their lines.
+    """Negative log-likelihood of the errors of points along and across their lines.
 
-    Both sigmas are those of the Gaussian in the line's own directions; the mean over points.
+    The sigmas are the standard deviations of the Gaussian along and across the line. The loss is
+    averaged over the points.
 
     Args:
-        loss_weight: Weight of the loss.
-        laplace: Take a Laplace distribution of the same variance in place of a normal one, which
-            large errors pull less.
-        detach_points: Learn the sigmas alone, without a gradient into the points.
-        match_m: Pairs whose points lie farther from the line than this, in metres and on average,
-            are no detections and are left out.
-        flags: As in `MapLoss`.
+        loss_weight: Weight of the loss, or a weight for each class.
+        laplace: Use a Laplace distribution of equal variance instead of a normal one. Large errors
+            have less influence on it.
+        detach_points: Stop the gradient in the points, so that only the sigmas are trained.
+        match_m: Largest mean distance of the points to the line, in metres. Pairs with a larger one
+            are no detections and have the loss 0.
+        flags: Flags of `MapLoss`.
     """
 
     name = "nll"
@@ -109,20 +121,26 @@ class GaussianNLLLoss(MapLoss):
         match_m: float = 1.5,
         **flags: bool,
     ) -> None:
-        super().__init__(loss_weight, **flags)
-        self.laplace, self.detach_points, self.match_m = laplace, detach_points, match_m
+        super().__init__(loss_weight=loss_weight, **flags)
+        self.laplace = laplace
+        self.detach_points = detach_points
+        self.match_m = match_m
 
     def check(self, head: BuiltHead) -> None:
         """Raise ValueError if the head has no Gaussians."""
         require_gaussians(self, head)
 
     def values(self, pairs: MatchedPairs) -> Tensor:
-        """Return the values along and across the line. (M, 2)"""
+        """Negative log-likelihoods along and across the line. (M, 2)"""
         reference = cast(GaussianReference, pairs.predictions.reference)
         gaussians = reference.errors(pairs.pred_references)
         points = gaussians.means.detach() if self.detach_points else gaussians.means
         sigma = extents_along_line(gaussians._replace(means=points))  # (M, P, 2)
         errors = line_errors(points, pairs.gt_pts_m[..., :2])
-        kind = Laplace(0, sigma / 2**0.5, False) if self.laplace else Normal(0, sigma, False)
-        near = errors[..., 1].mean(-1) <= self.match_m
-        return -kind.log_prob(errors).mean(1) * near[:, None]
+        distribution: Laplace | Normal
+        if self.laplace:
+            distribution = Laplace(0, sigma / 2**0.5, validate_args=False)
+        else:
+            distribution = Normal(0, sigma, validate_args=False)
+        is_detection = errors[..., 1].mean(-1) <= self.match_m
+        return -distribution.log_prob(errors).mean(1) * is_detection[:, None]
