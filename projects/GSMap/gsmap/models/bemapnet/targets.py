@@ -39,7 +39,7 @@ class FormatBezierTargets(FormatLineTargets):
         check_curves(self.degrees, self.pieces)
         super().__post_init__()
 
-    def by_class(self) -> tuple[str, Sequence[int]]:
+    def class_setting(self) -> tuple[str, Sequence[int]]:
         """Return the name and the values of the setting with one number for each class."""
         return "degrees", self.degrees
 

@@ -116,7 +116,7 @@ class BEVEncoderLayer(nn.Module):
         partner = query
         if self.released_pairs:
             partner = query.repeat_interleave(2, 0)[: len(query)]  # of samples 0, 0, 1, 1, ...
-        pair = torch.cat([partner, query + query_pos], -1)  # (B, Q, 2 C)
+        pair = torch.cat([partner, query + query_pos], dim=-1)  # (B, Q, 2 C)
         bev = query.transpose(1, 2).unflatten(-1, (grid.height, grid.width))  # (B, C, H, W)
         query = self.norms[0](query + self.self_attn(pair, centres, bev))
         query = self.norms[1](query + self.dropout(self.cross_attn(query, feats, projection)))

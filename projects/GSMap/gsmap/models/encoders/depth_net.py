@@ -47,7 +47,7 @@ def camera_vector(cam2img: Tensor, img_aug_matrix: Tensor, ego_from_cam: Tensor)
     intrinsics = [cam2img[..., 0, 0], cam2img[..., 1, 1], cam2img[..., 0, 2], cam2img[..., 1, 2]]
     augmentation = img_aug_matrix[..., :2, :3].flatten(-2)
     pose = ego_from_cam[..., :3, :].flatten(-2)
-    return torch.cat([torch.stack(intrinsics, -1), augmentation, pose], -1)
+    return torch.cat([torch.stack(intrinsics, -1), augmentation, pose], dim=-1)
 
 
 class SEGate(nn.Module):
@@ -105,7 +105,7 @@ class ASPP(nn.Module):
         for branch in (self.aspp1, self.aspp2, self.aspp3, self.aspp4):
             branches.append(branch(feats))
         branches.append(self.global_avg_pool(feats).expand_as(branches[0]))
-        pyramid = self.conv1(torch.cat(branches, 1))
+        pyramid = self.conv1(torch.cat(branches, dim=1))
         return self.dropout(F.relu(self.bn1(pyramid)))
 
 

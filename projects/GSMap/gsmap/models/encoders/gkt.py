@@ -24,7 +24,7 @@ def kernel_offsets(kernel_size: tuple[int, int]) -> Tensor:
     rows, cols = kernel_size
     dx = torch.arange(cols) - cols // 2
     dy = torch.arange(rows) - rows // 2
-    return torch.stack(torch.meshgrid(dx, dy, indexing="ij"), -1).flatten(0, 1)
+    return torch.stack(torch.meshgrid(dx, dy, indexing="ij"), dim=-1).flatten(0, 1)
 
 
 @MODELS.register_module()

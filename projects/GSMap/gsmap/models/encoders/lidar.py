@@ -114,4 +114,4 @@ class ConvFuser(ConvModule):
         Returns:
             The fused features. (B, out_channels, H, W)
         """
-        return super().forward(torch.cat([camera_feats, lidar_feats], 1))
+        return super().forward(torch.cat([camera_feats, lidar_feats], dim=1))

@@ -48,7 +48,7 @@ def pillar_points(
     y = rows * grid.extent_m[1] + grid.y_range[0]
     z = heights * (z_range[1] - z_range[0]) + z_range[0]
     y, x, z = torch.meshgrid(y, x, z, indexing="ij")
-    return torch.stack([x, y, z, torch.ones_like(x)], -1).flatten(0, 1)
+    return torch.stack([x, y, z, torch.ones_like(x)], dim=-1).flatten(0, 1)
 
 
 def project_pillars(
@@ -100,7 +100,7 @@ def pixel_rays(
     u = torch.linspace(0, image_size[1] - 1, feature_size[1], device=device, dtype=dtype)
     v = torch.linspace(0, image_size[0] - 1, feature_size[0], device=device, dtype=dtype)
     u, v = torch.meshgrid(u, v, indexing="xy")  # (h, w)
-    pixels = torch.stack([u, v, torch.ones_like(u)], -1)
+    pixels = torch.stack([u, v, torch.ones_like(u)], dim=-1)
     return torch.einsum("...ij,hwj->...hwi", frame_from_img[..., :3, :3], pixels)
 
 

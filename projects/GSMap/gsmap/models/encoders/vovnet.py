@@ -75,7 +75,7 @@ class OneShotAggregation(nn.Module):
         outputs = [feats]
         for layer in self.layers:
             outputs.append(layer(outputs[-1]))
-        aggregated = self.concat(torch.cat(outputs, 1))
+        aggregated = self.concat(torch.cat(outputs, dim=1))
         gated = aggregated * self.ese(aggregated.mean((2, 3), keepdim=True))
         if self.residual:
             return gated + feats

@@ -100,7 +100,7 @@ def euclidean_relation_loss(pred: Tensor, target: Tensor, counts: Sequence[int])
         pairs.append(torch.triu_indices(count, count, 1) + first)
         shares += [1 / max(count, 1) ** 2] * pairs[-1].shape[1]
         first += count
-    on_host = [torch.cat(pairs, 1), torch.tensor(shares, dtype=pred.dtype)]
+    on_host = [torch.cat(pairs, dim=1), torch.tensor(shares, dtype=pred.dtype)]
     pair_indices, pair_weights = upload(on_host, pred.device)
     pred_relations = relation_features(pred, pair_indices)
     target_relations = relation_features(target, pair_indices)

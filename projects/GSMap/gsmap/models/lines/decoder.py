@@ -1,4 +1,4 @@
-"""Line-aware decoder: the points of a line attend to the cells of its mask."""
+"""Decoder of lines with masked cross-attention."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -59,9 +59,11 @@ class AttentionLayer(nn.Module):
         else:
             self.attentions = ("self_attn", "cross_attn")
         for name in self.attentions:
-            attention = nn.MultiheadAttention(embed_dims, num_heads, dropout, batch_first=True)
+            attention = nn.MultiheadAttention(
+                embed_dims, num_heads, dropout=dropout, batch_first=True
+            )
             self.add_module(name, attention)
-        self.ffn = feed_forward(embed_dims, ffn_dims, dropout)
+        self.ffn = feed_forward(embed_dims, ffn_dims, dropout=dropout)
         num_norms = len(self.attentions) + 1
         self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in range(num_norms))
         self.dropout = nn.Dropout(dropout)
@@ -102,8 +104,8 @@ class AttentionLayer(nn.Module):
 class PointLineDecoder(BaseModule):
     """Decoder of point queries with masked cross-attention.
 
-    After each layer, classes and masks of the lines are predicted. In the next layer, the points of
-    a line attend to the cells of its mask.
+    Each layer is followed by the prediction of classes and masks of the lines. In the next layer,
+    the points of a line attend to the cells of its mask.
 
     Args:
         queries: Number of lines n, and of points p per line, for every map class.
@@ -111,7 +113,7 @@ class PointLineDecoder(BaseModule):
         num_layers: Number of layers.
         num_heads: Heads of each attention.
         ffn_dims: Hidden channels of the feed-forward networks.
-        line_masks: Restrict cross-attention to the mask of the line, as in the paper.
+        line_masks: Restrict the cross-attention to the mask of the line.
     """
 
     def __init__(
@@ -124,17 +126,20 @@ class PointLineDecoder(BaseModule):
         line_masks: bool = True,
     ) -> None:
         super().__init__()
-        self.queries = [(int(n), int(p)) for n, p in queries]
         self.line_masks = line_masks
         self.num_heads = num_heads
-        self.points_per_class = [n * p for n, p in self.queries]
+        self.queries: list[tuple[int, int]] = []
+        self.points_per_class: list[int] = []
+        for n, p in queries:
+            self.queries.append((int(n), int(p)))
+            self.points_per_class.append(int(n) * int(p))
         total = sum(self.points_per_class)
         self.query = nn.Embedding(total, embed_dims)
         self.query_pos = nn.Embedding(total, embed_dims)
         self.level = nn.Embedding(1, embed_dims)
         self.position = SinePositionalEncoding(embed_dims // 2, normalize=True)
         self.layers = nn.ModuleList(
-            AttentionLayer(embed_dims, num_heads, ffn_dims, memory_first=True)
+            AttentionLayer(embed_dims, num_heads, ffn_dims=ffn_dims, memory_first=True)
             for _ in range(num_layers)
         )
         self.norm = nn.LayerNorm(embed_dims)
@@ -162,7 +167,8 @@ class PointLineDecoder(BaseModule):
         memory = bev.flatten(2).transpose(1, 2) + self.level.weight  # (B, S, C)
         height, width = bev.shape[-2:]
         no_padding = bev.new_zeros((1, height, width))
-        key = memory + self.position(no_padding).flatten(2).transpose(1, 2)
+        cell_position = self.position(no_padding).flatten(2).transpose(1, 2)
+        key = memory + cell_position
         states = self.query.weight.expand(len(bev), -1, -1)  # (B, Q, C)
         outputs = [self.lines(states, bev)]
         for layer in self.layers:
@@ -206,4 +212,4 @@ class PointLineDecoder(BaseModule):
             blocked = class_lines.masks.detach().flatten(2) < 0  # (B, n, S)
             blocked &= ~blocked.all(-1, keepdim=True)
             masks.append(blocked.repeat_interleave(p, 1))
-        return torch.cat(masks, 1)
+        return torch.cat(masks, dim=1)

@@ -16,7 +16,9 @@ def front_size(grid: BEVGrid) -> tuple[int, int]:
 
 
 def turn_raster(feats: Tensor, grid: BEVGrid) -> Tensor:
-    """Convert between row 0 at the smallest y and row 0 at the front, in both directions.
+    """Convert a raster between row 0 at the smallest y and row 0 at the front.
+
+    The conversion is its inverse.
 
     Args:
         feats: Raster. (..., H, W)
@@ -42,7 +44,7 @@ def centres(shapes: Sequence[tuple[int, int]], device: torch.device) -> Tensor:
     """
     points = []
     for height, width in shapes:
-        grid = BEVGrid((0.0, 1.0), (0.0, 1.0), height=height, width=width)
+        grid = BEVGrid(x_range=(0.0, 1.0), y_range=(0.0, 1.0), height=height, width=width)
         points.append(grid.pixel_centres(device).flatten(0, 1))
     return torch.cat(points)
 
@@ -51,5 +53,5 @@ def ahead(points: Tensor, grid: BEVGrid) -> Tensor:
     """Convert points (x, y) to distances ahead and to the left, in metres. (..., 2)"""
     x, y = points.unbind(-1)
     if grid.forward == "y":
-        return torch.stack([y, -x], -1)
-    return torch.stack([x, y], -1)
+        return torch.stack([y, -x], dim=-1)
+    return torch.stack([x, y], dim=-1)

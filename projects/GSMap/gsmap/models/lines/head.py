@@ -1,18 +1,17 @@
-"""Base class of heads with separate line queries for each map class: scores, masks, losses."""
+"""Base class of heads with separate line queries for each map class."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
-from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
 from mmengine.structures import InstanceData
 from torch import Tensor, nn
 
 from gsmap.models.base.coder import DetectionHead, MapCoder, Samples, Tensors
 from gsmap.models.base.layers import resize_map
-from gsmap.models.base.parts import PARTS
+from gsmap.models.base.parts import PARTS, build_part
 from gsmap.models.lines.front import front_size, turn_raster
 from gsmap.models.lines.losses import LINE, Case, LineLosses
 from gsmap.structures.grid import BEVGrid
@@ -29,7 +28,8 @@ class LinePredictions(NamedTuple):
     Attributes:
         scores: Logits of the classes, -inf except for the class of the query. (B, N, classes)
         references: Points of each line. (B, N, P, D)
-        lines: For every class a NamedTuple of tensors (B, n, ...), with ``logits`` and ``masks``.
+        lines: Lines of every class, a NamedTuple of tensors (B, n, ...) with ``logits`` and
+            ``masks``.
     """
 
     scores: Tensor
@@ -44,18 +44,18 @@ def class_scores(logits: Sequence[Tensor]) -> Tensor:
         logits: Logits of a line and of no line, for every class. (B, n, 2) each
 
     Returns:
-        Their difference at the class of a query, -inf elsewhere. (B, N, classes)
+        Differences of the two logits at the class of each query, -inf elsewhere. (B, N, classes)
     """
     scores = []
     for label, class_logits in enumerate(logits):
         score = class_logits[..., LINE, None] - class_logits[..., 1 - LINE, None]
         padding = (label, len(logits) - 1 - label)
         scores.append(F.pad(score, padding, value=-torch.inf))
-    return torch.cat(scores, 1)
+    return torch.cat(scores, dim=1)
 
 
 class LineHead(DetectionHead):
-    """Head of lines with masks, where every class has its queries.
+    """Head of lines with masks, with separate queries for each class.
 
     Args:
         grid: Extent of the map.
@@ -63,9 +63,9 @@ class LineHead(DetectionHead):
         numbers: Number of lines of each class.
         decoder: Settings of `PointLineDecoder`.
         losses: Losses of one class.
-        mask_pixel_m: Side of a pixel of the training masks in metres; also for the targets.
-        score_threshold: Lines of at most this score are dropped. With 0.5, a line remains if it is
-            more likely than no line.
+        mask_pixel_m: Side of a pixel of the training masks in metres, also of the targets.
+        score_threshold: Detections need a higher score. With 0.5, a line must be more likely than
+            no line.
         embed_dims: Channels C.
         hidden_dims: Hidden channels of the network of map coordinates.
         point_dims: Channels of each coordinate of a point.
@@ -102,8 +102,7 @@ class LineHead(DetectionHead):
         self.losses = losses
         self.mask_size = front_size(grid.rasterized(mask_pixel_m))
         self.point_dims = point_dims
-        settings = {"type": "PointLineDecoder", "embed_dims": embed_dims}
-        self.decoder = MODELS.build(settings | decoder)
+        self.decoder = build_part(decoder, type="PointLineDecoder", embed_dims=embed_dims)
         num_layers = len(self.decoder.layers)
         if not 0 < num_layers <= len(LAYER_WEIGHTS):
             raise InputError(
@@ -111,20 +110,28 @@ class LineHead(DetectionHead):
                 f"losses, got {num_layers}."
             )
         self.layer_weights = LAYER_WEIGHTS[-num_layers:]
-        self.coder = MapCoder(grid, sum(numbers), None, score_threshold)
-        self.semantic_branches = nn.ModuleList(nn.Conv2d(embed_dims, 2, 1) for _ in classes)
+        self.coder = MapCoder(
+            grid, max_num=sum(numbers), margin_m=None, score_threshold=score_threshold
+        )
+        self.semantic_branches = nn.ModuleList()
+        for _ in classes:
+            self.semantic_branches.append(nn.Conv2d(embed_dims, 2, kernel_size=1))
         self.coordinates = nn.Sequential(
-            nn.Conv2d(2, hidden_dims, 1),
+            nn.Conv2d(2, hidden_dims, kernel_size=1),
             nn.ReLU(),
-            nn.Conv2d(hidden_dims, hidden_dims, 1),
+            nn.Conv2d(hidden_dims, hidden_dims, kernel_size=1),
             nn.ReLU(),
-            nn.Conv2d(hidden_dims, point_dims, 1),
+            nn.Conv2d(hidden_dims, point_dims, kernel_size=1),
         )
         self._cache: tuple[Any, Tensor] | None = None  # versions of the weights, and the feature
 
     @classmethod
     def target_settings(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """Settings of the transform that follow from the settings of the head."""
+        """Settings of the transform of targets that follow from the settings of the head.
+
+        Args:
+            settings: Settings of the head.
+        """
         return {"pixel_m": settings["mask_pixel_m"]}
 
     def forward(self, bev_outputs: Tensors) -> list[LinePredictions]:
@@ -183,13 +190,20 @@ class LineHead(DetectionHead):
         tokens = [str(sample.metainfo.get("token")) for sample in batch_data_samples]
         with torch.autocast(feats.device.type, enabled=False):
             truths = [self.truth(sample) for sample in batch_data_samples]
-            losses, _ = self.line_losses(outputs, truths, tokens)
-            levels = [self.class_masks(level) for level in bev_outputs.get("bev_levels", [feats])]
-            losses["semantic"] = self.semantic_loss(levels, truths)
-        return {f"loss_{name}": value for name, value in losses.items()}
+            line_losses, _ = self.line_losses(outputs, truths, tokens=tokens)
+            mask_levels = []
+            for level in bev_outputs.get("bev_levels", [feats]):
+                mask_levels.append(self.class_masks(level))
+            semantic_loss = self.semantic_loss(mask_levels, truths)
+        losses = {f"loss_{name}": value for name, value in line_losses.items()}
+        losses["loss_semantic"] = semantic_loss
+        return losses
 
     def line_targets(self, sample: Det3DDataSample) -> InstanceData:
-        """Annotated lines of a sample.
+        """Targets of a sample.
+
+        Args:
+            sample: Sample with the targets of the transform.
 
         Raises:
             ValueError: If the targets are of another transform or mask size.
@@ -210,11 +224,11 @@ class LineHead(DetectionHead):
         return instances
 
     def truth(self, sample: Det3DDataSample) -> list[Any]:
-        """Annotated lines of a sample for every class, see `annotated`."""
+        """Annotated lines of a sample for every class, from its `line_targets`."""
         raise NotImplementedError
 
     def cases(self, lines: Any, truths: Sequence[Any], tokens: Sequence[str]) -> Iterator[Case]:
-        """Pair the lines of a class with the annotated ones, sample by sample.
+        """Yield the predicted and annotated lines of a class, sample by sample.
 
         Args:
             lines: Lines of one layer and class, a NamedTuple of tensors (B, n, ...).
@@ -222,9 +236,10 @@ class LineHead(DetectionHead):
             tokens: Token of each sample.
         """
         lines = lines._replace(masks=self.resize_masks(lines.masks))
-        distances = self.losses.distances(lines.masks, [truth.masks for truth in truths])
+        truth_masks = [truth.masks for truth in truths]
+        distances = self.losses.distances(lines.masks, truth_masks)
         for index, token in enumerate(tokens):
-            sample_lines = lines._make([values[index] for values in lines])
+            sample_lines = lines._make(values[index] for values in lines)
             yield Case(sample_lines, truth=truths[index], apart=distances[index], token=token)
 
     def semantic_loss(self, levels: Sequence[Tensor], truths: Sequence[Sequence[Any]]) -> Tensor:
@@ -245,7 +260,9 @@ class LineHead(DetectionHead):
             )
         targets = []
         for label in range(len(self.classes)):
-            masks = [truth[label].masks.sum(0).clamp(max=1) for truth in truths]
+            masks = []
+            for truth in truths:
+                masks.append(truth[label].masks.sum(0).clamp(max=1))
             targets.append(torch.stack(masks))  # (B, H, W)
         terms = []
         for weight, level in zip(self.level_weights[-len(levels) :], levels, strict=True):
@@ -270,14 +287,16 @@ class LineHead(DetectionHead):
             Losses by name; and the matches of each layer and class, with one entry per sample.
         """
         groups: list[list[Case]] = []
+        cases: list[Case] = []  # of all groups
         weights: list[float] = []
         num_groups = len(outputs) * len(self.classes)
         for layer, layer_weight in zip(outputs, self.layer_weights, strict=True):
             for label, lines in enumerate(layer.lines):
                 class_truths = [truth[label] for truth in truths]
-                groups.append(list(self.cases(lines, class_truths, tokens)))
+                groups.append(list(self.cases(lines, class_truths, tokens=tokens)))
+                cases.extend(groups[-1])
                 weights.append(layer_weight / num_groups)
-        all_matches = self.losses.match([case for group in groups for case in group])
+        all_matches = self.losses.match(cases)
         totals: Tensors = {}
         matches = []
         for weight, group in zip(weights, groups, strict=True):
@@ -291,14 +310,14 @@ class LineHead(DetectionHead):
     def class_masks(self, bev_feats: Tensor) -> Tensor:
         """Logits of the class masks. (B, C, H, W) -> (B, classes, rows, columns)"""
         front = self.front(bev_feats)
-        # Each class has two channels, of which the released code trains the second only.
+        # Each class has two channels. The released code trains only the second one.
         logits = [branch(front)[:, 1:] for branch in self.semantic_branches]
-        return self.resize_masks(torch.cat(logits, 1))
+        return self.resize_masks(torch.cat(logits, dim=1))
 
     def front(self, bev_feats: Tensor) -> Tensor:
         """BEV features with row 0 at the front, the input of the decoder. (B, C, H, W)"""
         return turn_raster(bev_feats, self.grid)
 
     def resize_masks(self, masks: Tensor) -> Tensor:
-        """Enlarge masks to the size of the targets. (B, n, h, w) -> (B, n, H, W)"""
+        """Resize masks to the size of the targets. (B, n, h, w) -> (B, n, H, W)"""
         return resize_map(masks.float(), self.mask_size)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gsmap.structures.tensors import constant, upload
 
-LINE = 0  # index of the logit of a line; the other logit is that of no line
+LINE = 0  # index of the logit of a line; the other logit stands for no line
 
 
 class Case(NamedTuple):
@@ -87,21 +87,24 @@ class LineLosses:
         Raises:
             FloatingPointError: If a cost is not a number.
         """
-        costs_by_case = [self.costs(case) for case in cases]
-        shapes: list[torch.Size] = []
+        costs_by_case = []
         values: list[Tensor] = []
-        for costs in costs_by_case:
-            shapes += [cost.shape for cost in costs]
-            values += [cost.flatten() for cost in costs]
+        sizes: list[int] = []
+        for case in cases:
+            costs = self.costs(case)
+            costs_by_case.append(costs)
+            for cost in costs:
+                values.append(cost.flatten())
+                sizes.append(cost.numel())
         flat = torch.cat(values)
-        chunks = flat.cpu().split([value.numel() for value in values])
-        on_cpu = [chunk.view(shape) for chunk, shape in zip(chunks, shapes, strict=True)]
+        host_values = iter(flat.cpu().split(sizes))
         matches = []
         for case, costs in zip(cases, costs_by_case, strict=True):
-            case_costs = on_cpu[: len(costs)]
-            on_cpu = on_cpu[len(costs) :]
-            matches.append(self.pairs(case, case_costs))
-        return _uploaded_tuples(matches, flat.device)
+            host_costs = []
+            for cost in costs:
+                host_costs.append(next(host_values).view(cost.shape))
+            matches.append(self.pairs(case, host_costs))
+        return _upload_tuples(matches, flat.device)
 
     def costs(self, case: Case) -> tuple[Tensor, ...]:
         """Costs of the matching of a case, of any shapes, on the device."""
@@ -112,7 +115,7 @@ class LineLosses:
 
         Args:
             case: Lines of one class in one sample.
-            costs: The result of `costs`, on the CPU.
+            costs: Result of the method `costs`, on the CPU.
 
         Returns:
             A NamedTuple of tensors on the CPU.
@@ -124,7 +127,7 @@ class LineLosses:
 
         Args:
             cases: Lines of the class in each sample.
-            matches: The result of `match`.
+            matches: Result of `match`.
         """
         raise NotImplementedError
 
@@ -147,17 +150,18 @@ class LineLosses:
             case_labels[matched_rows] = LINE
             labels.append(case_labels)
         weights = constant(logits, [1.0, self.none_weight])
-        return self.cls * F.cross_entropy(logits, torch.cat(labels), weights)
+        return self.cls * F.cross_entropy(logits, torch.cat(labels), weight=weights)
 
 
-def _uploaded_tuples(tuples: Sequence[Any], device: torch.device) -> list[Any]:
+def _upload_tuples(tuples: Sequence[Any], device: torch.device) -> list[Any]:
     """Copy NamedTuples of tensors to a device at once."""
-    tensors = [tensor for fields in tuples for tensor in fields]
-    on_device = upload(tensors, device)
+    tensors: list[Tensor] = []
+    for fields in tuples:
+        tensors.extend(fields)
+    copies = iter(upload(tensors, device))
     result = []
     for fields in tuples:
-        result.append(fields._make(on_device[: len(fields)]))
-        on_device = on_device[len(fields) :]
+        result.append(fields._make(next(copies) for _ in fields))
     return result
 
 

@@ -23,9 +23,9 @@ Part = tuple[int, Points]  # class index, and a line (u, v) in [0, 1] from the f
 
 
 def direct_line(line: Points, tolerance: float, sort_rings: bool = False) -> Points:
-    """Order a line from its rear end to its front end.
+    """Order the points of a line from its rear end to its front end.
 
-    If both ends are level, the line starts at the right one.
+    If the ends are level, the line starts at the right end.
 
     Args:
         line: Points (u, v) from the front and from the left. (n, 2)
@@ -36,7 +36,8 @@ def direct_line(line: Points, tolerance: float, sort_rings: bool = False) -> Poi
         The ordered points. (n, 2)
     """
     if sort_rings and is_closed(line):
-        ring = np.roll(line[:-1], -int(line[:-1, 0].argmax()), 0)
+        rearmost = int(line[:-1, 0].argmax())
+        ring = np.roll(line[:-1], -rearmost, axis=0)
         ring = np.concatenate([ring, ring[:1]])
         areas = ring[:-1, 1] * ring[1:, 0] - ring[1:, 1] * ring[:-1, 0]  # with u downwards
         return ring if areas.sum() > 0 else ring[::-1]
@@ -63,23 +64,29 @@ def draw_lines(
     masks = []
     for line in lines:
         cells = (line * size)[:, ::-1].astype(np.int32)
-        mask = cv2.polylines(np.zeros(size, np.uint8), [cells], False, (1,), thickness_px)
+        canvas = np.zeros(size, dtype=np.uint8)
+        mask = cv2.polylines(canvas, [cells], isClosed=False, color=(1,), thickness=thickness_px)
         masks.append(mask.astype(bool))
-    return np.array(masks).reshape(-1, *size).astype(bool)
+    rows, columns = size
+    return np.array(masks).reshape(-1, rows, columns).astype(bool)
 
 
 @dataclass(eq=False)
 class FormatLineTargets(BaseTransform):
-    """Transform that computes the targets of a `LineHead`: key points of each line, and its mask.
+    """Transform that makes the targets of a `LineHead`: key points and a mask of each line.
 
-    It sets ``gt_instances_3d`` with ``labels_3d`` (K,); ``pts`` (K, P, 2) in metres, where the last
-    point is repeated; their number ``num_pts`` (K,); ``masks`` (K, H, W), with rows from the front
-    and columns from the left; and ``redrawn`` (K,): whether the mask was drawn from the key points,
-    because other lines of the class cover a line completely.
+    It sets ``gt_instances_3d`` with the fields
+
+    - ``labels_3d``: Class indices. (K,)
+    - ``pts``: Key points in metres, padded with the last one. (K, P, 2)
+    - ``num_pts``: Number of key points. (K,)
+    - ``masks``: Masks with rows from the front and columns from the left. (K, H, W)
+    - ``redrawn``: True if the mask was drawn from the key points, because other lines of the class
+      cover a line completely. (K,)
 
     Args:
         edge_classes: Indices of classes whose rings are replaced by their two longest edges.
-        pixel_m: Side of a pixel of the masks in metres; a config sets it in the head.
+        pixel_m: Side of a pixel of the masks in metres. In configs it is set in the head.
         thickness_px: Width of the lines in the masks in pixels.
         step_m: Distance of the samples of a line, from which its key points are computed.
         sort_rings: Let rings start at their rearmost vertex and run clockwise. Otherwise they keep
@@ -97,15 +104,16 @@ class FormatLineTargets(BaseTransform):
 
     def __post_init__(self) -> None:
         check_positive(pixel_m=self.pixel_m, thickness_px=self.thickness_px, step_m=self.step_m)
-        name, numbers = self.by_class()
-        if not set(self.edge_classes) <= set(range(len(numbers))):
+        name, numbers = self.class_setting()
+        num_classes = len(numbers)
+        if any(index not in range(num_classes) for index in self.edge_classes):
             raise InputError(
-                f"edge_classes must be indices of the {len(numbers)} classes of {name}, got "
+                f"edge_classes must be indices of the {num_classes} classes of {name}, got "
                 f"{self.edge_classes}."
             )
 
-    def by_class(self) -> tuple[str, Sequence[int]]:
-        """Name and value of the setting with a number for each class."""
+    def class_setting(self) -> tuple[str, Sequence[int]]:
+        """Name and value of the setting that has a number for each class."""
         raise NotImplementedError
 
     def most(self) -> int:
@@ -126,31 +134,39 @@ class FormatLineTargets(BaseTransform):
         raise NotImplementedError
 
     def way(self, points: Points, label: int) -> Points:
-        """Polyline through the key points of a line, in [0, 1]."""
+        """Polyline through the key points of a line.
+
+        Args:
+            points: Key points in [0, 1]. (m, 2)
+            label: Index of the class.
+
+        Returns:
+            Points of the polyline in [0, 1]. (n, 2)
+        """
         return points
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Add the targets to a sample.
 
         Raises:
-            ValueError: If there is no ground truth, or the setting of `by_class` lacks a class.
+            ValueError: If there is no ground truth, or `class_setting` has no value for a class.
         """
         parts, grid = self.collect_parts(results)
         labels = []
-        points = []
+        counts = []
         points_m = []
         ways = []
         for label, line in parts:
             key_points = self.points(line, label, grid)
             labels.append(label)
-            points.append(key_points)
+            counts.append(len(key_points))
             points_m.append(grid.metres_from_front(key_points))
             ways.append(self.way(key_points, label))
         masks, redrawn = self.masks(parts, pivots=ways, size=front_size(grid))
         results["gt_instances_3d"] = InstanceData(
             labels_3d=torch.tensor(labels, dtype=torch.int64),
             pts=torch.from_numpy(pad_lines(points_m, self.most())).float(),
-            num_pts=torch.tensor([len(key_points) for key_points in points], dtype=torch.int64),
+            num_pts=torch.tensor(counts, dtype=torch.int64),
             masks=torch.from_numpy(masks),
             redrawn=torch.from_numpy(redrawn),
         )
@@ -158,6 +174,9 @@ class FormatLineTargets(BaseTransform):
 
     def collect_parts(self, results: dict[str, Any]) -> tuple[list[Part], BEVGrid]:
         """Parts of the annotated lines, ordered by class, and the raster of the masks.
+
+        Args:
+            results: Sample with ``x_range``, ``y_range`` and the ground truth.
 
         Raises:
             ValueError: If there is no ground truth.
@@ -171,34 +190,43 @@ class FormatLineTargets(BaseTransform):
         return parts, grid
 
     def lines(self, element: Any, grid: BEVGrid) -> list[Points]:
-        """Parts of an element within the map, in [0, 1] from the front and the left.
+        """Parts of an element within the map.
+
+        Args:
+            element: Map element, with ``label`` and ``points`` in metres (n, 2 or 3).
+            grid: Raster of the masks.
+
+        Returns:
+            Points (u, v) in [0, 1] from the front and the left. (m, 2) each
 
         Raises:
-            ValueError: If the setting of `by_class` lacks the class of the element.
+            ValueError: If `class_setting` has no value for the class of the element.
         """
-        name, numbers = self.by_class()
+        name, numbers = self.class_setting()
         if not 0 <= element.label < len(numbers):
             raise InputError(
                 f"label {element.label} of an element, but {name} of "
                 f"{type(self).__name__} is {numbers}: give one for each class."
             )
-        whole = element.points[:, :2].astype(np.float64)
-        lines = [whole]
-        if is_closed(whole) and element.label in self.edge_classes:
-            longest = np.argsort(np.linalg.norm(np.diff(whole, axis=0), axis=1), kind="stable")[-2:]
-            lines = [whole[i : i + 2] for i in longest]
+        points_m = element.points[:, :2].astype(np.float64)
+        lines = [points_m]
+        if is_closed(points_m) and element.label in self.edge_classes:
+            lengths_m = np.linalg.norm(np.diff(points_m, axis=0), axis=1)
+            longest_edges = np.argsort(lengths_m, kind="stable")[-2:]
+            lines = [points_m[start : start + 2] for start in longest_edges]
         parts = []
         for line in lines:
             samples = points_at_steps(line, self.step_m)
             if self.sort_rings and is_closed(line):
                 samples = np.concatenate([samples, line[:1]])
-            parts += parts_inside(samples, grid.x_range, grid.y_range)
-        return [grid.front_from_metres(part) for part in parts]
+            for part_m in parts_inside(samples, x_range=grid.x_range, y_range=grid.y_range):
+                parts.append(grid.front_from_metres(part_m))
+        return parts
 
     def masks(
         self, parts: Sequence[Part], pivots: Iterable[Points], size: tuple[int, int]
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Draw the masks; within a class, later lines cover earlier ones.
+        """Draw the masks. Within a class, later lines cover earlier ones.
 
         If a line is covered completely, all lines of its class are drawn from their key points.
 
@@ -208,14 +236,19 @@ class FormatLineTargets(BaseTransform):
             size: Rows H and columns W of the masks.
 
         Returns:
-            Masks (K, H, W), and whether a mask was drawn from key points (K,).
+            Masks (K, H, W), and True for the masks that were drawn from key points (K,).
         """
-        labels = np.array([label for label, _ in parts], int)
-        lines = [line for _, line in parts]
-        masks = draw_lines(lines, size, self.thickness_px)
+        part_labels = []
+        lines = []
+        for label, line in parts:
+            part_labels.append(label)
+            lines.append(line)
+        labels = np.array(part_labels, dtype=int)
+        masks = draw_lines(lines, size, thickness_px=self.thickness_px)
         for index, mask in enumerate(masks):
             earlier_of_class = labels[:index] == labels[index]
             masks[:index][earlier_of_class] &= ~mask
-        hidden = np.isin(labels, labels[~masks.any((1, 2))])
-        masks[hidden] = draw_lines(pivots, size, self.thickness_px)[hidden]
-        return masks, hidden
+        is_empty = ~masks.any(axis=(1, 2))
+        redrawn = np.isin(labels, labels[is_empty])
+        masks[redrawn] = draw_lines(pivots, size, thickness_px=self.thickness_px)[redrawn]
+        return masks, redrawn

@@ -29,7 +29,7 @@ def sine_code(points: Tensor, channels: int) -> Tensor:
     half = channels // 2
     steps = 10000.0 ** (torch.arange(0, half, 2, device=points.device) / half)
     phases = 2 * math.pi * points.flip(-1)[..., None] / steps  # (..., 2, C / 4)
-    return torch.stack([phases.sin(), phases.cos()], -1).flatten(-3)
+    return torch.stack([phases.sin(), phases.cos()], dim=-1).flatten(-3)
 
 
 class Gather(nn.Sequential):

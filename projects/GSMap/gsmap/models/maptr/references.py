@@ -40,7 +40,7 @@ def refine_reference(reference: Tensor, offsets: Tensor, coords: int = 2) -> Ten
     points = (inner.logit() + offsets[..., :coords]).sigmoid()
     if reference.shape[-1] == coords:
         return points
-    return torch.cat([points, reference[..., coords:] + offsets[..., coords:]], -1)
+    return torch.cat([points, reference[..., coords:] + offsets[..., coords:]], dim=-1)
 
 
 @MODELS.register_module()
@@ -135,7 +135,7 @@ class PointReference(nn.Module, RefinedReference):
         if self.z_range is None:
             return points
         low, high = self.z_range
-        return torch.cat([points[..., :2], low + (high - low) * points[..., 2:]], -1)
+        return torch.cat([points[..., :2], low + (high - low) * points[..., 2:]], dim=-1)
 
     def norm(self, points_m: Tensor) -> Tensor:
         """Normalise points in metres to [0, 1]; the inverse of :meth:`metres`.
@@ -161,7 +161,7 @@ class PointReference(nn.Module, RefinedReference):
             return points
         low, high = self.z_range
         height = (points[..., 2:].clamp(low, high) - low) / (high - low)
-        return torch.cat([points[..., :2], height], -1)
+        return torch.cat([points[..., :2], height], dim=-1)
 
     def transform_references(self, references: Tensor, motion: Tensor) -> Tensor:
         """Transform references of an earlier frame to the current frame.
@@ -174,7 +174,7 @@ class PointReference(nn.Module, RefinedReference):
             References of the current frame. (B, ..., D)
         """
         points = self.transform_points(references[..., : self.coords], motion)
-        return torch.cat([points, references[..., self.coords :]], -1)
+        return torch.cat([points, references[..., self.coords :]], dim=-1)
 
     def transform_points(self, points: Tensor, motion: Tensor) -> Tensor:
         """Transform normalised points and clamp them to the map.

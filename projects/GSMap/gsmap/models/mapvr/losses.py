@@ -76,7 +76,7 @@ class ElementRenderer:
             Masks in [0, 1]. (n, H, W)
         """
         height, width = self.size
-        pixels = torch.stack([points[..., 0] * width, points[..., 1] * height], -1)
+        pixels = torch.stack([points[..., 0] * width, points[..., 1] * height], dim=-1)
         return soft_rasters(
             pixels,
             height=height,

@@ -80,7 +80,7 @@ class FormatPivotTargets(FormatLineTargets):
             raise InputError(f"num_points must be >= 2 for each class, got {self.num_points}.")
         super().__post_init__()
 
-    def by_class(self) -> tuple[str, Sequence[int]]:
+    def class_setting(self) -> tuple[str, Sequence[int]]:
         """Return the name and the values of the setting with one number for each class."""
         return "num_points", self.num_points
 

@@ -91,7 +91,7 @@ class BEVMemory(nn.Module, AddsWeights):
         low_y, high_y = self.grid.y_range
         x = torch.linspace(low_x, high_x, width, dtype=torch.float64)
         y = torch.linspace(low_y, high_y, height, dtype=torch.float64)
-        return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
+        return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
 
     def source_locations(self, motion: Tensor, height: int, width: int) -> Tensor:
         """Sampling locations of the cells in the features of the previous frame.
@@ -147,12 +147,12 @@ class BEVMemory(nn.Module, AddsWeights):
         if memory is not None:
             warped = self.warp(memory.to(feats), past.then_from_now)
             if self.kept_dims is not None:
-                warped = torch.cat([warped, hidden[:, self.kept_dims :]], 1)
+                warped = torch.cat([warped, hidden[:, self.kept_dims :]], dim=1)
             hidden = torch.where(past.continues.view(-1, 1, 1, 1), warped, hidden)
-        both = torch.cat([hidden, feats], 1)
+        both = torch.cat([hidden, feats], dim=1)
         update = self.convz(both).sigmoid()
         reset = self.convr(both).sigmoid()
-        candidate = self.convq(torch.cat([reset * hidden, feats], 1))
+        candidate = self.convq(torch.cat([reset * hidden, feats], dim=1))
         fused = torch.lerp(hidden, candidate, update)
         return self.ln(fused.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 

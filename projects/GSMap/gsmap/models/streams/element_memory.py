@@ -110,7 +110,7 @@ class ElementMemory:
         )
         means = gaussians.means.index_put((is_confident,), new.means)
         result = detections.clone()
-        result.pts = torch.cat([means, detections.pts[..., 2:]], -1)
+        result.pts = torch.cat([means, detections.pts[..., 2:]], dim=-1)
         result.scales = gaussians.scales.index_put((is_confident,), new.scales)
         result.rotations = gaussians.rotations.index_put((is_confident,), new.rotations)
         return result

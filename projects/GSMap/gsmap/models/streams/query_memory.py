@@ -86,7 +86,7 @@ class QueryMemory(BaseModule, AddsWeights):
         while code.dim() < states.dim():
             code = code.unsqueeze(1)
         code = code.expand(*states.shape[:-1], -1)
-        return states + self.fc(torch.cat([states, code], -1))
+        return states + self.fc(torch.cat([states, code], dim=-1))
 
     def transform_references(self, head: FlowHead, references: Tensor, past: Past) -> Tensor:
         """Transform references of the previous frame to the current frame.
@@ -166,7 +166,7 @@ class Propagation(FlowHook):
         propagated = instances[:, : self.memory.num]
         fused = self.memory.fuse_references(propagated, self.propagated.reference, head)
         propagated = torch.where(self.past.continues.view(-1, 1, 1, 1), fused, propagated)
-        return torch.cat([propagated, instances[:, self.memory.num :]], 1).flatten(1, 2)
+        return torch.cat([propagated, instances[:, self.memory.num :]], dim=1).flatten(1, 2)
 
     def between(self, head: FlowHead, layer: int, queries: Queries) -> Queries:
         """Insert the memory after the first layer, and store the output of the last layer.
@@ -207,7 +207,7 @@ class Propagation(FlowHook):
         merged: list[Any] = []
         for leaf, propagated in zip(leaves, propagated_leaves, strict=True):
             if isinstance(leaf, Tensor):
-                leaf = torch.cat([propagated.to(leaf.dtype), by_instance(leaf, total)], 1)
+                leaf = torch.cat([propagated.to(leaf.dtype), by_instance(leaf, total)], dim=1)
                 leaf = pick(leaf, order).flatten(1, 2)
             merged.append(leaf)
         return tree_unflatten(merged, form)
@@ -227,10 +227,10 @@ class Propagation(FlowHook):
         survivors = scores.topk(group_size - num).indices + num
         propagated = torch.arange(num, device=scores.device).expand(len(scores), -1)
         unchanged = torch.arange(num, num + group_size, device=scores.device)
-        replaced = torch.cat([propagated, survivors], 1)
+        replaced = torch.cat([propagated, survivors], dim=1)
         order = torch.where(self.past.continues[:, None], replaced, unchanged)
         further = torch.arange(num + group_size, num + total, device=scores.device)
-        return torch.cat([order, further.expand(len(scores), -1)], 1)
+        return torch.cat([order, further.expand(len(scores), -1)], dim=1)
 
     def transform_queries(self, head: FlowHead, queries: Queries) -> Queries:
         """Transform states and references of the previous frame to the current frame."""
