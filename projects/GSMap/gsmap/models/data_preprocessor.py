@@ -1,6 +1,6 @@
-"""Data preprocessor: from packed samples to the inputs of the detector, a batch at once."""
+"""Data preprocessor: conversion of packed samples to a batch of inputs of the detector."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -17,19 +17,22 @@ from gsmap.structures.tensors import upload
 class MapDataPreprocessor(Det3DDataPreprocessor):
     """`Det3DDataPreprocessor` of mmdet3d for samples of several cameras.
 
-    Arguments and results are those of the base class. All tensors of a batch are copied to a GPU
-    without synchronisation, ground truths as one block of memory. Images of equal size are
+    It has the arguments and results of the base class. All tensors of a batch are copied to a GPU
+    without synchronisation, and small ones as one block of memory. Images of equal size are
     converted, normalised and padded as one tensor.
     """
 
     def cast_data(self, data: Any) -> Any:
         """Copy the tensors of nested data to the device."""
-        tensors = list(_tensors(data))
-        some_on_host = any(tensor.device.type == "cpu" for tensor in tensors)
-        if self.device.type == "cpu" or not some_on_host:
+        tensors = _collect_tensors(data)
+        device_types = set()
+        for tensor in tensors:
+            device_types.add(tensor.device.type)
+        if self.device.type == "cpu" or "cpu" not in device_types:
             return super().cast_data(data)
         replacements = {}
-        for tensor, copy in zip(tensors, upload(tensors, self.device), strict=True):
+        copies = upload(tensors, device=self.device)
+        for tensor, copy in zip(tensors, copies, strict=True):
             replacements[id(tensor)] = copy
         return _replace_tensors(data, replacements)
 
@@ -40,7 +43,7 @@ class MapDataPreprocessor(Det3DDataPreprocessor):
             return super().collate_data(data)  # pads each image to the largest one
         data = self.cast_data(data)
         imgs = torch.stack(data["inputs"]["img"])
-        imgs = self.run_noted_steps(imgs, data.get("data_samples") or ())
+        imgs = self.run_noted_steps(imgs, samples=data.get("data_samples") or ())
         data["inputs"]["imgs"] = self.normalise(imgs)
         data.setdefault("data_samples", None)
         return data
@@ -57,21 +60,21 @@ class MapDataPreprocessor(Det3DDataPreprocessor):
             Images as packed by the published pipelines. (B, V, 3, H', W')
         """
         steps = [sample.metainfo.get("image_steps") or () for sample in samples]
-        return take_noted_steps(images, steps) if any(steps) else images
+        return take_noted_steps(images, steps)
 
     def normalise(self, images: Tensor) -> Tensor:
         """Convert the channels, normalise and pad. (..., 3, H, W) -> (..., 3, H', W') float32"""
         if self._channel_conversion:
-            images = images.flip(-3)
+            images = images.flip(dims=(-3,))
         images = images.float()
         if self._enable_normalize:
             images = (images - self.mean).div_(self.std)
         height, width = images.shape[-2:]
-        rows, columns = padded_size((height, width), self.pad_size_divisor)
+        rows, columns = padded_size((height, width), divisor=self.pad_size_divisor)
         if (rows, columns) == (height, width):
             return images
-        margins = (0, columns - width, 0, rows - height)
-        return torch.nn.functional.pad(images, margins, value=self.pad_value)
+        margins = (0, columns - width, 0, rows - height)  # left, right, top, bottom
+        return torch.nn.functional.pad(images, pad=margins, value=self.pad_value)
 
 
 def take_noted_steps(images: Tensor, steps: Sequence[Sequence[Any]]) -> Tensor:
@@ -91,45 +94,58 @@ def take_noted_steps(images: Tensor, steps: Sequence[Sequence[Any]]) -> Tensor:
     if batch_steps is None:
         samples = []
         for index, sample_steps in enumerate(steps):
-            samples.append(take_noted_steps(images[index : index + 1], [sample_steps]))
+            image = images[index : index + 1]
+            samples.append(take_noted_steps(image, steps=[sample_steps]))
         return torch.cat(samples)
-    images = images.flatten(0, 1)
+    images = images.flatten(start_dim=0, end_dim=1)
     for step in batch_steps:
         images = step.on_device(images)
-    return images.unflatten(0, batch_shape)
+    return images.unflatten(dim=0, sizes=batch_shape)
 
 
 def _join_steps(steps: Sequence[Sequence[Any]]) -> list[Any] | None:
     """Join the steps of all samples to steps of the batch; None if they do not fit together."""
-    if len({len(sample_steps) for sample_steps in steps}) > 1:
-        return None
-    joined = []
-    for first, *others in zip(*steps, strict=True):
+    num_steps = len(steps[0])
+    for sample_steps in steps:
+        if len(sample_steps) != num_steps:
+            return None
+    batch_steps = []
+    for number in range(num_steps):
+        first, *others = [sample_steps[number] for sample_steps in steps]
         step = first.join(others)
         if step is None:
             return None
-        joined.append(step)
-    return joined
+        batch_steps.append(step)
+    return batch_steps
 
 
 def _have_one_size(images: Any) -> bool:
     """Whether images are a list of tensors (V, 3, H, W), one per sample, of one shape and type."""
-    if not isinstance(images, Sequence) or not all(isinstance(each, Tensor) for each in images):
+    if not isinstance(images, Sequence) or not len(images):
         return False
-    kinds = {(each.shape, each.dtype) for each in images}
-    return len(kinds) == 1 and images[0].dim() == 4 and images[0].shape[1] == 3
+    first = images[0]
+    if not isinstance(first, Tensor) or first.dim() != 4 or first.shape[1] != 3:
+        return False
+    for image in images:
+        if not isinstance(image, Tensor):
+            return False
+        if image.shape != first.shape or image.dtype != first.dtype:
+            return False
+    return True
 
 
-def _tensors(data: Any) -> Iterator[Tensor]:
-    """Yield all tensors in nested data."""
+def _collect_tensors(data: Any) -> list[Tensor]:
+    """All tensors in nested data."""
+    tensors: list[Tensor] = []
     if isinstance(data, Tensor):
-        yield data
+        tensors.append(data)
     elif isinstance(data, BaseDataElement | Mapping):
         for _, value in data.items():
-            yield from _tensors(value)
+            tensors.extend(_collect_tensors(value))
     elif isinstance(data, list | tuple):
         for value in data:
-            yield from _tensors(value)
+            tensors.extend(_collect_tensors(value))
+    return tensors
 
 
 def _replace_tensors(data: Any, replacements: Mapping[int, Tensor]) -> Any:

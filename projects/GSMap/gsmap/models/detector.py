@@ -1,4 +1,4 @@
-"""The detector: from images and LiDAR over BEV features to map elements."""
+"""Detector of map elements in images and LiDAR points."""
 
 import logging
 from collections.abc import Sequence
@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_map_only
 
 from gsmap.checkpoints.strict import adapt_state, neutral_keys
+from gsmap.models.base.parts import build_part
 from gsmap.models.encoders.folded_backbone import FoldedBackbone
 from gsmap.models.encoders.half_backbone import HalfBackbone
 from gsmap.models.loss_check import LossCheck
@@ -50,11 +51,11 @@ class MapDetector(Base3DDetector):
         fold_batch_norms: Run the image backbone without gradients as a copy whose batch norms are
             folded into its convolutions. It is faster and needs a second copy of the weights.
         allow_untrained: Accept checkpoints without the weights of modules that start without
-            effect, such as GSMap's Gaussians in a checkpoint of MapTR. Trainings accept them.
-            Everything else does so on request only. All other weights must be present, under the
-            names here or those of the release, and no further ones.
-        autocast: ``"bfloat16"``: backbone, neck and encoders, which do nearly all arithmetic, use
-            this type in training. Head, matching and losses stay in float32, and no loss scale is
+            effect, for example the Gaussians of GSMap in a checkpoint of MapTR. Trainings accept
+            them, all other commands only on request. All other weights must be present, with the
+            names of this package or of the release, and there must be no further ones.
+        autocast: ``"bfloat16"``: backbone, neck and encoders, with nearly all arithmetic, use
+            this type in training. Head, matching and losses run in float32, and no loss scale is
             needed. None: no autocast here; ``--amp`` then includes the head.
         compiled: Compile backbone, neck, encoders and head at the start of a training, which takes
             a minute or more. True, or a mode of ``torch.compile``; ``"reduce-overhead"`` also
@@ -90,8 +91,11 @@ class MapDetector(Base3DDetector):
         self.folded_backbone = FoldedBackbone() if fold_batch_norms else None
         # Convolutions on CPUs and tensor cores are fastest with channels last. mmcv's deformable
         # convolution reads such tensors as channels first, without an error.
-        modules = () if self.img_backbone is None else self.img_backbone.modules()
-        self.channels_last = not any(isinstance(m, ModulatedDeformConv2d) for m in modules)
+        self.channels_last = True
+        if self.img_backbone is not None:
+            for module in self.img_backbone.modules():
+                if isinstance(module, ModulatedDeformConv2d):
+                    self.channels_last = False
         self.loss_check = LossCheck()
         self.half_backbone: HalfBackbone | None = None  # replaces backbone and neck in inference
         self.allow_untrained = allow_untrained
@@ -106,20 +110,25 @@ class MapDetector(Base3DDetector):
         if bool(bev_fuser) != bool(bev_encoder and lidar_encoder):
             raise InputError("bev_fuser belongs to a model of cameras and LiDAR, and to no other.")
         self.grid = BEVGrid(**grid)
-        shared = {"grid": self.grid}
-        self.bev_encoder = MODELS.build({**shared, **bev_encoder}) if bev_encoder else None
-        self.lidar_encoder = MODELS.build({**shared, **lidar_encoder}) if lidar_encoder else None
+        self.bev_encoder = build_part(bev_encoder, grid=self.grid) if bev_encoder else None
+        self.lidar_encoder = build_part(lidar_encoder, grid=self.grid) if lidar_encoder else None
         self.bev_fuser = MODELS.build(bev_fuser) if bev_fuser else None
-        self.map_head = MODELS.build({**shared, "classes": classes, **map_head})
+        self.map_head = build_part(map_head, grid=self.grid, classes=classes)
         self.temporal = None if temporal is None else StreamMemory(self.map_head, **temporal)
 
     def train(self, mode: bool = True) -> "MapDetector":
-        """Set the mode. With ``compiled``, the first training compiles the modules."""
+        """Set the mode. If ``compiled`` is set, the modules are compiled before a training."""
         super().train(mode)
         if mode and self.compiled:
             compile_mode = None if self.compiled is True else self.compiled
-            parts = (self.img_backbone, self.img_neck, self.bev_encoder, self.lidar_encoder)
-            for part in (*parts, self.map_head):
+            parts = (
+                self.img_backbone,
+                self.img_neck,
+                self.bev_encoder,
+                self.lidar_encoder,
+                self.map_head,
+            )
+            for part in parts:
                 if part is not None:
                     part.compile(backend=self.compiler, mode=compile_mode)
             self.compiled = False  # it is now
@@ -136,7 +145,7 @@ class MapDetector(Base3DDetector):
             maps = self.half_backbone(
                 self.img_backbone, self.img_neck, images=images, channels_last=self.channels_last
             )
-            return [feat.unflatten(0, (len(imgs), -1)) for feat in maps]
+            return _split_batch(maps, batch_size=len(imgs))
         if self.channels_last:
             images = images.contiguous(memory_format=torch.channels_last)
         if self.folded_backbone is None:
@@ -145,7 +154,7 @@ class MapDetector(Base3DDetector):
             feats = self.folded_backbone(self.img_backbone, images)
         if self.img_neck is not None:
             feats = self.img_neck(feats)
-        return [feat.unflatten(0, (len(imgs), -1)) for feat in feats]
+        return _split_batch(feats, batch_size=len(imgs))
 
     def halve_backbone(self) -> None:
         """Run image backbone and neck in float16 in inference (`HalfBackbone`)."""
@@ -156,7 +165,7 @@ class MapDetector(Base3DDetector):
         if not (self.training and self.autocast):
             return self._encode(batch_inputs, batch_data_samples)
         device = next(self.parameters()).device.type
-        with torch.autocast(device, getattr(torch, self.autocast)):
+        with torch.autocast(device, dtype=getattr(torch, self.autocast)):
             outputs = self._encode(batch_inputs, batch_data_samples)
         return tree_map_only(Tensor, _in_float32, outputs)
 
@@ -165,8 +174,9 @@ class MapDetector(Base3DDetector):
         outputs: dict[str, Tensor] = {}
         if self.bev_encoder is not None:
             imgs = batch_inputs["imgs"]
-            shape = {"batch_input_shape": tuple(imgs.shape[-2:])}
-            metas = [{**sample.metainfo, **shape} for sample in batch_data_samples]
+            metas = []
+            for sample in batch_data_samples:
+                metas.append({**sample.metainfo, "batch_input_shape": tuple(imgs.shape[-2:])})
             outputs = self.bev_encoder(self.extract_img_feats(imgs), metas)
         if self.lidar_encoder is not None:
             feats = self.lidar_encoder(batch_inputs["voxels"], len(batch_data_samples))
@@ -197,18 +207,27 @@ class MapDetector(Base3DDetector):
         outputs = self.extract_feat(batch_inputs, batch_data_samples)
         with self.over_time(outputs, batch_data_samples) as batch:
             losses = self.map_head.loss(batch.outputs, batch_data_samples, **batch.hooks)
-        losses = {name: loss.mean() if loss.dim() else loss for name, loss in losses.items()}
+        scalars = {}
+        for name, loss in losses.items():
+            scalars[name] = loss.mean() if loss.dim() else loss
         tokens = [sample.metainfo.get("token", "unknown") for sample in batch_data_samples]
-        self.loss_check.start(losses, tokens)
-        return losses
+        self.loss_check.start(scalars, tokens=tokens)
+        return scalars
 
     def parse_losses(self, losses: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
-        """Sum the values whose name contains "loss".
+        """Sum the values whose names contain "loss".
+
+        Args:
+            losses: Scalars by name.
 
         Returns:
-            The sum; and all values by name for the log, with the sum first.
+            The sum, and all values by name for the log, with the sum first.
         """
-        total = torch.stack([value for name, value in losses.items() if "loss" in name]).sum()
+        values = []
+        for name, value in losses.items():
+            if "loss" in name:
+                values.append(value)
+        total = torch.stack(values).sum()
         return total, {"loss": total, **losses}
 
     def predict(self, batch_inputs: Inputs, batch_data_samples: Samples) -> list[Det3DDataSample]:
@@ -233,14 +252,44 @@ class MapDetector(Base3DDetector):
             super()._dump_init_info()
 
     def _load_from_state_dict(
-        self, state_dict: dict[str, Tensor], prefix: str, *args: Any, **kwargs: Any
+        self,
+        state_dict: dict[str, Tensor],
+        prefix: str,
+        local_metadata: dict[str, Any],
+        strict: bool,
+        missing_keys: list[str],
+        unexpected_keys: list[str],
+        error_msgs: list[str],
     ) -> None:
-        """Load weights under the names here or those of a release; see `adapt_state`."""
+        """Load weights with the names of this package or of a release (`adapt_state`)."""
         expected = self.state_dict(prefix=prefix)
         neutral = neutral_keys(self, prefix)
         fit = partial(self.map_head.fit_state, prefix=f"{prefix}map_head.")
-        adapt_state(state_dict, expected, prefix, neutral, fit, self.allow_untrained)
-        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+        adapt_state(
+            state_dict,
+            expected,
+            prefix=prefix,
+            neutral=neutral,
+            fit=fit,
+            allow_untrained=self.allow_untrained,
+        )
+        super()._load_from_state_dict(
+            state_dict,
+            prefix,
+            local_metadata=local_metadata,
+            strict=strict,
+            missing_keys=missing_keys,
+            unexpected_keys=unexpected_keys,
+            error_msgs=error_msgs,
+        )
+
+
+def _split_batch(maps: Sequence[Tensor], batch_size: int) -> list[Tensor]:
+    """Split maps of images by sample. (B * V, C, h, w) each -> (B, V, C, h, w) each"""
+    batches = []
+    for feats in maps:
+        batches.append(feats.unflatten(dim=0, sizes=(batch_size, -1)))
+    return batches
 
 
 def _in_float32(values: Tensor) -> Tensor:

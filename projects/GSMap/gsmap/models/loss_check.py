@@ -1,7 +1,7 @@
 """Check that the losses of a step are finite."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -10,15 +10,31 @@ from gsmap.structures.tensors import LateValues
 from gsmap.utils.errors import NotFiniteError
 
 
+class PendingCheck(NamedTuple):
+    """Check of one step whose result may still be on the way to the host.
+
+    Attributes:
+        is_finite: One value per loss.
+        names: Names of the losses.
+        tokens: Tokens of the samples.
+    """
+
+    is_finite: LateValues
+    names: list[str]
+    tokens: list[Any]
+
+
 class LossCheck:
-    """Raises an error if losses are not finite: at once on a CPU, in the next step on a GPU.
+    """Check of losses that raises an error if one is not finite.
+
+    On a CPU the error is raised in the same step, on a GPU in the next one.
 
     On a GPU the result is copied to the host while the step continues, and `finish` waits for it.
     A copy of the object has no pending check.
     """
 
     def __init__(self) -> None:
-        self._pending: tuple[LateValues, list[str], list[Any]] | None = None
+        self._pending: PendingCheck | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         return {"_pending": None}
@@ -35,8 +51,13 @@ class LossCheck:
                 of this step is not. The message names losses and samples.
         """
         self.finish()
-        values = torch.stack([loss.detach().float().reshape(()) for loss in losses.values()])
-        self._pending = (LateValues(values.isfinite()), list(losses), list(tokens))
+        scalars = []
+        for loss in losses.values():
+            scalars.append(loss.detach().float().reshape(()))
+        values = torch.stack(scalars)
+        self._pending = PendingCheck(
+            is_finite=LateValues(values.isfinite()), names=list(losses), tokens=list(tokens)
+        )
         if values.device.type == "cpu":
             self.finish()
 
@@ -48,12 +69,14 @@ class LossCheck:
         """
         if self._pending is None:
             return
-        result, names, tokens = self._pending
+        check = self._pending
         self._pending = None
-        is_finite = dict(zip(names, result.read().tolist(), strict=True))
-        bad = [name for name in names if not is_finite[name]]
+        bad = []
+        for name, is_finite in zip(check.names, check.is_finite.read().tolist(), strict=True):
+            if not is_finite:
+                bad.append(name)
         if bad:
             raise NotFiniteError(
-                f"losses {bad} are not finite; samples {tokens}: look at their images and ground "
-                "truth, then at the learning rate and at the loss scale of mixed precision."
+                f"losses {bad} are not finite; samples {check.tokens}: look at their images and "
+                "ground truth, then at the learning rate and at the loss scale of mixed precision."
             )

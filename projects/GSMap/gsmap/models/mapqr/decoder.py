@@ -42,7 +42,9 @@ class Gather(nn.Sequential):
 
     def __init__(self, embed_dims: int, points: int) -> None:
         inputs = points * embed_dims
-        super().__init__(*mlp(inputs, inputs // 2, embed_dims, embed_dims))
+        super().__init__()
+        for layer in mlp(inputs, inputs // 2, embed_dims, embed_dims):
+            self.append(layer)
         self.points = points
 
     def forward(self, point_feats: Tensor) -> Tensor:

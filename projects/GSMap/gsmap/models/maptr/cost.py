@@ -16,8 +16,9 @@ def order_distances(pts: Tensor, pts_shifts: Tensor) -> Tensor:
     """L1 distance of every prediction to every equivalent point order of every ground truth.
 
     Args:
-        pts: Normalised points of the predictions. (N, P, 2)
-        pts_shifts: Normalised points of the ground truths, in S equivalent orders. (K, S, P, 2)
+        pts: Normalised points of the predictions. (N, P, 2 or 3)
+        pts_shifts: Normalised points of the ground truths, in S equivalent orders.
+            (K, S, P, 2 or 3)
 
     Returns:
         Distances, summed over points and coordinates. (N, K, S)
@@ -41,11 +42,11 @@ class OrderedPointsCost(PointsCost):
     """L1 distance to the closest equivalent point order (MapTR Eq. 5).
 
     Args:
-        weight: Weight of the cost.
+        weight: Weight of the cost, or a weight for each class.
     """
 
     def __init__(self, weight: WEIGHT = 5.0) -> None:
-        super().__init__(weight)
+        super().__init__(weight=weight)
 
     def __call__(
         self, pred_instances: SampleView, gt_instances: SampleView, img_meta: Any = None
@@ -55,7 +56,7 @@ class OrderedPointsCost(PointsCost):
         Args:
             pred_instances: Predictions with normalised ``pts`` (N, P, 2).
             gt_instances: Ground truths with ``pts_shifts`` (K, S, P, 2) and ``labels`` (K,).
-            img_meta: Not used.
+            img_meta: Meta dict of the sample, not used.
 
         Returns:
             The costs. (N, K)

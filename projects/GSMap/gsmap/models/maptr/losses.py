@@ -17,13 +17,13 @@ class PointsLoss(MapLoss):
 
     Args:
         loss_weight: Weight of the loss (lambda_v).
-        flags: As in `MapLoss`.
+        flags: Flags of `MapLoss`.
     """
 
     name = "pts"
 
     def __init__(self, loss_weight: WEIGHT = 5.0, **flags: bool) -> None:
-        super().__init__(loss_weight, **flags)
+        super().__init__(loss_weight=loss_weight, **flags)
 
     def values(self, pairs: MatchedPairs) -> Tensor:
         """Absolute difference of each coordinate of M matched pairs. (M, P, 2 or 3)"""
@@ -40,13 +40,13 @@ class DirectionLoss(MapLoss):
 
     Args:
         loss_weight: Weight of the loss.
-        flags: As in `MapLoss`.
+        flags: Flags of `MapLoss`.
     """
 
     name = "dir"
 
     def __init__(self, loss_weight: WEIGHT = 0.005, **flags: bool) -> None:
-        super().__init__(loss_weight, **flags)
+        super().__init__(loss_weight=loss_weight, **flags)
 
     def values(self, pairs: MatchedPairs) -> Tensor:
         """One minus the cosine for each edge of M matched pairs. (M, P - 1)"""

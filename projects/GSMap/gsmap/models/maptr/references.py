@@ -45,7 +45,7 @@ def refine_reference(reference: Tensor, offsets: Tensor, coords: int = 2) -> Ten
 
 @MODELS.register_module()
 class PointReference(nn.Module, RefinedReference):
-    """A point per query, [0, 1] over the map, refined by each decoder layer (MapTR).
+    """References of points, [0, 1] over the map, refined by each decoder layer (MapTR).
 
     Args:
         grid: Extent of the map.
@@ -82,11 +82,16 @@ class PointReference(nn.Module, RefinedReference):
         self.points_per_state = points_per_state
         entries = points_per_state * coords
         self.initial: nn.Module = nn.Linear(embed_dims, entries)
-        hidden = [embed_dims] * 2
+        self.branches = nn.ModuleList()
         if points_per_state > 1:
             self.initial = mlp(embed_dims, embed_dims, entries)
-            hidden = [2 * embed_dims] * 3
-        self.branches = nn.ModuleList(mlp(embed_dims, *hidden, entries) for _ in range(num_layers))
+        wide = 2 * embed_dims
+        for _ in range(num_layers):
+            if points_per_state > 1:
+                branch = mlp(embed_dims, wide, wide, wide, entries)
+            else:
+                branch = mlp(embed_dims, embed_dims, embed_dims, entries)
+            self.branches.append(branch)
 
     def by_point(self, entries: Tensor) -> Tensor:
         """Split entries of states into points. (..., Q, n * D) -> (..., Q * n, D), >= float32"""
@@ -127,7 +132,8 @@ class PointReference(nn.Module, RefinedReference):
         Returns:
             The refined reference. (..., Q * n, D)
         """
-        return refine_reference(reference, self.offsets(layer, point_states), self.coords)
+        offsets = self.offsets(layer, point_states)
+        return refine_reference(reference, offsets, coords=self.coords)
 
     def metres(self, points: Tensor) -> Tensor:
         """Convert normalised points to metres. (..., coords) -> (..., coords)"""
@@ -196,11 +202,18 @@ class PointReference(nn.Module, RefinedReference):
         return self.norm(transformed_m).clamp(0.0, 1.0).view_as(points).to(points)
 
     def decode(self, references: Tensor) -> dict[str, Tensor]:
-        """Decode references (N, P, D) to ``pts`` (N, P, coords) in metres."""
+        """Decode the points of a sample.
+
+        Args:
+            references: References. (N, P, D)
+
+        Returns:
+            ``pts`` in metres. (N, P, coords)
+        """
         return {"pts": self.metres(references[..., : self.coords])}
 
     def render(self, references: Tensor, grid: BEVGrid) -> Tensor:
-        """Not available: points have no extent to render.
+        """Raise TypeError, because points have no extent to render.
 
         Args:
             references: References. (..., P, D)

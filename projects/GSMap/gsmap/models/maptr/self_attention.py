@@ -1,9 +1,10 @@
 """Self-attention of point queries.
 
 The constructor of a self-attention takes ``embed_dims`` (channels C), ``num_heads``, ``num_points``
-(points P per instance) and ``dropout``. Its call takes point queries, instance after instance
-(B, N * P, C), their positional encoding, and a mask or None, True where an instance may not attend
-to another one (N, N). It returns the queries plus the attention; the decoder layer normalises them.
+(points P per instance) and ``dropout``. The inputs of its call are point queries, instance after
+instance (B, N * P, C), positional queries of equal shape, and a mask (N, N) or None. The mask is
+True where an instance may not attend to another one. The output is the sum of queries and
+attention, without normalisation.
 """
 
 from mmdet3d.registry import MODELS
@@ -35,15 +36,17 @@ class PointSelfAttention(nn.MultiheadAttention):
 
         Args:
             query: Point queries, instance after instance. (B, N * P, C)
-            query_pos: Their positional encoding. (B, N * P, C)
+            query_pos: Positional queries. (B, N * P, C)
             attn_mask: True where an instance may not attend to another one. (N, N)
 
         Returns:
             The queries plus the attention. (B, N * P, C)
         """
-        attn_mask = mask_of_points(attn_mask, self.num_points)
+        point_mask = mask_of_points(attn_mask, num_points=self.num_points)
         key = query + query_pos
-        attended = super().forward(key, key, query, attn_mask=attn_mask, need_weights=False)[0]
+        attended, _ = super().forward(
+            query=key, key=key, value=query, attn_mask=point_mask, need_weights=False
+        )
         return query + self.output_dropout(attended)
 
 
@@ -51,4 +54,5 @@ def mask_of_points(mask: Tensor | None, num_points: int) -> Tensor | None:
     """Expand a mask of instances to their points. (N, N) -> (N * P, N * P)"""
     if mask is None:
         return None
-    return mask.repeat_interleave(num_points, 0).repeat_interleave(num_points, 1)
+    mask = mask.repeat_interleave(num_points, dim=0)
+    return mask.repeat_interleave(num_points, dim=1)

@@ -34,7 +34,7 @@ class DecoupledSelfAttention(nn.Module):
 
         Args:
             query: Point queries, instance after instance. (B, N * P, C)
-            query_pos: Their positional encoding. (B, N * P, C)
+            query_pos: Positional queries. (B, N * P, C)
             attn_mask: True where an instance may not attend to another one. (N, N)
 
         Returns:
@@ -56,5 +56,5 @@ class DecoupledSelfAttention(nn.Module):
     ) -> Tensor:
         """Apply one attention with its residual."""
         key = query + pos
-        attended = attention(key, key, query, attn_mask=mask, need_weights=False)[0]
+        attended, _ = attention(query=key, key=key, value=query, attn_mask=mask, need_weights=False)
         return query + self.dropout(attended)

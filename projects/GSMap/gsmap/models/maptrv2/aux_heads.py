@@ -12,7 +12,7 @@ from gsmap.utils.targets import NeedsTargets
 
 @MODELS.register_module()
 class DepthSupervision(nn.Module, NeedsTargets):
-    """Supervises the depth of a lifting encoder by ``gt_depth`` (V, H, W) of a LiDAR.
+    """Auxiliary head of the depth in a lifting encoder, with LiDAR as ground truth.
 
     Args:
         loss_weight: Weight of the loss.
@@ -36,7 +36,7 @@ class DepthSupervision(nn.Module, NeedsTargets):
             batch_data_samples: Samples with ``gt_depth`` in metres. (V, H, W) each
         """
         probs = bev_outputs["depth"]
-        target = stack_targets(self, batch_data_samples, "gt_depth", probs.device)
+        target = stack_targets(self, batch_data_samples, name="gt_depth", device=probs.device)
         stride = target.shape[-1] // probs.shape[-1]
         bins = depth_bins(target, stride=stride, depth_range=bev_outputs["depth_range"])
         return self.loss_weight * depth_loss(probs, bins)

@@ -10,8 +10,8 @@ from gsmap.utils.errors import InputError
 def depth_bins(depth_m: Tensor, stride: int, depth_range: tuple[float, float, float]) -> Tensor:
     """Depth bin of each block of pixels.
 
-    The nearest return of a block counts. If it lies before the first bin or behind the last one,
-    the block has no target, even if another return lies in a bin.
+    The target of a block is its nearest return. If that is before the first bin or beyond the last
+    one, the block has no target, even if another return is in a bin.
 
     Args:
         depth_m: Depth along the optical axis in metres, 0 without a return. (..., H, W)
@@ -30,7 +30,8 @@ def depth_bins(depth_m: Tensor, stride: int, depth_range: tuple[float, float, fl
             f"depth_m must have a size divisible by stride {stride}, got {height} x {width}."
         )
     low, _, step = depth_range
-    blocks = depth_m.unflatten(-1, (-1, stride)).unflatten(-3, (-1, stride))  # (..., h, s, w, s)
+    blocks = depth_m.unflatten(dim=-1, sizes=(-1, stride))
+    blocks = blocks.unflatten(dim=-3, sizes=(-1, stride))  # (..., h, s, w, s)
     nearest = torch.where(blocks == 0, torch.inf, blocks).amin((-3, -1))  # (..., h, w)
     position = (nearest - (low - step)) / step
     valid = (position >= 1) & (position < num_depth_bins(depth_range) + 1)
@@ -57,7 +58,7 @@ def depth_loss(probs: Tensor, bins: Tensor) -> Tensor:
         )
     valid = bins >= 0
     indices = bins.clamp(min=0).unsqueeze(-3)
-    target_probs = probs.float().gather(-3, indices).squeeze(-3)  # (..., h, w)
+    target_probs = probs.float().gather(dim=-3, index=indices).squeeze(-3)  # (..., h, w)
     least = torch.finfo(target_probs.dtype).tiny
     target_probs = torch.where(valid, target_probs, 1).clamp(min=least)
     return -target_probs.log().sum() / valid.sum().clamp(min=1)

@@ -26,11 +26,11 @@ class BEVMemory(nn.Module, AddsWeights):
     Args:
         grid: Extent of the map.
         embed_dims: Channels C.
-        end_points: Space the cells from edge to edge of the map, as in the released code, instead
-            of at their centres. With it the memory of a standing vehicle is resampled, too. The
+        end_points: Place the cells from edge to edge of the map, as in the released code, instead
+            of at their centres. The memory is then resampled also if the vehicle does not move. The
             released weights require it.
-        kept_dims: Number of channels to remember, from the first on. The other channels of h are
-            those of x. None remembers all, as published.
+        kept_dims: Number of channels to remember, from the first on. In the other channels, h is
+            equal to x. None remembers all channels, as published.
         present_share: Initialise as a mean of present and past, with z equal to this share, q = x
             and no LayerNorm. A model that was trained without memory then keeps its features. None
             initialises random weights, as published.
@@ -63,9 +63,9 @@ class BEVMemory(nn.Module, AddsWeights):
         self.kept_dims = kept_dims
         published = present_share is None
         self.neutral_keys = () if published else ("conv",)  # a checkpoint may lack them
-        self.convz = nn.Conv2d(2 * embed_dims, embed_dims, 1, bias=not published)
-        self.convr = nn.Conv2d(2 * embed_dims, embed_dims, 1, bias=False)
-        self.convq = nn.Conv2d(2 * embed_dims, embed_dims, 1, bias=False)
+        self.convz = nn.Conv2d(2 * embed_dims, embed_dims, kernel_size=1, bias=not published)
+        self.convr = nn.Conv2d(2 * embed_dims, embed_dims, kernel_size=1, bias=False)
+        self.convq = nn.Conv2d(2 * embed_dims, embed_dims, kernel_size=1, bias=False)
         self.ln = nn.LayerNorm(embed_dims) if published else nn.Identity()
         for conv in (self.convz, self.convr, self.convq):
             nn.init.kaiming_normal_(conv.weight, mode="fan_out", nonlinearity="relu")

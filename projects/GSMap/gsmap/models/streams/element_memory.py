@@ -1,4 +1,4 @@
-"""Memory of elements: detections of a frame refine those of the next one."""
+"""Memory of elements: refinement of detections by the detections of the previous frame."""
 
 import math
 from collections.abc import Sequence
@@ -70,7 +70,7 @@ class ElementMemory:
             past: Memory of the streams and the ego motion.
 
         Returns:
-            Detections of each sample; those of a stream that starts are unchanged.
+            Detections of each sample, unchanged if its stream starts.
         """
         if f"{PREFIX}labels" not in past.memory:
             return list(results)
@@ -80,9 +80,12 @@ class ElementMemory:
             scales=past.memory[f"{PREFIX}scales"],
             rotations=past.memory[f"{PREFIX}rotations"],
         )
-        spread = past.seconds.sqrt()
+        scale = past.seconds.sqrt()
         previous = move_gaussians(
-            remembered, past.now_from_then, self.noise_m * spread, self.noise_rad * spread
+            remembered,
+            motion=past.now_from_then,
+            drift_m=self.noise_m * scale,
+            drift_rad=self.noise_rad * scale,
         )
         updated = []
         for index, continues in enumerate(past.continues.tolist()):
@@ -97,16 +100,16 @@ class ElementMemory:
     def _update_sample(
         self, detections: InstanceData, previous: Gaussians, labels: Tensor
     ) -> InstanceData:
-        """Update the detections of one sample by previous elements; label -1 is no element."""
+        """Update the detections of one sample. Previous elements with label -1 are padding."""
         exists = labels >= 0
         is_confident = detections.scores_3d >= self.min_score
         gaussians = detected_gaussians(detections)
         new = update_from_known_lines(
-            _select(gaussians, is_confident),
-            detections.labels_3d[is_confident],
-            _select(previous, exists),
-            labels[exists],
-            self.gate_m,
+            now=_select(gaussians, is_confident),
+            labels=detections.labels_3d[is_confident],
+            known=_select(previous, exists),
+            known_labels=labels[exists],
+            gate_m=self.gate_m,
         )
         means = gaussians.means.index_put((is_confident,), new.means)
         result = detections.clone()
@@ -116,19 +119,26 @@ class ElementMemory:
         return result
 
     def remember(self, results: Sequence[InstanceData]) -> dict[str, Tensor]:
-        """Memory of the detections of a batch, by name; label -1 fills up. (B, max_num, ...)"""
+        """Memory of the detections of a batch, padded with zeros and with label -1.
+
+        Args:
+            results: Detections of each sample.
+
+        Returns:
+            Tensors by name. (B, max_num, ...) each
+        """
         frames: dict[str, list[Tensor]] = {}
         for detections in results:
             is_confident = detections.scores_3d >= self.min_score
             labels = detections.labels_3d[is_confident]
             gaussians = _select(detected_gaussians(detections), is_confident)
-            filled = labels.new_full((self.num,), -1)
-            filled[: len(labels)] = labels
-            frames.setdefault("labels", []).append(filled)
+            padded = labels.new_full((self.num,), -1)
+            padded[: len(labels)] = labels
+            frames.setdefault("labels", []).append(padded)
             for name, values in gaussians._asdict().items():
-                filled = values.new_zeros((self.num, *values.shape[1:]))
-                filled[: len(values)] = values
-                frames.setdefault(name, []).append(filled)
+                padded = values.new_zeros((self.num, *values.shape[1:]))
+                padded[: len(values)] = values
+                frames.setdefault(name, []).append(padded)
         return {f"{PREFIX}{name}": torch.stack(values) for name, values in frames.items()}
 
 

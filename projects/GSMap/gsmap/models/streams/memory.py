@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from mmdet3d.registry import MODELS
 from mmengine.model import BaseModule
 from mmengine.structures import InstanceData
 from torch import Tensor
 
 from gsmap.models.base.head import MapHead
 from gsmap.models.base.hooks import FlowHook
+from gsmap.models.base.parts import build_part
 from gsmap.models.streams.bev_memory import BEVMemory
 from gsmap.models.streams.element_memory import PREFIX, ElementMemory
 from gsmap.models.streams.query_memory import Propagation, QueryMemory
@@ -22,7 +22,7 @@ from gsmap.structures.streams import Frame, MapStream, Scenes, Slots, StreamStat
 from gsmap.structures.tensors import upload
 from gsmap.utils.errors import InputError
 
-# Prefixes of names that keep single precision: half precision would move points by centimetres.
+# Prefixes of names in single precision. Half precision has errors of centimetres in points.
 _EXACT = ("references", "targets", PREFIX)
 
 
@@ -31,7 +31,8 @@ class BatchMemory:
     """A batch of a detector with memory, from the encoder to the end of the frame.
 
     Args:
-        outputs: Outputs of the encoder; ``bev_feats`` are fused with the memory. (B, C, H, W)
+        outputs: Outputs of the encoder, in which ``bev_feats`` (B, C, H, W) are fused with the
+            memory.
         past: Memory of the streams and the ego motion, or None without memory.
         propagation: Memory of queries, or None.
         elements: Memory of the detections for the next frame, by name. (B, ...) each
@@ -94,8 +95,7 @@ class StreamMemory(BaseModule):
         self.name = f"a model with {type(head).__name__}"
         self.bev: BEVMemory | None = None
         if bev is not None:
-            part = {"type": "BEVMemory", "grid": head.grid, "embed_dims": embed_dims}
-            self.bev = MODELS.build({**part, **bev})
+            self.bev = build_part(bev, type="BEVMemory", grid=head.grid, embed_dims=embed_dims)
         self.queries: QueryMemory | None = None
         if queries is not None:
             if not isinstance(head, MapHead):
@@ -103,12 +103,11 @@ class StreamMemory(BaseModule):
                     f"{type(head).__name__} can have no memory of queries, which needs a MapHead: "
                     "set temporal.queries=None; temporal.bev works with every head."
                 )
-            part = {"type": "QueryMemory", "embed_dims": head.embed_dims}
-            self.queries = MODELS.build({**part, **queries})
+            self.queries = build_part(queries, type="QueryMemory", embed_dims=head.embed_dims)
             self.queries.check(head)
         self.elements: ElementMemory | None = None
         if elements is not None:
-            self.elements = MODELS.build({"type": "ElementMemory", "head": head, **elements})
+            self.elements = build_part(elements, type="ElementMemory", head=head)
         self.streams: Slots | Scenes = Slots(max_gap_s)
 
     def __str__(self) -> str:
@@ -124,7 +123,7 @@ class StreamMemory(BaseModule):
         return Scenes(self.max_gap_s)
 
     def new_stream(self) -> MapStream:
-        """Create an empty memory of one scene, which the caller owns."""
+        """Create an empty memory of one scene for the caller."""
         stream = MapStream(self.max_gap_s)
         stream.claim(self)
         return stream

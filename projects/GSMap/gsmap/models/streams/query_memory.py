@@ -85,7 +85,7 @@ class QueryMemory(BaseModule, AddsWeights):
         code = motion[:, :3].flatten(1).to(states)  # (B, 12)
         while code.dim() < states.dim():
             code = code.unsqueeze(1)
-        code = code.expand(*states.shape[:-1], -1)
+        code = code.expand((*states.shape[:-1], -1))
         return states + self.fc(torch.cat([states, code], dim=-1))
 
     def transform_references(self, head: FlowHead, references: Tensor, past: Past) -> Tensor:
@@ -128,7 +128,7 @@ def leaf_names(count: int) -> list[str]:
 
 
 def pick(values: Tensor, order: Tensor) -> Tensor:
-    """Select instances. (B, N, ...), indices (B, M) -> (B, M, ...)"""
+    """Select instances by indices (B, M). (B, N, ...) -> (B, M, ...)"""
     return values[torch.arange(len(order), device=order.device)[:, None], order]
 
 
@@ -164,7 +164,9 @@ class Propagation(FlowHook):
             return refined
         instances = head.decoder.by_instance(refined)
         propagated = instances[:, : self.memory.num]
-        fused = self.memory.fuse_references(propagated, self.propagated.reference, head)
+        fused = self.memory.fuse_references(
+            refined=propagated, before=self.propagated.reference, head=head
+        )
         propagated = torch.where(self.past.continues.view(-1, 1, 1, 1), fused, propagated)
         return torch.cat([propagated, instances[:, self.memory.num :]], dim=1).flatten(1, 2)
 
