@@ -187,7 +187,13 @@ class MapHead(LossHead):
         return coder
 
     def check_parts(self) -> None:
-        """Check that the parts fit together; see the errors of the class."""
+        """Check that the parts fit together.
+
+        Raises:
+            TypeError: If a loss is no `MapLoss`.
+            ValueError: If a loss or a cost lacks an input, a class or a loss does not exist, or two
+                parts have one name.
+        """
         for loss in self.losses.values():
             if not isinstance(loss, MapLoss):
                 raise InputTypeError(

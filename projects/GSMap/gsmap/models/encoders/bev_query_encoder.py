@@ -107,7 +107,7 @@ class BEVEncoderLayer(nn.Module):
             grid: The cells, H x W = Q.
             feats: Image features with the embeddings of camera and level. (B, V, C, h, w), or a
                 list with one such tensor per level
-            projection: Image coordinates of the pillars, and the cells that each camera sees.
+            projection: Image coordinates of the pillars, and the visible cells of each camera.
 
         Returns:
             The updated queries. (B, Q, C)

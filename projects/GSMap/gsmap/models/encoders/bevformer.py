@@ -106,7 +106,7 @@ def _sample_all_pairs(
         shape: Rows h and columns w of the features.
         offsets: Offsets from the projected pillar, as fractions of the map. (B, Q, heads, S, 2)
         weights: Weight of each sample. (B, Q, heads, S)
-        projection: Image coordinates of the pillars, and the cells that each camera sees.
+        projection: Image coordinates of the pillars, and the visible cells of each camera.
         repeats: Samples per pillar height.
 
     Returns:

@@ -14,7 +14,7 @@ class GridMask(nn.Module):
 
     Args:
         prob: Probability to mask a batch, in [0, 1].
-        ratio: Width of a kept stripe over the period of the grid, in (0, 1).
+        ratio: Width of a visible stripe over the period of the grid, in (0, 1).
 
     Raises:
         ValueError: If an argument is out of range.
@@ -35,7 +35,7 @@ class GridMask(nn.Module):
         return images * mask.to(images.dtype)
 
     def draw_mask(self, height: int, width: int) -> Tensor:
-        """Random mask: 1 where the image is kept, 0 in the squares. (H, W)
+        """Random mask: 0 in the squares, 1 elsewhere. (H, W)
 
         Args:
             height: Rows of the images.

@@ -20,10 +20,10 @@ class GeMapHead(MapHead):
 
     Args:
         decoder: Config of the decoder; its self-attention is replaced if ``decoupled``.
-        losses: Configs of the losses; `EuclideanLoss` is added.
-        query_groups: Groups of queries; the first one remains unless ``one_to_many``.
+        losses: Configs of the other losses.
+        query_groups: Settings of each `QueryGroup`, only the first of them unless ``one_to_many``.
         loss_euclidean: Settings of `EuclideanLoss`, or None to train without it.
-        decoupled: Use GeMap's self-attention in the layers instead of the configured one.
+        decoupled: Use the self-attention of GeMap in the layers instead of the configured one.
         one_to_many: Keep the further query groups, which GeMap does not have. The Euclidean loss of
             many matches takes much memory, so list the losses of such a group.
         kwargs: Further arguments of `MapHead`.
@@ -40,9 +40,10 @@ class GeMapHead(MapHead):
         **kwargs: Any,
     ) -> None:
         layer = decoder.get("layer", {})
-        attention = {"type": GeometryDecoupledAttention}
-        if decoupled and class_of(layer.get("self_attn", {})) is not GeometryDecoupledAttention:
-            decoder = {**decoder, "layer": {**layer, "self_attn": attention}}
+        attention_class = class_of(layer.get("self_attn", {}))
+        if decoupled and attention_class is not GeometryDecoupledAttention:
+            layer = {**layer, "self_attn": {"type": GeometryDecoupledAttention}}
+            decoder = {**decoder, "layer": layer}
         super().__init__(
             decoder=decoder,
             losses=[*losses, *optional_part(EuclideanLoss, loss_euclidean)],

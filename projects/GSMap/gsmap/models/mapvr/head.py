@@ -7,7 +7,14 @@ from mmdet3d.registry import MODELS, TASK_UTILS
 
 from gsmap.models.base.head import MapHead
 from gsmap.models.base.masks import ElementMasks
-from gsmap.models.base.parts import DEFAULTS, PARTS, class_of, optional_part, set_points_weight
+from gsmap.models.base.parts import (
+    DEFAULTS,
+    PARTS,
+    class_of,
+    optional_part,
+    set_points_weight,
+    with_defaults,
+)
 from gsmap.models.maptr.cost import OrderedPointsCost
 from gsmap.models.maptr.losses import DirectionLoss, PointsLoss
 from gsmap.models.mapvr.cost import RenderedDiceCost
@@ -29,14 +36,16 @@ class MapVRHead(MapHead):
         grid: Extent of the map.
         classes: Names of the classes.
         decoder: Config of the decoder; the dropout of its layers is set to ``dropout``.
-        losses: As in `MapHead`; the weight of `PointsLoss` is set to ``points_weight``, and
+        losses: Configs of the losses. The weight of `PointsLoss` is set to ``points_weight``, and
             `DirectionLoss` is removed.
-        match_costs: As in `MapHead`; the weight of `OrderedPointsCost` is set to ``points_weight``.
+        match_costs: Configs of the matching costs. The weight of `OrderedPointsCost` is set to
+            ``points_weight``.
         loss_dice: Settings of the dice loss, or None to train without it.
-        dice_cost: Settings of its matching cost, or None to match without it.
+        dice_cost: Settings of the matching cost of rendered masks, or None to match without it.
         loss_direction: Settings of `SelfDirectionLoss`, or None to train without it.
-        points_weight: Weight of the points in losses and in matching. None: keep the configs'.
-        polygons: Names of the classes that are rendered as filled polygons. None: those of
+        points_weight: Weight of the points in losses and matching. None keeps the weights of the
+            configs.
+        polygons: Names of the classes that are rendered as filled polygons. None means
             `AREA_CLASSES`.
         rendering: Further settings of `ElementRenderer`, for loss and cost.
         masks: Pixel sizes as in `ElementMasks`. Defaults: 256 x 128 pixels, and 128 x 64 for
@@ -70,28 +79,40 @@ class MapVRHead(MapHead):
         if unknown:
             raise InputError(f"polygons must be classes of {list(classes)}, got {unknown}.")
         areas = AREA_CLASSES if polygons is None else polygons
-        indices = tuple(index for index, name in enumerate(classes) if name in areas)
-        sizes = {"pixel_m": 60 / 256, "cost_pixel_m": 60 / 128}
-        drawing = ElementMasks(grid, **{**sizes, **(masks or {})})
-        shared = {"polygon_classes": indices, **(rendering or {})}
-        size = (drawing.grid.height, drawing.grid.width)
-        cost_size = (drawing.cost_grid.height, drawing.cost_grid.width)
-        other_losses = [loss for loss in losses if class_of(loss) is not DirectionLoss]
-        losses = [
-            *set_points_weight(other_losses, PointsLoss, points_weight, "loss_weight"),
-            *optional_part(SelfDirectionLoss, loss_direction),
-            *optional_part(RenderedDiceLoss, loss_dice, size=size, **shared),
-        ]
-        match_costs = [
-            *set_points_weight(match_costs, OrderedPointsCost, points_weight, "weight", TASK_UTILS),
-            *optional_part(RenderedDiceCost, dice_cost, size=cost_size, **shared),
-        ]
+        area_inds = tuple(index for index, name in enumerate(classes) if name in areas)
+        mask_settings = with_defaults(masks, pixel_m=60 / 256, cost_pixel_m=60 / 128)
+        element_masks = ElementMasks(grid, **mask_settings)
+        rendering = with_defaults(rendering, polygon_classes=area_inds)
+        loss_grid = element_masks.grid
+        cost_grid = element_masks.cost_grid
+        points_losses = [loss for loss in losses if class_of(loss) is not DirectionLoss]
+        points_losses = set_points_weight(
+            points_losses, PointsLoss, weight=points_weight, key="loss_weight"
+        )
+        points_costs = set_points_weight(
+            match_costs,
+            OrderedPointsCost,
+            weight=points_weight,
+            key="weight",
+            registry=TASK_UTILS,
+        )
+        dice_losses = optional_part(
+            RenderedDiceLoss, loss_dice, size=(loss_grid.height, loss_grid.width), **rendering
+        )
+        dice_costs = optional_part(
+            RenderedDiceCost, dice_cost, size=(cost_grid.height, cost_grid.width), **rendering
+        )
+        layer = {**decoder.get("layer", {}), "dropout": dropout}
         super().__init__(
             grid=grid,
             classes=classes,
-            decoder={**decoder, "layer": {**decoder.get("layer", {}), "dropout": dropout}},
-            losses=losses,
-            match_costs=match_costs,
-            masks=drawing,
+            decoder={**decoder, "layer": layer},
+            losses=[
+                *points_losses,
+                *optional_part(SelfDirectionLoss, loss_direction),
+                *dice_losses,
+            ],
+            match_costs=[*points_costs, *dice_costs],
+            masks=element_masks,
             **kwargs,
         )
