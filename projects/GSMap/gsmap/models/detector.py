@@ -16,7 +16,6 @@ from torch import Tensor
 from torch.utils._pytree import tree_map_only
 
 from gsmap.checkpoints.strict import adapt_state, neutral_keys
-from gsmap.models.base.parts import build_part
 from gsmap.models.encoders.folded_backbone import FoldedBackbone
 from gsmap.models.encoders.half_backbone import HalfBackbone
 from gsmap.models.loss_check import LossCheck
@@ -110,10 +109,11 @@ class MapDetector(Base3DDetector):
         if bool(bev_fuser) != bool(bev_encoder and lidar_encoder):
             raise InputError("bev_fuser belongs to a model of cameras and LiDAR, and to no other.")
         self.grid = BEVGrid(**grid)
-        self.bev_encoder = build_part(bev_encoder, grid=self.grid) if bev_encoder else None
-        self.lidar_encoder = build_part(lidar_encoder, grid=self.grid) if lidar_encoder else None
+        shared = {"grid": self.grid}
+        self.bev_encoder = MODELS.build({**shared, **bev_encoder}) if bev_encoder else None
+        self.lidar_encoder = MODELS.build({**shared, **lidar_encoder}) if lidar_encoder else None
         self.bev_fuser = MODELS.build(bev_fuser) if bev_fuser else None
-        self.map_head = build_part(map_head, grid=self.grid, classes=classes)
+        self.map_head = MODELS.build({**shared, "classes": classes, **map_head})
         self.temporal = None if temporal is None else StreamMemory(self.map_head, **temporal)
 
     def train(self, mode: bool = True) -> "MapDetector":
