@@ -114,7 +114,7 @@ def modules_by_name(modules: Sequence[Any]) -> nn.ModuleDict:
     """
     names = [module.name for module in modules]
     check_unique_names(names, kind="parts")
-    return nn.ModuleDict(zip(names, modules, strict=True))
+    return nn.ModuleDict(dict(zip(names, modules, strict=True)))
 
 
 def check_unique_names(names: Sequence[str], kind: str) -> None:
