@@ -120,7 +120,8 @@ def test_the_wheel_says_what_it_is_and_needs(site):
     assert "torchvision" not in required
     assert not [line for line in package.requires if "==" in line.split(";")[0]]
     owners = importlib.metadata.packages_distributions()
-    for name in imported() - {"gsmap", "mapdata", "drivemaps", "minicity", "tools", "comparison", "scoring"}:
+    shipped = {"gsmap", "mapdata", "drivemaps", "minicity", "tools", "comparison", "scoring"}
+    for name in imported() - shipped:
         owner = {o.lower() for o in owners.get(name, [name])}
         owner |= {"mmcv-lite"} if name == "mmcv" else set()
         assert owner & (required | BROUGHT), f"{name} is imported, but {owner} is not required"
