@@ -1,6 +1,6 @@
 """AP per sample of older methods: lines are drawn to masks, and AP is averaged over samples.
 
-Rules, equal to the evaluators that HDMapNet and BeMapNet released:
+Rules, equal to the released evaluators of the methods that use it:
 
 - The lines of a class in a sample are drawn to one mask of 0.15 m pixels in the order of the file,
   so that a later line hides the pixels that it crosses.
