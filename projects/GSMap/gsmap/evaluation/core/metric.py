@@ -36,7 +36,7 @@ class _Sides(NamedTuple):
 class Sample(_Sides):
     """Predictions and ground truth of one sample, in metres in the annotation frame.
 
-    Args:
+    Attributes:
         token: Name of the sample.
         predictions: Predicted elements, with scores. N in number.
         ground_truth: Annotated elements. K in number.
