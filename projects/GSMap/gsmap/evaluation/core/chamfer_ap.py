@@ -138,7 +138,7 @@ def _line(lines: kernels.Lines, index: int) -> FloatArray:
 
 def _strips_touch(first: FloatArray, second: FloatArray) -> bool:
     """Whether the 4 m wide strips around two lines intersect; ends are flat, corners mitred."""
-    if kernels.beside_a_segment(first, line=second, half_width_m=STRIP_HALF_WIDTH_M):
+    if kernels.beside_a_segment(first, second, STRIP_HALF_WIDTH_M):
         return True
     import shapely  # only a handful of pairs per thousand frames reach this line
 

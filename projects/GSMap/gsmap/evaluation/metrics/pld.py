@@ -140,7 +140,7 @@ def sospa(first: FloatArray, second: FloatArray, cutoffs_m: Sequence[float]) -> 
     for row, cutoff in enumerate(cutoffs_m):
         if distances.min() < cutoff:
             gap_cost = cutoff / 2
-            sums = np.array(_align_lines(distances, gap_cost=gap_cost, num_starts=num_starts))
+            sums = np.array(_align_lines(distances, gap_cost, num_starts))
             figures[row] = 2 * sums / (gap_cost * sum(distances.shape) + sums[0])
     return figures
 
