@@ -1,9 +1,15 @@
-"""Measures of how densely Python code is written, and how its docstrings name things."""
+"""Measures of how densely Python code is written, and how its docstrings name things.
+
+``PYTHONPATH=tests python -m readability FOLDER ...`` prints them, a row for each folder.
+"""
 
 import ast
 import re
+import sys
 from dataclasses import dataclass
 from pathlib import Path
+
+from gsmap.utils.words import markdown_table
 
 COMPREHENSIONS = (ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
@@ -145,3 +151,30 @@ def count(*paths: Path) -> Counts:
         for file in files:
             Reader(file.read_text(encoding="utf-8"), counts)
     return counts
+
+
+def percentage(part: int, whole: int) -> int:
+    """Share of a part, rounded."""
+    return round(100 * part / max(whole, 1))
+
+
+def row(path: Path) -> list[str]:
+    """Measures of a folder, per 1,000 lines or in percent."""
+    counts = count(path)
+    cells = [str(path), f"{counts.lines:,}"]
+    for number in (counts.pairs, counts.splats, counts.comprehensions):
+        cells.append(f"{1000 * number / max(counts.lines, 1):.1f}")
+    for part, whole in (
+        (counts.named_arguments, counts.arguments),
+        (counts.described_functions, counts.wide_functions),
+        (counts.clauses, counts.docstrings),
+        (counts.participles, counts.functions),
+    ):
+        cells.append(f"{percentage(part, whole)} %")
+    return cells
+
+
+if __name__ == "__main__":
+    head = ["folder", "lines", "pairs", "splats", "comprehensions"]
+    head += ["by name", "`Args:`", "clauses", "participles"]
+    print(markdown_table(head, [row(Path(folder)) for folder in sys.argv[1:]]))

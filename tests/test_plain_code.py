@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from readability import Counts, Reader, count
+from readability import Counts, Reader, count, percentage
 
 REPO = Path(__file__).resolve().parents[1]
 PACKAGES = [
@@ -25,10 +25,6 @@ def rooms() -> list[Path]:
     large = [folder for folder in folders if count(folder).lines >= SMALL]
     assert len(large) > 30
     return large
-
-
-def percentage(part: int, whole: int) -> int:
-    return round(100 * part / max(whole, 1))
 
 
 @pytest.mark.parametrize("room", rooms(), ids=lambda room: str(room.relative_to(REPO)))
