@@ -3,9 +3,9 @@
 ``PYTHONPATH=tests python -m readability FOLDER ...`` prints them, a row for each folder.
 """
 
+import argparse
 import ast
 import re
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -174,7 +174,18 @@ def row(path: Path) -> list[str]:
     return cells
 
 
-if __name__ == "__main__":
+def parse_args() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folders", nargs="+", type=Path)
+    return parser.parse_args()
+
+
+def main() -> None:
+    args = parse_args()
     head = ["folder", "lines", "pairs", "splats", "comprehensions"]
     head += ["by name", "`Args:`", "clauses", "participles"]
-    print(markdown_table(head, [row(Path(folder)) for folder in sys.argv[1:]]))
+    print(markdown_table(head, [row(folder) for folder in args.folders]))
+
+
+if __name__ == "__main__":
+    main()
