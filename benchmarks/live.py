@@ -14,23 +14,34 @@ from gsmap.apis.map_inferencer import MapInferencer
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``benchmarks live`` to a parser."""
     parser.add_argument("model", help="name of a trained model, or a config with random weights")
-    parser.add_argument("--size", type=int, nargs=2, default=(225, 400), metavar=("H", "W"))
+    parser.add_argument(
+        "--size",
+        type=int,
+        nargs=2,
+        default=(225, 400),
+        metavar=("H", "W"),
+        help="height and width of each image in pixels",
+    )
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
-    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--threads", type=int, default=2, help="threads of torch on the CPU")
     parser.add_argument("--amp", action="store_true", help="mixed precision")
-    parser.add_argument("--cuda-graphs", action="store_true", help="frames that are replayed")
-    parser.add_argument("--repeats", type=int, default=20)
+    parser.add_argument("--cuda-graphs", action="store_true", help="replay frames as CUDA graphs")
+    parser.add_argument("--repeats", type=int, default=20, help="number of measured calls")
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure and print the shortest time of a frame, of a known rig and of a new one.
+    """Measure and print the shortest time of one frame.
+
+    ``live`` prepares the calibration once, before the measurement. ``predict_images`` prepares it
+    in each call.
 
     Args:
         args: Parsed options of ``add_arguments``.
     """
     torch.set_num_threads(args.threads)
+    cuda_graphs = True if args.cuda_graphs else None  # None: the default of the model
     inferencer = MapInferencer(
-        args.model, device=args.device, amp=args.amp, cuda_graphs=args.cuda_graphs or None
+        args.model, device=args.device, amp=args.amp, cuda_graphs=cuda_graphs
     )
     names = inferencer.cfg.test_dataloader.dataset.cameras
     height, width = args.size
@@ -39,8 +50,8 @@ def run(args: argparse.Namespace) -> None:
     images = dict.fromkeys(names, pixels)
     img_from_cam = np.eye(4)  # intrinsics of `ring_of_cameras`
     img_from_cam[:2, :3] = [[width / 2, 0, width / 2], [0, width / 2, height / 2]]
-    img_from_frame = ring_of_cameras(len(names), height, width=width)
-    cam_from_frame = np.linalg.inv(img_from_cam) @ img_from_frame
+    img_from_frame = ring_of_cameras(len(names), height=height, width=width)  # (V, 4, 4)
+    cam_from_frame = np.linalg.inv(img_from_cam) @ img_from_frame  # (V, 4, 4)
     intrinsics = dict.fromkeys(names, img_from_cam[:3, :3])
     extrinsics = dict(zip(names, cam_from_frame, strict=True))
     live = inferencer.live(intrinsics, extrinsics)
@@ -54,8 +65,9 @@ def run(args: argparse.Namespace) -> None:
     for name, call in calls.items():
         cost = measure(call, torch.device(args.device), repeats=args.repeats)
         rows.append([name, f"{1000 * cost.cpu_s:.1f}", f"{1000 * cost.wall_s:.1f}"])
-    print(
+    title = (
         f"{args.model}, {len(names)} images of {height} x {width}, {args.device}, {args.threads} "
-        f"threads, torch {torch.__version__}\n\n"
-        f"{markdown_table(['one frame', 'processor, ms', 'wall clock, ms'], rows)}"
+        f"threads, torch {torch.__version__}"
     )
+    table = markdown_table(["one frame", "processor, ms", "wall clock, ms"], rows)
+    print(f"{title}\n\n{table}")

@@ -1,4 +1,4 @@
-"""Processes of a comparison: training, test, exit states and common progress."""
+"""Processes of a comparison: training and test of each run, and the progress of all runs."""
 
 import json
 import os
@@ -26,7 +26,7 @@ _MESSAGE_LENGTH = 200  # characters of a failed run's error
 
 
 def devices() -> list[str | None]:
-    """GPUs, each for one run at a time; without a GPU, None for the CPU."""
+    """Values of ``CUDA_VISIBLE_DEVICES`` for single GPUs; only None, the CPU, without a GPU."""
     count = torch.cuda.device_count()
     if not count:
         return [None]
@@ -37,7 +37,7 @@ def devices() -> list[str | None]:
 
 
 def machine() -> str:
-    """Name and number of the GPUs, or of the processor cores."""
+    """Number and name of the GPUs; without a GPU, of the processor cores."""
     if torch.cuda.is_available():
         return f"{torch.cuda.device_count()} x {torch.cuda.get_device_name()}"
     model = re.search(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text())
@@ -46,7 +46,10 @@ def machine() -> str:
 
 
 class Job:
-    """Training and test of one run on one device, in a process that ends with this one.
+    """Training and test of one run on one device.
+
+    The training and the test are the two stages of a job. Each is a child process, which the
+    system ends together with this process.
 
     Args:
         run: The run. Its folder is locked until the end of the job.
@@ -59,8 +62,9 @@ class Job:
     def __init__(self, run: Run, device: str | None) -> None:
         self.run = run
         self.device = device
-        require_no_link(run.folder, run.folder.parent.parent)
-        self._lock = lock_folder(run.folder, ".lock", "wait for its end")
+        comparison_folder = run.folder.parent.parent
+        require_no_link(run.folder, below=comparison_folder)
+        self._lock = lock_folder(run.folder, name=".lock", advice="wait for its end")
         write_text(run.folder / SETTINGS, json.dumps(plain(run.settings), indent=1))
         self.record: dict[str, Any] = {"machine": machine(), "load_at_start": os.getloadavg()[0]}
         for stage, command in run.commands().items():
@@ -71,18 +75,19 @@ class Job:
 
     @property
     def _log(self) -> Path:
-        """File with the output of the stage."""
+        """File with the output of the current stage."""
         return self.run.folder / f"{self.stage}.log"
 
     def _start(self) -> None:
-        """Start the process of a stage."""
-        environment = {**os.environ, "PYTHON": sys.executable}  # for the script of several ranks
+        """Start the process of the current stage."""
+        environment = {**os.environ, "PYTHON": sys.executable}  # read by `tools/dist_run.sh`
         if self.device is None:
             environment.setdefault("OMP_NUM_THREADS", "1")
         else:
             environment["CUDA_VISIBLE_DEVICES"] = self.device
         with open_to_append(self._log) as log:
-            self._begin = log.seek(0, os.SEEK_END)  # after the output of an attempt that was killed
+            # in bytes; a killed attempt may have written to the file before
+            self._log_start = log.seek(0, os.SEEK_END)
             self._process = subprocess.Popen(
                 self.run.commands()[self.stage],
                 env=environment,
@@ -92,8 +97,12 @@ class Job:
             )
 
     def poll(self) -> bool:
-        """Poll the process: start the test after the training, record the end of the test."""
-        if not self._has_ended():
+        """Start the test if the training has ended; record the end of the test or a failure.
+
+        Returns:
+            Whether the job has ended.
+        """
+        if not self._collect_process():
             return False
         code = self._process.returncode
         if code != 0:
@@ -107,26 +116,33 @@ class Job:
         self.end("done")
         return True
 
-    def _has_ended(self) -> bool:
-        """Whether the process has ended; updates the peak memory of its largest process."""
+    def _collect_process(self) -> bool:
+        """Record exit code and peak memory if the process has ended; return whether it has."""
         pid, status, usage = os.wait4(self._process.pid, os.WNOHANG)
         if pid == 0:
             return False
         self._process.returncode = os.waitstatus_to_exitcode(status)
-        self._peak_mib = max(self._peak_mib, usage.ru_maxrss // 1024)
+        peak_mib = usage.ru_maxrss // 1024  # Linux counts in KiB
+        self._peak_mib = max(self._peak_mib, peak_mib)
         return True
 
     def _error_message(self) -> str:
         """First error in the output of the stage, or else its last line."""
-        text = self._log.read_bytes()[self._begin :].decode(errors="replace")
+        text = self._log.read_bytes()[self._log_start :].decode(errors="replace")
         lines = text.splitlines()
         errors = [line for line in lines if line.startswith("error: ")]
         if errors:
             return errors[0][:_MESSAGE_LENGTH]
-        return lines[-1][:_MESSAGE_LENGTH] if lines else ""
+        if not lines:
+            return ""
+        return lines[-1][:_MESSAGE_LENGTH]
 
     def end(self, state: str) -> None:
-        """Stop a process that still runs, record the state of the run and unlock its folder."""
+        """End the job: kill its process if it runs, record the state and unlock the folder.
+
+        Args:
+            state: ``done``, or a sentence about the failure.
+        """
         if self._process.returncode is None:
             self._process.kill()
             self._process.wait()
@@ -140,32 +156,42 @@ def execute(runs: Sequence[Run]) -> Iterator[tuple[Run, str]]:
     """Train and test the unfinished runs, one after another on each device.
 
     Args:
-        runs: From `plan`.
+        runs: Runs of the comparison, including finished ones.
 
     Yields:
-        Each run at its end, with its state: ``done``, or the fault.
+        Each run when it has ended, with its state: ``done``, or a sentence about the failure.
     """
     waiting = deque(run for run in runs if not run.done)
     jobs: dict[str | None, Job] = {}
-    places = devices()
+    usable_devices = devices()
     initial = sum(run.position for run in runs)
     total = sum(run.iterations for run in runs)
-    options = {"unit": "iterations", "smoothing": 0, "disable": not waiting}
-    with Progress(initial=initial, total=total, **options) as bar:
+    progress = Progress(
+        initial=initial,
+        total=total,
+        unit="iterations",
+        smoothing=0,  # mean speed since the start
+        disable=not waiting,
+    )
+    with progress as bar:
         try:
             while waiting or jobs:
-                for device in places:
+                for device in usable_devices:
                     if device not in jobs and waiting:
                         jobs[device] = Job(waiting.popleft(), device)
                 for job in list(jobs.values()):
                     if job.poll():
                         del jobs[job.device]
                         yield job.run, job.record["state"]
-                stages = [f"{job.run.label} {job.stage}s" for job in jobs.values()]
+                stages = []
+                for job in jobs.values():
+                    stages.append(f"{job.run.label} {job.stage}s")  # "NAME trains", "NAME tests"
                 done = f"{sum(run.done for run in runs)} of {len(runs)} runs done"
                 bar.set_description(", ".join([done, *stages]), refresh=False)
-                bar.update(sum(run.position for run in runs) - bar.n)
-                time.sleep(_PAUSE_S if jobs else 0)
+                position = sum(run.position for run in runs)
+                bar.update(position - bar.n)  # takes the increment
+                if jobs:
+                    time.sleep(_PAUSE_S)
         finally:
             for job in jobs.values():
                 job.end("cut off")

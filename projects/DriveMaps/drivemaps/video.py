@@ -17,12 +17,12 @@ from gsmap.visualization.style import MapStyle
 def write_video(path: str | Path, replay: Replay, width_px: int = 1280) -> None:
     """Write a drive as a video in H.264 (``.mp4``) that plays in real time.
 
-    A panel with the predictions of the frame is followed by one with the map so far, unless the
-    map is empty.
+    Each picture shows the cameras, the predictions of the frame from above and, unless the map of
+    the drive is empty, the map up to the frame.
 
     Args:
         path: File to write.
-        replay: Drive and its map.
+        replay: Drive with its predictions, map and images.
         width_px: Width of the video in pixels.
 
     Raises:
@@ -30,12 +30,12 @@ def write_video(path: str | Path, replay: Replay, width_px: int = 1280) -> None:
         RuntimeError: If ``av`` (PyAV) is missing.
     """
     times_ns = [frame.sample.timestamp_ns for frame in replay.drive.frames]
-    pictures = (_draw_moment(moment, replay, width_px) for moment in replay.moments())
+    pictures = (_draw_moment(moment, replay, width_px=width_px) for moment in replay.moments())
     write_film(path, pictures, times_ns)
 
 
 def _draw_moment(moment: Moment, replay: Replay, width_px: int) -> np.ndarray:
-    """Draw one frame of a drive as RGB. (H, W, 3) uint8"""
+    """Draw a frame and the map up to it as an RGB image. (H, W, 3), uint8"""
     frame = moment.frame
     sample = frame.sample
     drive = replay.drive
@@ -44,20 +44,22 @@ def _draw_moment(moment: Moment, replay: Replay, width_px: int) -> np.ndarray:
         moment.lines, labels=elements.labels, scores=elements.scores
     )
     panels = [BEVPanel("Prediction", predictions)]
-    if len(replay.elements):
+    has_map = len(replay.elements) > 0
+    if has_map:
         lines = []
         labels = []
         for label, points in moment.map_lines:
-            lines.append(frame.to_frame(points[:, :2]))
+            global_xy = points[:, :2]
+            lines.append(frame.to_frame(global_xy))
             labels.append(label)
         panels.append(BEVPanel("Map so far", MapElements.from_polylines(lines, labels)))
     cameras = []
     if replay.data_root is not None:
-        cameras = camera_views(sample.cameras, replay.data_root, sample.token)
+        cameras = camera_views(sample.cameras, replay.data_root, token=sample.token)
     figure = compose_figure(
         cameras,
         panels,
-        grid=BEVGrid(drive.x_range, drive.y_range),
+        grid=BEVGrid(x_range=drive.x_range, y_range=drive.y_range),
         view=replay.view.with_mounting(sample.ego_from_frame),
         style=MapStyle(classes=drive.classes),
         camera_elements=predictions,

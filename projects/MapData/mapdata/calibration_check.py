@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from gsmap.datasets.annotations.record import RANGES, CameraRecord, MapSample
 from gsmap.datasets.image_files import image_size
-from gsmap.datasets.plausibility import calibration_warnings as calibration_warnings
+from gsmap.datasets.plausibility import calibration_warnings as calibration_warnings  # public here
 from gsmap.datasets.source import ground_from_frame
 from gsmap.structures.elements import MapElements
 from gsmap.structures.frames import frame_view
@@ -19,9 +19,12 @@ from gsmap.visualization.camera_view import camera_views
 from gsmap.visualization.figure import compose_figure
 from gsmap.visualization.style import MapStyle
 
-_REACH_M = 30.0
+_REACH_M = 30.0  # of the ground lines, ahead of and behind the vehicle
+_SIDE_REACH_M = 15.0  # to the left and right of it
+_WEDGE_M = 6.0  # length of a field of view in the panel from above
 _WIDTH_PX = 3200  # six cameras of about 750 px, large enough to see an error of a few centimetres
-_LINES = ("ahead", "left", "every_5_m", "behind", "right", "cameras")
+# Classes of the drawn lines; "cameras" are the fields of view. The order decides the colours.
+_LINE_CLASSES = ("ahead", "left", "every_5_m", "behind", "right", "cameras")
 
 
 def image_warnings(sample: MapSample, data_root: Path) -> list[str]:
@@ -29,7 +32,7 @@ def image_warnings(sample: MapSample, data_root: Path) -> list[str]:
 
     Args:
         sample: The sample.
-        data_root: Folder that its paths are relative to; images that do not exist are ignored.
+        data_root: Folder that image paths are relative to. Missing images are ignored.
 
     Returns:
         A line for each such image.
@@ -55,7 +58,7 @@ def calibration_figure(
     Args:
         sample: The sample.
         frame: Annotation frame of the sample, ``lidar`` or ``ego``.
-        data_root: Folder that its paths are relative to; an image that does not exist is grey.
+        data_root: Folder that image paths are relative to. A missing image is drawn in grey.
         ground_z_m: Height of the road in the frame in metres, as in ``AnnotationMeta``.
 
     Returns:
@@ -65,14 +68,14 @@ def calibration_figure(
     lines = _ground_lines(frame_from_ground)
     wedges = []
     for camera in sample.cameras:
-        wedges.append(("cameras", _wedge(camera, frame_from_ground)))
+        wedges.append(("cameras", _field_of_view(camera, frame_from_ground)))
     x_range, y_range = RANGES[frame]
     return compose_figure(
-        cameras=camera_views(sample.cameras, data_root, sample.token, grey=True),
+        cameras=camera_views(sample.cameras, data_root, token=sample.token, grey=True),
         panels=[BEVPanel("From above", _elements([*lines, *wedges]))],
         grid=BEVGrid(x_range=x_range, y_range=y_range),
         view=frame_view(frame, ground_z_m=ground_z_m).with_mounting(sample.ego_from_frame),
-        style=MapStyle(classes=_LINES),
+        style=MapStyle(classes=_LINE_CLASSES),
         camera_elements=_elements(lines),
         title=f"ground plane of {sample.token}",
         width_px=_WIDTH_PX,
@@ -80,21 +83,22 @@ def calibration_figure(
 
 
 def _elements(lines: Sequence[tuple[str, np.ndarray]]) -> MapElements:
-    """Lines as map elements, whose labels are positions in ``_LINES``."""
+    """Convert pairs (class, points (n, 3)) to map elements with indices of ``_LINE_CLASSES``."""
     polylines = []
     labels = []
     for name, points in lines:
         polylines.append(points)
-        labels.append(_LINES.index(name))
+        labels.append(_LINE_CLASSES.index(name))
     return MapElements.from_polylines(polylines, labels)
 
 
 def _ground_lines(frame_from_ground: np.ndarray) -> list[tuple[str, np.ndarray]]:
-    """Lines on the road, in the annotation frame, in metres. each (name, (2, 3))"""
+    """Lines on the road: pairs of a class and two points (2, 3), in metres in the frame."""
     reach = _REACH_M
-    side = 15.0
+    side = _SIDE_REACH_M
     ends = []
-    offsets = [offset for offset in np.arange(-reach, reach + 1, 5.0) if offset]
+    # the lines through 0 have classes of their own, below
+    offsets = [offset for offset in np.arange(-reach, reach + 1, 5.0) if offset != 0]
     for x in offsets:
         ends.append(("every_5_m", (x, -side), (x, side)))
     for y in offsets:
@@ -107,20 +111,23 @@ def _ground_lines(frame_from_ground: np.ndarray) -> list[tuple[str, np.ndarray]]
     lines = []
     for name, (start_x, start_y), (end_x, end_y) in ends:
         points = np.array([[start_x, start_y, 0, 1], [end_x, end_y, 0, 1]])
-        lines.append((name, (points @ frame_from_ground.T)[:, :3]))
+        points_in_frame = points @ frame_from_ground.T  # (2, 4)
+        lines.append((name, points_in_frame[:, :3]))
     return lines
 
 
-def _wedge(camera: CameraRecord, frame_from_ground: np.ndarray) -> np.ndarray:
-    """Outline of a camera's field of view up to 6 m, on the road, in the frame. (4, 3)"""
+def _field_of_view(camera: CameraRecord, frame_from_ground: np.ndarray) -> np.ndarray:
+    """Triangle of a camera's horizontal field of view on the road, in the frame. (4, 3)"""
     intrinsics = camera.intrinsics
     ground_from_cam = invert_rigid(camera.cam_from_frame @ frame_from_ground)
     rotation = ground_from_cam[:3, :3]
     centre = ground_from_cam[:3, 3]
     tips = []
-    for u in (0, camera.width):
-        ray = rotation @ [(u - intrinsics[0, 2]) / intrinsics[0, 0], 0, 1]
-        tips.append(centre + 6 * ray / np.linalg.norm(ray))
+    for u in (0, camera.width):  # left and right edge, in the row of the optical axis
+        slope = (u - intrinsics[0, 2]) / intrinsics[0, 0]
+        ray = rotation @ [slope, 0, 1]
+        tips.append(centre + _WEDGE_M * ray / np.linalg.norm(ray))
     outline = np.array([centre, *tips, centre])
-    outline[:, 2] = 0
-    return np.column_stack([outline, np.ones(4)]) @ frame_from_ground.T[:, :3]
+    outline[:, 2] = 0  # down to the road
+    homogeneous = np.column_stack([outline, np.ones(4)])
+    return homogeneous @ frame_from_ground.T[:, :3]

@@ -22,7 +22,7 @@ from gsmap.utils.files import partial_path
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
 from gsmap.utils.shards import add_shard_options
-from mapdata.argoverse2.log import POSES, RING_CAMERAS, Argoverse2Log, find_logs
+from mapdata.argoverse2.log import POSE_TABLE, RING_CAMERAS, Argoverse2Log, find_logs
 from mapdata.argoverse2.map import find_map
 from mapdata.argoverse2.samples import thin_out
 from mapdata.command_line import add_log_options, add_workers_option, options_from
@@ -194,7 +194,7 @@ def _copy_log(log_dir: Path, calibrated_log: Argoverse2Log, target: Path, scale:
         scale: Size of the pictures relative to the real images, in (0, 1].
     """
     shutil.copytree(log_dir / "map", target / "map", copy_function=shutil.copyfile)
-    shutil.copyfile(log_dir / POSES, target / POSES)
+    shutil.copyfile(log_dir / POSE_TABLE, target / POSE_TABLE)
     (target / "calibration").mkdir()
     extrinsics = "calibration/egovehicle_SE3_sensor.feather"
     shutil.copyfile(calibrated_log.log_dir / extrinsics, target / extrinsics)

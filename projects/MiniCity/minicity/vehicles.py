@@ -8,14 +8,17 @@ import numpy as np
 from minicity.curves import Array, rectangle
 from minicity.meshes import Color, FrozenMesh, Mesh, patch, prism_faces
 
-Size = tuple[float, float, float]
+Size = tuple[float, float, float]  # length, width, height in metres
 TYRES: Color = (34.0, 34.0, 34.0)
 GLASS: Color = (74.0, 62.0, 53.0)
 TROUSERS: Color = (70.0, 58.0, 52.0)
 SKIN: Color = (120.0, 150.0, 190.0)
 TAIL_LIGHT: Color = (40.0, 40.0, 215.0)
 HEAD_LIGHT: Color = (225.0, 235.0, 235.0)
-BACK_FACE, FRONT_FACE, TOP_FACE = 1, 3, 4
+# indices of the faces from `prism_faces`
+BACK_FACE = 1
+FRONT_FACE = 3
+TOP_FACE = 4
 
 
 @dataclass(frozen=True)
@@ -23,60 +26,66 @@ class Vehicle:
     """Vehicle or person at one moment.
 
     Attributes:
-        category: nuScenes category; ``human.*`` has the shape of a person, ``vehicle.car`` a cabin.
+        category: nuScenes category. ``human.*`` is drawn as a person, ``vehicle.car`` as a car with
+            a cabin, any other as a tall box with windows.
         center: x, y, z of the box's centre in the world, in metres. (3,)
         yaw_rad: Heading in radians, anticlockwise from +x.
         size: Length, width, height in metres.
         color: Colour of the paint, BGR in [0, 255].
-        identity: Name, constant through a scene.
+        identity: Name of the object, constant through a scene.
         speed: Speed in m/s.
     """
 
     category: str
     center: Array
     yaw_rad: float
-    size: tuple[float, float, float]
+    size: Size
     color: Color
     identity: str = ""
     speed: float = 0.0
 
 
 def _body(size: Size, back: float, front: float, width: float) -> Array:
-    """Rectangle in shares of a vehicle's size, from -0.5 at its back to 0.5 at its front. (4, 2)"""
+    """Rectangle in metres around the origin, heading along +x. (4, 2)
+
+    ``back`` and ``front`` are shares of the length, -0.5 to 0.5. ``width`` is a share of the width.
+    """
     center = np.array([(back + front) / 2 * size[0], 0.0])
     length_m = (front - back) * size[0]
     return rectangle(center, 0.0, length_m=length_m, width_m=width * size[1])
 
 
 def _add_lights(mesh: Mesh, face: Array, color: Color) -> None:
-    """Add two lamps to a face (4, 3)."""
-    for left, right in ((0.04, 0.22), (0.78, 0.96)):
+    """Add two lamps to a face with corners as in `patch`. (4, 3)"""
+    for left, right in ((0.04, 0.22), (0.78, 0.96)):  # edges as shares of the width of the face
         lamp = patch(face, left, right, bottom=0.5, top=0.8)
         mesh.add_quad(lamp, color, layer=2, glow=True)
 
 
-def _add_motor(mesh: Mesh, size: Size, color: Color, tall: bool) -> None:
+def _add_motor_vehicle(mesh: Mesh, size: Size, color: Color, tall: bool) -> None:
     """Add a car with a cabin on its body, or a tall box with windows along its sides."""
     height = size[2]
-    shoulder = height * (0.9 if tall else 0.55)
+    shoulder_share = 0.9 if tall else 0.55
+    shoulder_m = height * shoulder_share  # top of the body
     outline = _body(size, back=-0.5, front=0.5, width=1.0)
-    for face in prism_faces(outline, low_m=0.0, high_m=0.28):
+    for face in prism_faces(outline, low_m=0.0, high_m=0.28):  # wheels, as one dark box
         mesh.add_quad(face, TYRES, layer=0)
-    body = prism_faces(outline, low_m=0.22, high_m=shoulder, top_scale=0.97)
-    for k, face in enumerate(body):
+    body = prism_faces(outline, low_m=0.22, high_m=shoulder_m, top_scale=0.97)
+    for index, face in enumerate(body):
         mesh.add_quad(face, color, layer=1)
-        if k == BACK_FACE:
+        if index == BACK_FACE:
             _add_lights(mesh, face, color=TAIL_LIGHT)
-        elif k == FRONT_FACE:
+        elif index == FRONT_FACE:
             _add_lights(mesh, face, color=HEAD_LIGHT)
-        if tall and k != TOP_FACE:
+        if tall and index != TOP_FACE:
             window = patch(face, left=0.05, right=0.95, bottom=0.55, top=0.85)
             mesh.add_quad(window, GLASS, layer=2)
     if not tall:
-        outline = _body(size, back=-0.42, front=0.22, width=0.92)
-        cabin = prism_faces(outline, low_m=shoulder, high_m=height, top_scale=0.82)
-        for k, face in enumerate(cabin):
-            mesh.add_quad(face, color if k == TOP_FACE else GLASS, layer=3)
+        cabin_outline = _body(size, back=-0.42, front=0.22, width=0.92)
+        cabin = prism_faces(cabin_outline, low_m=shoulder_m, high_m=height, top_scale=0.82)
+        for index, face in enumerate(cabin):
+            face_color = color if index == TOP_FACE else GLASS
+            mesh.add_quad(face, face_color, layer=3)
 
 
 def _add_person(mesh: Mesh, size: Size, color: Color) -> None:
@@ -88,42 +97,46 @@ def _add_person(mesh: Mesh, size: Size, color: Color) -> None:
     torso = _body(size, back=-0.4, front=0.4, width=1.0)
     for face in prism_faces(torso, low_m=0.46 * height, high_m=0.84 * height):
         mesh.add_quad(face, color, layer=1)
-    mesh.add_disc(np.array([0.0, 0.0, 0.92 * height]), 0.08 * height, color=SKIN)
+    head_center = np.array([0.0, 0.0, 0.92 * height])
+    mesh.add_disc(head_center, radius_m=0.08 * height, color=SKIN)
 
 
 @lru_cache(maxsize=4096)
 def _template(category: str, size: Size, color: Color) -> FrozenMesh:
     """Mesh of a vehicle or person at the origin, on z = 0 and heading along +x."""
     mesh = Mesh()
-    mesh.begin(np.array([0.0, 0.0, size[2] / 2]))
+    mesh.begin(anchor=np.array([0.0, 0.0, size[2] / 2]))
     if category.startswith("human"):
         _add_person(mesh, size, color=color)
     else:
-        _add_motor(mesh, size, color=color, tall=category != "vehicle.car")
+        is_tall = category != "vehicle.car"
+        _add_motor_vehicle(mesh, size, color=color, tall=is_tall)
     return mesh.freeze()
 
 
 def vehicle_mesh(vehicles: list[Vehicle]) -> FrozenMesh:
-    """Mesh of vehicles and people in the world. The object index is the position in the list."""
+    """Mesh of vehicles and people in the world, with one object for each, in their order."""
     if not vehicles:
         return Mesh().freeze()
     templates = [_template(v.category, v.size, color=v.color) for v in vehicles]
-    numbers = np.arange(len(templates))
-    quad_groups = np.repeat(numbers, [len(t.quads) for t in templates])
-    disc_groups = np.repeat(numbers, [len(t.discs) for t in templates])
+    objects = np.arange(len(templates))
+    quad_groups = np.repeat(objects, [len(t.quads) for t in templates])  # object of each quad
+    disc_groups = np.repeat(objects, [len(t.discs) for t in templates])  # object of each disc
     yaw = np.array([v.yaw_rad for v in vehicles])
-    turn = np.zeros((len(vehicles), 3, 3))
+    turn = np.zeros((len(vehicles), 3, 3))  # rotations about z
     turn[:, 0, 0] = np.cos(yaw)
     turn[:, 0, 1] = -np.sin(yaw)
     turn[:, 1, 0] = np.sin(yaw)
     turn[:, 1, 1] = np.cos(yaw)
     turn[:, 2, 2] = 1.0
     centers = np.array([v.center for v in vehicles])
-    floor = centers - np.array([[0.0, 0.0, v.size[2] / 2] for v in vehicles])
+    half_heights = np.array([[0.0, 0.0, v.size[2] / 2] for v in vehicles])
+    floor = centers - half_heights  # centres of the bottoms
     quads = np.concatenate([t.quads for t in templates])
     discs = np.concatenate([t.discs for t in templates])
     discs[:, :3] += floor[disc_groups]
-    world_quads = np.einsum("fij,fkj->fki", turn[quad_groups], quads) + floor[quad_groups][:, None]
+    turned_quads = np.einsum("fij,fkj->fki", turn[quad_groups], quads)  # (F, 4, 3)
+    world_quads = turned_quads + floor[quad_groups][:, None]
     return FrozenMesh(
         quads=world_quads,
         colors=np.concatenate([t.colors for t in templates]),

@@ -30,10 +30,10 @@ class Predictor(Protocol):
     """Interface of `MapInferencer` that a `LiveMap` uses."""
 
     cfg: Config
-    model: Any  # of `load_model`
+    model: Any  # MapDetector from `load_model`
 
     def dataset(self, source: Source) -> "VectorizedMapDataset":
-        """Open samples as the test data set of the config."""
+        """Create the test data set of the config with other samples."""
 
     def predict(
         self, dataset: "VectorizedMapDataset", *, allow_missing_cameras: bool, stream: Any
@@ -43,7 +43,7 @@ class Predictor(Protocol):
         Args:
             dataset: From ``dataset``.
             allow_missing_cameras: Whether cameras of the model may be absent.
-            stream: Drive that the samples continue, or None.
+            stream: Memory of the earlier frames of the drive; None for independent samples.
         """
 
     def elements(self, data_sample: "Det3DDataSample") -> MapElements:
@@ -54,8 +54,8 @@ class LiveMap:
     """Predictor of the map around a vehicle, from images in memory.
 
     Use ``MapInferencer.live`` to create it. The calibration is prepared at the first frame, and
-    again if an image size changes. Frames are independent of each other unless a stream is given:
-    it has the memory of a model with ``temporal``.
+    again if an image size changes. Frames are independent of each other, unless a stream is given.
+    It holds the state of a temporal model between frames.
 
     Args:
         inferencer: The trained model.
@@ -64,9 +64,9 @@ class LiveMap:
             metres, by name or as a list. (4, 4) each
         frame: ``vehicle`` (x ahead, y left, on the road below the rear axle), or an annotation
             frame: ``lidar`` (x right, y ahead, at a roof LiDAR) or ``ego`` (x ahead, y left, at the
-            rear axle). By default the frame of the config. The annotation frame of the model has
-            the pose of the training data on the vehicle; the other one has the usual pose of
-            nuScenes and Argoverse 2.
+            rear axle). By default the frame of the config. If it is the frame that the model was
+            trained in, its pose on the vehicle is taken from the training data, otherwise from
+            nuScenes (``lidar``) or Argoverse 2 (``ego``).
         allow_missing_cameras: Whether cameras of the model may be absent.
     """
 
@@ -84,9 +84,12 @@ class LiveMap:
         self._cam_from_frame = cam_from_frame
         self._frame = frame or self._config.get("frame") or "lidar"
         self._allow_missing_cameras = allow_missing_cameras
-        self._sizes: dict[str, tuple[int, ...]] = {}
+        self._sizes: dict[str, tuple[int, ...]] = {}  # shape of the last image of each camera
         self._logged_warnings: set[str] = set()
+        # Set by `_prepare`: the data set of one sample, and the transform from the annotation frame
+        # of the model to the frame of the calibration. (4, 4)
         self._dataset: VectorizedMapDataset
+        self._calibration_from_model: np.ndarray
 
     def __call__(
         self,
@@ -100,15 +103,15 @@ class LiveMap:
         Args:
             images: Images of the cameras, as `predict` takes them. (H, W, 3) each
             can_bus: Vehicle signals, as `predict` takes them. (18,)
-            at: Name, scene, time and pose of the frame, if there is a stream.
-            stream: Drive that the frame continues.
+            at: Place of the frame in the stream, as `predict` takes it.
+            stream: Memory of the earlier frames of the drive, as `predict` takes it.
 
         Returns:
             The elements in the frame of the calibration, in metres.
 
         Raises:
-            TypeError: As `predict`.
-            ValueError: As `predict`.
+            TypeError: As in `predict`.
+            ValueError: As in `predict`.
         """
         data_sample = self.predict(images, can_bus=can_bus, at=at, stream=stream)
         elements = self._inferencer.elements(data_sample)
@@ -128,10 +131,10 @@ class LiveMap:
                 the training images. (H, W, 3) each
             can_bus: Vehicle signals, as `motion_signals` computes them from poses. Without them, a
                 model that was trained with signals assumes a standing vehicle. (18,)
-            at: Name, scene, time and pose of the frame, if there is a stream. The pose is the
+            at: Name, scene, time and pose of the frame. Required with ``stream``. The pose is the
                 transform from the frame of the calibration to the world, in metres.
-            stream: Drive that the frame continues (``MapInferencer.new_stream``), for a model with
-                memory.
+            stream: Memory of the earlier frames of the drive, from ``MapInferencer.new_stream``.
+                For temporal models only.
 
         Returns:
             The sample with ``pred_instances_3d`` on the CPU, in the annotation frame of the config.
@@ -139,9 +142,10 @@ class LiveMap:
         Raises:
             TypeError: If an image is not uint8.
             ValueError: If an array has another shape, a matrix is not a valid intrinsic matrix or
-                pose, or a signal is not finite; if the cameras of the arguments differ from each
-                other or from the model's; if only one of ``at`` and ``stream`` is given, the model
-                has no memory, or the frame is not later than the last frame of the stream.
+                pose, or a signal is not finite. If the cameras of the arguments differ from each
+                other or from the cameras of the model. If only one of ``at`` and ``stream`` is
+                given, a stream is given for a model that is not temporal, or the frame is not
+                later than the last frame of the stream.
         """
         if (at is None) != (stream is None):
             raise InputError(
@@ -158,13 +162,17 @@ class LiveMap:
         self._dataset.images_in_memory = pixels
         signals = None if can_bus is None else np.asarray(can_bus, dtype=float)
         self._dataset.can_bus_in_memory = signals
-        frame = None if self._inferencer.model.temporal is None else _SINGLE_FRAME
         if at is not None:
             frame = replace(at, pose=at.pose @ self._calibration_from_model)
+        elif self._inferencer.model.temporal is not None:
+            frame = _SINGLE_FRAME
+        else:
+            frame = None
         self._dataset.frame_in_memory = frame
-        (data_sample,) = self._inferencer.predict(
+        predictions = self._inferencer.predict(
             self._dataset, allow_missing_cameras=self._allow_missing_cameras, stream=stream
         )
+        (data_sample,) = predictions  # the data set has one sample
         return data_sample
 
     def _prepare(self, pixels: dict[str, np.ndarray]) -> None:
@@ -173,28 +181,34 @@ class LiveMap:
         Args:
             pixels: BGR images by the name of the camera. (H, W, 3) each
         """
-        mount = self._inferencer.model.mount
+        training_mount = self._inferencer.model.mount  # place of the frame in the training vehicle
+        mount = training_mount if self._frame == training_mount.frame else None
         source = source_in_memory(
             pixels,
             intrinsics=self._intrinsics,
             cam_from_frame=self._cam_from_frame,
             frame=self._frame,
-            mount=mount if self._frame == mount.frame else None,
+            mount=mount,
         )
         for line in calibration_warnings(source.samples, source.frame, source.ground_z_m):
             if line not in self._logged_warnings:
                 _LOGGER.warning("calibration: %s", line)
                 self._logged_warnings.add(line)
-        unknown = set(pixels) - set(self._config.get("cameras") or pixels)
+        model_cameras = self._config.get("cameras") or pixels
+        unknown = set(pixels) - set(model_cameras)
+        # if the model has none of the names, cameras are assigned to it by their directions
         if unknown and unknown != set(pixels):
             raise InputError(
                 f"the model has the cameras {list(self._config.cameras)}, but not "
-                f"{sorted(unknown)}: name all cameras as it does, or none."
+                f"{sorted(unknown)}: give all cameras names of the model, or none."
             )
         dataset = self._inferencer.dataset(source)
-        Path(dataset.ann_file).unlink()  # already read; image sizes may change many times
-        ground_from_calibration = np.eye(4)
-        if self._frame != VEHICLE:
+        # The inferencer has written a temporary annotation file and the data set has read it. It is
+        # removed now, because each change of the image sizes writes another one.
+        Path(dataset.ann_file).unlink()
+        if self._frame == VEHICLE:
+            ground_from_calibration = np.eye(4)
+        else:
             ground_from_calibration = ground_from_frame(
                 source.samples[0], frame=source.frame, ground_z_m=source.ground_z_m
             )

@@ -8,16 +8,19 @@ from gsmap.datasets.annotations.record import CameraRecord, MapSample
 from gsmap.datasets.source import ground_from_frame
 from gsmap.structures.rigid import invert_rigid
 
-_MAX_DISTANCE_M = 20.0  # of a camera from the origin of the vehicle
-_MAX_HEIGHT_M = 5.0  # of a camera above the road
-_MIN_HEIGHT_M = 0.15
+_MAX_DISTANCE_M = 20.0  # from the origin of the vehicle to a camera
+_MILLIMETRES_FROM = 300.0  # larger median distances are taken for millimetres, not centimetres
+_MIN_HEIGHT_M = 0.15  # camera above the road
+_MAX_HEIGHT_M = 5.0
 _MAX_UP_DEG = 25.0  # slope of the optical axis
 _MAX_DOWN_DEG = 65.0
-_MAX_CENTRE_OFFSET = 0.2  # of the principal point, relative to the width or height of the image
+_MAX_NAME_DEG = 110.0  # between the optical axis and the direction in the name of the camera
+# from the image centre to the principal point, relative to the width or height of the image
+_MAX_CENTRE_OFFSET = 0.2
 _MIN_FIELD_OF_VIEW_DEG = 15.0
 _MAX_FIELD_OF_VIEW_DEG = 150.0
 _SIDES = {"left": 90.0, "right": -90.0, "front": 0.0, "back": 180.0, "rear": 180.0}
-"""Azimuth in degrees, anticlockwise from ahead, by a word in the name of a camera."""
+"""Azimuth of a camera in degrees, anticlockwise from ahead; the keys are words in camera names."""
 
 
 def calibration_warnings(
@@ -31,29 +34,31 @@ def calibration_warnings(
         ground_z_m: Height of the road in the frame in metres, as in ``AnnotationMeta``.
 
     Returns:
-        Different warnings, one line each.
+        Warnings without repetitions, one line each.
     """
     first_samples: dict[str, MapSample] = {}
     for sample in samples:
         first_samples.setdefault(sample.scene, sample)
-    warnings: dict[str, None] = {}  # in the order of their first occurrence
+    warnings: list[str] = []
     for sample in first_samples.values():
         for line in _warnings(sample, frame=frame, ground_z_m=ground_z_m):
-            warnings[line] = None
-    return list(warnings)
+            if line not in warnings:
+                warnings.append(line)
+    return warnings
 
 
 def _warnings(sample: MapSample, frame: str, ground_z_m: float | None) -> Iterator[str]:
-    """Yield the warnings about all cameras of a sample."""
-    ground = ground_from_frame(sample, frame=frame, ground_z_m=ground_z_m)
-    poses = {}
+    """Yield the warnings about all cameras of a sample; arguments as in the public function."""
+    ground_from_sample = ground_from_frame(sample, frame=frame, ground_z_m=ground_z_m)
+    poses = {}  # transforms from each camera to the ground
     for camera in sample.cameras:
-        poses[camera.name] = ground @ invert_rigid(camera.cam_from_frame)
+        poses[camera.name] = ground_from_sample @ invert_rigid(camera.cam_from_frame)
     positions = np.array([pose[:3, 3] for pose in poses.values()]).reshape(-1, 3)
     distances = np.linalg.norm(positions, axis=1)
-    plausible = bool((distances < _MAX_DISTANCE_M).all())
-    if not plausible:
-        unit = "millimetres" if np.median(distances) > 300 else "centimetres"
+    is_near = bool((distances < _MAX_DISTANCE_M).all())
+    if not is_near:
+        is_large = np.median(distances) > _MILLIMETRES_FROM
+        unit = "millimetres" if is_large else "centimetres"
         yield (
             f"cameras stand up to {distances.max():.0f} m from the vehicle's origin: are positions "
             f"in {unit}? They must be in metres"
@@ -64,8 +69,8 @@ def _warnings(sample: MapSample, frame: str, ground_z_m: float | None) -> Iterat
         pose = poses[camera.name]
         lines = list(_view_warnings(camera.name, pose))
         lines += _lens_warnings(camera)
-        if plausible:
-            lines += _height_warnings(pose[2, 3])
+        if is_near:
+            lines += _height_warnings(height_m=pose[2, 3])
         for line in lines:
             yield f"camera {camera.name!r} {line}"
 
@@ -79,8 +84,10 @@ def _height_warnings(height_m: float) -> Iterator[str]:
 
 
 def _view_warnings(name: str, pose: np.ndarray) -> Iterator[str]:
-    """Yield warnings about the direction of a camera, given the pose over the ground. (4, 4)"""
-    right, down, ahead = pose[:3, :3].T
+    """Yield warnings about the direction of a camera from its transform to the ground. (4, 4)"""
+    right = pose[:3, 0]  # axes of the camera, in the frame of the ground
+    down = pose[:3, 1]
+    ahead = pose[:3, 2]
     up_deg = np.degrees(np.arcsin(np.clip(ahead[2], -1, 1)))
     if up_deg > _MAX_UP_DEG:
         yield (
@@ -97,15 +104,16 @@ def _view_warnings(name: str, pose: np.ndarray) -> Iterator[str]:
         yield "lies on its side"
     azimuth_deg = np.degrees(np.arctan2(ahead[1], ahead[0]))
     for word, side_deg in _SIDES.items():
-        difference_deg = abs((azimuth_deg - side_deg + 180) % 360 - 180)
-        if word in name.lower() and difference_deg > 110:
+        wrapped_deg = (azimuth_deg - side_deg + 180) % 360 - 180  # [-180, 180)
+        if word in name.lower() and abs(wrapped_deg) > _MAX_NAME_DEG:
             direction = "left" if azimuth_deg > 0 else "right"
             yield (
                 f"has {word!r} in its name, but looks {abs(azimuth_deg):.0f} degrees to the "
                 f"{direction}: are axes mirrored?"
             )
     left_m = pose[1, 3]
-    if abs(left_m) > 0.3 and 30 < -np.sign(left_m) * azimuth_deg < 150:
+    inward_deg = -np.sign(left_m) * azimuth_deg  # positive towards the other side of the vehicle
+    if abs(left_m) > 0.3 and 30 < inward_deg < 150:
         side = "left" if left_m > 0 else "right"
         opposite_side = "right" if left_m > 0 else "left"
         yield f"stands on the {side} and looks to the {opposite_side}: are axes mirrored?"
@@ -113,7 +121,10 @@ def _view_warnings(name: str, pose: np.ndarray) -> Iterator[str]:
 
 def _lens_warnings(camera: CameraRecord) -> Iterator[str]:
     """Yield warnings about intrinsics that do not fit the size of the image."""
-    (fx, _, cx), (_, fy, cy), _ = camera.intrinsics
+    fx = camera.intrinsics[0, 0]
+    fy = camera.intrinsics[1, 1]
+    cx = camera.intrinsics[0, 2]
+    cy = camera.intrinsics[1, 2]
     size = f"{camera.width} x {camera.height}"
     centre_offset = max(abs(cx / camera.width - 0.5), abs(cy / camera.height - 0.5))
     if centre_offset > _MAX_CENTRE_OFFSET:
@@ -123,6 +134,9 @@ def _lens_warnings(camera: CameraRecord) -> Iterator[str]:
         )
     view_deg = 2 * np.degrees(np.arctan(camera.width / 2 / fx))
     if not _MIN_FIELD_OF_VIEW_DEG <= view_deg <= _MAX_FIELD_OF_VIEW_DEG:
-        yield f"sees {view_deg:.0f} degrees, by fx = {fx:.1f} and {size} pixels: is fx in pixels?"
+        yield (
+            f"has a field of view of {view_deg:.0f} degrees, from fx = {fx:.1f} and {size} pixels: "
+            "is fx in pixels?"
+        )
     if not 0.8 < fx / fy < 1.25:
         yield f"has fx = {fx:.1f} and fy = {fy:.1f}: was the image squeezed?"

@@ -1,4 +1,4 @@
-"""Command-line arguments that the commands share; free of torch, so that ``--help`` is quick."""
+"""Shared command-line arguments. The module does not import torch, which keeps ``--help`` fast."""
 
 import argparse
 from collections.abc import Sequence
@@ -9,38 +9,43 @@ from mmengine.config import DictAction
 
 
 def data_root_options(data_root: str | Path) -> dict[str, str]:
-    """Return config overrides, by dotted name, that read every split from one folder."""
+    """Return config overrides by dotted name, which set the data root of every split."""
     splits = ("train", "val", "test")
     return {f"{split}_dataloader.dataset.data_root": str(data_root) for split in splits}
 
 
 class _OptionAction(argparse.Action):
-    """Turn an argument into config overrides; ``--cfg-options`` takes precedence over them."""
+    """Store ``--data-root`` or ``--image-scale`` and add it to the config overrides.
+
+    Overrides from ``--cfg-options`` take precedence.
+    """
 
     def __call__(
         self, parser: object, namespace: argparse.Namespace, values: Any, option: object = None
     ) -> None:
         setattr(namespace, self.dest, values)
-        overrides = data_root_options(values) if self.dest == "data_root" else {self.dest: values}
+        overrides = {self.dest: values}
+        if self.dest == "data_root":
+            overrides = data_root_options(values)
         explicit_overrides = getattr(namespace, "cfg_options", None) or {}
         namespace.cfg_options = {**overrides, **explicit_overrides}
 
 
 def add_config_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that `read_config` takes as ``cfg_options``."""
+    """Add the options that override config settings, parsed into ``cfg_options``."""
     parser.add_argument(
         "--data-root",
         type=Path,
         metavar="DIR",
         action=_OptionAction,
-        help="folder of the data set: annotation files, and root of the paths in them",
+        help="folder of the data set: its annotation files, whose paths are relative to it",
     )
     parser.add_argument(
         "--image-scale",
         type=float,
         metavar="FACTOR",
         action=_OptionAction,
-        help="scale of the images; by default to the size that a checkpoint was trained at",
+        help="scale of the images; default: to the size of the training images",
     )
     parser.add_argument(
         "--cfg-options",

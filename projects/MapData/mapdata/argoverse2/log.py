@@ -14,7 +14,7 @@ from pyarrow import feather
 from gsmap.datasets.errors import naming
 from gsmap.structures.rigid import rigid
 from gsmap.utils.errors import InputError
-from gsmap.utils.files import SUFFIX as PARTIAL
+from gsmap.utils.files import SUFFIX as PARTIAL_SUFFIX
 from gsmap.utils.inputs import heed_input
 
 # Camera order of MapTR and its successors; the camera embeddings of checkpoints depend on it.
@@ -25,7 +25,7 @@ RING_CAMERAS = (
 MAX_CAMERA_OFFSET_NS = int(SynchronizationDB.MAX_LIDAR_RING_CAM_TIMESTAMP_DIFF)  # 25 ms
 MAX_LIDAR_OFFSET_NS = int(SynchronizationDB.MAX_LIDAR_ANYCAM_TIMESTAMP_DIFF)  # 51 ms
 
-POSES = "city_SE3_egovehicle.feather"
+POSE_TABLE = "city_SE3_egovehicle.feather"
 
 # logs with an unusable map or unusable sensor data
 BROKEN_LOGS = (
@@ -41,10 +41,12 @@ MAP_CHANGE_LOGS = (
 def _read_feather(path: Path) -> Any:
     """Read a table as a pandas data frame.
 
-    The full validation raises an ``ArrowException`` for damaged tables that could otherwise crash
-    the process later.
+    The table is validated, because a damaged one could crash the process later.
+
+    Raises:
+        ArrowException: If the table is damaged.
     """
-    heed_input(path)
+    heed_input(path)  # because Arrow does not open files through Python
     table = feather.read_table(path, memory_map=False)
     table.validate(full=True)
     return table.to_pandas()
@@ -63,13 +65,13 @@ class Argoverse2Log:
 
     @cached_property
     def poses(self) -> dict[int, np.ndarray]:
-        """Transforms from the vehicle to the city, by ascending time in nanoseconds. Each (4, 4).
+        """Transforms from the vehicle to the city; the keys are ascending times in ns. Each (4, 4).
 
         Raises:
             FileNotFoundError: If the pose table is missing.
             ValueError: If the table is damaged, or a pose is not finite.
         """
-        path = self.log_dir / POSES
+        path = self.log_dir / POSE_TABLE
         if not path.is_file():
             raise FileNotFoundError(f"no poses at {path}: download the log again.")
         with naming(path, "download the log again"):
@@ -79,8 +81,9 @@ class Argoverse2Log:
             translations = table[["tx_m", "ty_m", "tz_m"]].to_numpy(np.float64)
             is_valid = np.abs(np.linalg.norm(quaternions, axis=1) - 1) < 1e-3
             is_valid &= np.isfinite(translations).all(axis=1)
-            if not is_valid.all() or len(table) == 0:
-                raise InputError(f"it holds {int((~is_valid).sum())} bad of {len(table)} poses")
+            num_invalid = int((~is_valid).sum())
+            if num_invalid > 0 or len(table) == 0:
+                raise InputError(f"{num_invalid} of its {len(table)} poses are not valid")
             times = table["timestamp_ns"].to_numpy(np.int64).tolist()
         rotations = quat_to_mat(quaternions)  # (n, 3, 3)
         poses = {}
@@ -90,11 +93,13 @@ class Argoverse2Log:
 
     @cached_property
     def city(self) -> str:
-        """Short name of the city, such as ``PIT``; empty if the map's file name has none."""
-        for path in (self.log_dir / "map").glob("log_map_archive_*____*.json"):
-            suffix = path.name.split("____")[1]  # "PIT_city_47117.json"
-            return suffix.split("_")[0]
-        return ""
+        """Short name of the city, such as ``PIT``; empty without a map file named by its city."""
+        map_paths = (self.log_dir / "map").glob("log_map_archive_*____*.json")
+        path = next(map_paths, None)
+        if path is None:
+            return ""
+        suffix = path.name.split("____")[1]  # "PIT_city_47117.json"
+        return suffix.split("_")[0]
 
     @cached_property
     def calibration(self) -> dict[str, PinholeCamera]:
@@ -107,7 +112,9 @@ class Argoverse2Log:
         cameras = {}
         with naming(folder, "download the log again"):
             intrinsics = _read_feather(intrinsics_path)
-            _read_feather(extrinsics_path)  # validates the table, which av2 reads without a check
+            _read_feather(
+                extrinsics_path
+            )  # for its validation only; av2 reads the table without one
             calibrated_names = set(intrinsics["sensor_name"])
             for name in RING_CAMERAS:
                 if name in calibrated_names:
@@ -127,12 +134,12 @@ class Argoverse2Log:
 
 
 def closest_ns(timestamps_ns: np.ndarray, wanted_ns: int, tolerance_ns: int) -> int | None:
-    """Find the time closest to a target time.
+    """Find the time closest to a wanted time.
 
     Args:
         timestamps_ns: Ascending times in nanoseconds. (n,)
-        wanted_ns: Target time in nanoseconds.
-        tolerance_ns: Largest distance from the target time in nanoseconds.
+        wanted_ns: Wanted time in nanoseconds.
+        tolerance_ns: Largest distance from the wanted time in nanoseconds.
 
     Returns:
         The closest time in nanoseconds; None if no time is within the tolerance.
@@ -140,8 +147,9 @@ def closest_ns(timestamps_ns: np.ndarray, wanted_ns: int, tolerance_ns: int) -> 
     if len(timestamps_ns) == 0:
         return None
     after = int(np.searchsorted(timestamps_ns, wanted_ns))
-    candidates = timestamps_ns[max(after - 1, 0) : after + 1]
-    closest = int(candidates[np.abs(candidates - wanted_ns).argmin()])
+    neighbours = timestamps_ns[max(after - 1, 0) : after + 1]  # the times before and after
+    index = np.abs(neighbours - wanted_ns).argmin()
+    closest = int(neighbours[index])
     return closest if abs(closest - wanted_ns) <= tolerance_ns else None
 
 
@@ -149,7 +157,7 @@ def find_logs(root: Path, split: str, logs: Sequence[str] = ()) -> list[Path]:
     """Find the logs of a split.
 
     Args:
-        root: Data root, which holds the folder of the split, directly or below ``sensor``.
+        root: Data root. The folder of the split is ``root/split`` or ``root/sensor/split``.
         split: ``train``, ``val`` or ``test``.
         logs: Ids, or first characters of ids, of the logs to take; empty takes all.
 
@@ -166,7 +174,7 @@ def find_logs(root: Path, split: str, logs: Sequence[str] = ()) -> list[Path]:
             "folder that holds train, val and test of the Argoverse 2 sensor data set "
             "(https://www.argoverse.org/av2.html#download-link)."
         )
-    log_dirs = _logs_of(folder)
+    log_dirs = _logs_of_split(folder)
     for prefix in logs:
         if not any(path.name.startswith(prefix) for path in log_dirs):
             raise FileNotFoundError(f"no log in {folder} begins with {prefix!r}.")
@@ -187,7 +195,7 @@ def find_all_logs(root: Path) -> list[Path]:
     for split in ("train", "val", "test"):
         folder = _split_folder(root, split)
         if folder is not None:
-            log_dirs += _logs_of(folder)
+            log_dirs += _logs_of_split(folder)
     if not log_dirs:
         raise FileNotFoundError(f"no Argoverse 2 log in the folders train, val and test of {root}.")
     return log_dirs
@@ -201,12 +209,12 @@ def _split_folder(root: Path, split: str) -> Path | None:
     return None
 
 
-def _logs_of(folder: Path) -> list[Path]:
+def _logs_of_split(folder: Path) -> list[Path]:
     """Sorted subfolders with a map or a pose table, without unfinished folders."""
     log_dirs = set()
-    for part in ("map", POSES):
+    for part in ("map", POSE_TABLE):
         for path in folder.glob(f"*/{part}"):
-            if path.parent.suffix != PARTIAL:
+            if path.parent.suffix != PARTIAL_SUFFIX:
                 log_dirs.add(path.parent)
     return sorted(log_dirs)
 
@@ -215,10 +223,12 @@ def logs_in(folder: Path) -> list[Path]:
     """Find the logs in a folder or at most three levels below it, as in ``sensor/val/LOG``.
 
     Returns:
-        Folders of the logs at the highest level that has logs, sorted; empty without any.
+        Sorted folders of the logs. Only the first level with logs is searched; empty if there is
+        none.
     """
     for depth in range(4):
-        pose_tables = sorted(folder.glob("*/" * depth + POSES))
+        pattern = "*/" * depth + POSE_TABLE
+        pose_tables = sorted(folder.glob(pattern))
         if pose_tables:
             return [path.parent for path in pose_tables]
     return []

@@ -35,7 +35,7 @@ def map_targets(
     rng: np.random.Generator | None = None,
     orders_of: str = "vertices",
 ) -> InstanceData:
-    """Create the training targets of a sample, like MapTR with the "v2" orders.
+    """Create the training targets of a sample, by default as MapTR does (its point orders "v2").
 
     Args:
         instances: K map elements at full resolution, in metres in the annotation frame.
@@ -43,16 +43,18 @@ def map_targets(
         x_range: Smallest and largest x in metres. Points outside are moved to the edge.
         y_range: Smallest and largest y in metres. Points outside are moved to the edge.
         dim: Coordinates per point, 2 or 3. Heights are interpolated but not clamped.
-        rng: Generator for the selection of P - 1 orders of rings with more vertices; None for an
-            even selection.
-        orders_of: With ``vertices``, a ring has an order for each vertex, in the direction of the
-            ring (MapTR). With ``points``, a ring has an order for each of its P points in both
-            directions, and a line whose ends almost meet is treated as a ring.
+        rng: Generator that selects P - 1 orders of a ring with more than P - 1 vertices; None for
+            an even selection.
+        orders_of: Starts of the orders of a ring. ``vertices``: one order starts at each vertex and
+            keeps the direction of the ring (MapTR). ``points``: two orders, forward and reversed,
+            start at each of the P - 1 different resampled points, and a line whose ends almost meet
+            is treated as a ring.
 
     Returns:
         Targets of the elements: ``labels_3d`` (K,), int64; ``pts`` (K, P, dim), the resampled
-        points; ``pts_shifts`` (K, S, P, dim), the points in S equivalent orders, where unused
-        orders are -10000; ``boxes`` (K, 4), as (x_min, y_min, x_max, y_max); ``polylines``
+        points; ``pts_shifts`` (K, S, P, dim), the points in S equivalent orders, with S =
+        max(P - 1, 2) for ``vertices`` and 2 (P - 1) for ``points``, where unused orders are
+        -10000; ``boxes`` (K, 4), as (x_min, y_min, x_max, y_max); ``polylines``
         (K, M, 2), the elements at full resolution, where the last vertex is repeated up to the
         length of the longest element; ``closed`` (K,), bool, whether an element is a ring.
         Coordinates are float32 in metres.
@@ -62,7 +64,9 @@ def map_targets(
     """
     if orders_of not in ORDERS:
         raise InputError(f"orders_of must be one of {ORDERS}, got {orders_of!r}.")
-    num_orders = max(num_points - 1, 2) if orders_of == "vertices" else 2 * (num_points - 1)
+    num_orders = 2 * (num_points - 1)
+    if orders_of == "vertices":
+        num_orders = max(num_points - 1, 2)  # an open line has two orders
     points = np.empty((len(instances), num_points, dim))
     orders = np.empty((len(instances), num_orders, num_points, dim))
     longest = max((len(instance.points) for instance in instances), default=2)
@@ -71,7 +75,7 @@ def map_targets(
     for i, instance in enumerate(instances):
         if instance.points.shape[1] < dim:
             raise InputError(
-                f"targets of dim {dim} need points of as many coordinates, got "
+                f"targets of dim {dim} need points with {dim} coordinates, got points of shape "
                 f"{instance.points.shape}."
             )
         line = instance.points[:, :dim].astype(np.float64)
@@ -82,12 +86,12 @@ def map_targets(
             is_ring = ends_meet(points[i], x_range=x_range, y_range=y_range)
             orders[i] = sampled_orders(points[i], closed=is_ring)
         polylines[i, : len(line)] = line[:, :2]
-        polylines[i, len(line) :] = line[-1, :2]
+        polylines[i, len(line) :] = line[-1, :2]  # repeat the last vertex
         closed[i] = is_closed(instance.points[:, :dim])
     is_unused = orders == PADDING
     points = clamp(points, x_range=x_range, y_range=y_range)
     orders = clamp(orders, x_range=x_range, y_range=y_range)
-    orders[is_unused] = PADDING
+    orders[is_unused] = PADDING  # `clamp` has moved it to the edge
     polylines = clamp(polylines, x_range=x_range, y_range=y_range)
     labels = [instance.label for instance in instances]
     return InstanceData(
@@ -108,22 +112,26 @@ def _float_tensor(array: np.ndarray) -> torch.Tensor:
 def ends_meet(
     points: np.ndarray, x_range: tuple[float, float], y_range: tuple[float, float]
 ) -> bool:
-    """Test whether the ends of a line are closer than a thousandth of the map along each axis.
+    """Test whether the ends of a line almost meet.
+
+    Along x and y, they are less than a thousandth of the extent of the map apart.
 
     Args:
         points: Points of the line in metres. (P, D)
         x_range: Smallest and largest x of the map in metres.
         y_range: Smallest and largest y of the map in metres.
     """
+    origin = np.array([x_range[0], y_range[0]])
     extent = np.array([x_range[1] - x_range[0], y_range[1] - y_range[0]])
-    first, last = (points[[0, -1], :2] - (x_range[0], y_range[0])) / extent
-    return bool(np.allclose(first, last, atol=1e-3))  # with the default rtol=1e-5
+    first_norm = (points[0, :2] - origin) / extent
+    last_norm = (points[-1, :2] - origin) / extent
+    return bool(np.allclose(first_norm, last_norm, atol=1e-3))
 
 
 @TRANSFORMS.register_module()
 @dataclass(eq=False)
 class FormatMapTargets(BaseTransform):
-    """Add ``gt_instances_3d``, the training targets of the map elements, see `map_targets`.
+    """Add the training targets of `map_targets` as ``gt_instances_3d``.
 
     Points have ``dim`` coordinates, as set in the data set. The orders of rings with more than
     P - 1 vertices are drawn at random in each epoch, as in MapTR.
@@ -142,9 +150,10 @@ class FormatMapTargets(BaseTransform):
         Raises:
             ValueError: If the sample has no ground truth, or has no heights and ``dim`` is 3.
         """
-        elements = ground_truth_elements(results, self)
+        elements = ground_truth_elements(results, transform=self)
         # The seed comes from the global generator, which mmengine seeds in each worker.
-        rng = np.random.default_rng(np.random.randint(2**31))  # noqa: NPY002
+        seed = np.random.randint(2**31)  # noqa: NPY002
+        rng = np.random.default_rng(seed)
         results["gt_instances_3d"] = map_targets(
             elements,
             num_points=self.num_points,
