@@ -97,7 +97,7 @@ def _ground_lines(frame_from_ground: np.ndarray) -> list[tuple[str, np.ndarray]]
     reach = _REACH_M
     side = _SIDE_REACH_M
     ends = []
-    # the lines through 0 have classes of their own, below
+    # without 0: the lines ahead, behind, left and right pass through it
     offsets = [offset for offset in np.arange(-reach, reach + 1, 5.0) if offset != 0]
     for x in offsets:
         ends.append(("every_5_m", (x, -side), (x, side)))

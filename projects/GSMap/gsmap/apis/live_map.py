@@ -200,7 +200,7 @@ class LiveMap:
         if unknown and unknown != set(pixels):
             raise InputError(
                 f"the model has the cameras {list(self._config.cameras)}, but not "
-                f"{sorted(unknown)}: give all cameras names of the model, or none."
+                f"{sorted(unknown)}: name all cameras as the model does, or none of them."
             )
         dataset = self._inferencer.dataset(source)
         # The inferencer has written a temporary annotation file and the data set has read it. It is
