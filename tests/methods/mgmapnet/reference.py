@@ -187,9 +187,9 @@ def inside_rows(
     samples = attention.compute_samples(state.instances + position, reference, feats)
     instances, points = attention.aggregate(feats, samples)
     point_code, instance_code = attention.codes(samples)
-    exchanged = attention.interact_points(points, point_code, state)
+    exchanged = attention.attend_to_points(points, point_code, state)
     joined = exchanged + instances[:, :, None]
-    out = attention.interact_instances(joined, point_code, instances, instance_code)
+    out = attention.attend_to_instances(joined, point_code, instances, instance_code)
     values = torch.cat([attention.values(level.flatten(2).transpose(1, 2)) for level in feats], 1)
     ours = {  # (B, N, P, levels, heads, K) -> (B, N, heads, levels, P, K)
         "loc": (samples.locations.permute(0, 1, 4, 3, 2, 5, 6)[:, :, ::2], 1e-5),

@@ -122,10 +122,10 @@ def test_p2p_sees_the_points_of_the_layer_before_within_an_instance():
     assert influence(attention, before=True) == (True, False)
     points, before = torch.randn(2, B, N, P, C, dtype=torch.float64)
     state = Granularities(inputs()[0])
-    first = attention.interact_points(points, 0.0, state)
-    later = attention.interact_points(points, 0.0, state._replace(points=before))
+    first = attention.attend_to_points(points, 0.0, state)
+    later = attention.attend_to_points(points, 0.0, state._replace(points=before))
     assert not torch.allclose(first, later)
-    assert build(p2p=False).interact_points(points, 0.0, state) is points
+    assert build(p2p=False).attend_to_points(points, 0.0, state) is points
 
 
 SWITCHES = [

@@ -24,7 +24,7 @@ from gsmap.models.gsmap.guidance import GaussianGuidance
 from gsmap.models.gsmap.layer import add_guidance
 from gsmap.models.maptr.self_attention import PointSelfAttention
 from gsmap.models.mgmapnet.decoder import MGMapNetDecoder
-from gsmap.models.mgmapnet.head import with_granularities
+from gsmap.models.mgmapnet.head import convert_decoder
 
 FURTHER = {"name": "one2many", "num": 6, "repeats": 3}
 BEV = {"bev_feats": torch.randn(1, C, 8, 4, generator=torch.Generator().manual_seed(2))}
@@ -83,9 +83,9 @@ def test_the_log_says_what_of_the_decoder_is_replaced(monkeypatch):
     lines = []
     monkeypatch.setattr("gsmap.models.mgmapnet.head.print_log", lambda text, *_: lines.append(text))
     layer = {"self_attn": {"type": "DecoupledSelfAttention"}, "cross_attn": {"num_points": 3}}
-    with_granularities({"layer": {**layer, "ffn_dims": 32}})
+    convert_decoder({"layer": {**layer, "ffn_dims": 32}})
     assert lines == [f"MGMapHead replaces {layer} of its decoder's layers."]
-    with_granularities({"layer": {"ffn_dims": 32}})
+    convert_decoder({"layer": {"ffn_dims": 32}})
     assert len(lines) == 1
 
 

@@ -20,8 +20,10 @@ from gsmap.visualization.style import FALSE_DASHES, MATCH_COLOURS, TRUTH_OPACITY
 
 _SCORE_PT = 6.5  # font size of scores
 # Control points of four Bezier curves that approximate the unit circle within 0.03 %. (13, 2)
-_K = 4 / 3 * (np.sqrt(2) - 1)
-_QUARTERS = np.array([1, 1 + 1j * _K, _K + 1j]) * 1j ** np.arange(5)[:, None]
+# Points are complex numbers x + iy, so that a factor of i turns them by a quarter of the circle.
+_HANDLE = 4 / 3 * (np.sqrt(2) - 1)  # distance of an inner control point from its end point
+_FIRST_QUARTER = np.array([1, 1 + 1j * _HANDLE, _HANDLE + 1j])
+_QUARTERS = _FIRST_QUARTER * 1j ** np.arange(5)[:, None]
 _CIRCLE = _QUARTERS.ravel()[:13].view(np.float64).reshape(13, 2)
 _CIRCLE_CODES = [Path.MOVETO, *[Path.CURVE4] * 12]
 
@@ -39,12 +41,13 @@ class BEVPanel:
         order: Whether to mark the start and the direction of each polyline.
         gaussians: Whether to draw the Gaussian of each vertex as its 1-sigma ellipse.
         scores: Whether to write the scores.
-        rasters: Occupancy in [0, 1] of each element on the rows and columns of ``BEVGrid``, drawn
-            instead of the background. (N, H, W)
+        rasters: Occupancy in [0, 1] of each element on the rows and columns of ``BEVGrid``. The
+            picture of the rasters covers the background. (N, H, W)
         points: Points in metres in the annotation frame, such as a LiDAR sweep, drawn as faint
             dots. (n, >= 2)
         truth: Ground truth, drawn in broad lines under the elements and coloured by its matches.
-        hits: Index of the ground truth that each element hits, or -1; colours the elements. (N,)
+        hits: Index of the ground truth matched with each element, or -1. Elements have the colours
+            of matches instead of classes. (N,)
         colours: Colour of each element, instead of the colour of its class. (N,)
     """
 
@@ -67,8 +70,8 @@ class BEVPanel:
         """Kinds of matches, keys of ``MATCH_COLOURS``.
 
         Returns:
-            ``hit`` or ``false`` for each element if there are ``hits``, (N,) or (0,), and
-            ``found`` or ``missed`` for each ground truth, (K,).
+            ``hit`` or ``false`` for each element (N,), or an empty list without ``hits``, and
+            ``found`` or ``missed`` for each ground truth (K,).
         """
         hits: Sequence[int] = () if self.hits is None else self.hits.tolist()
         fates = ["hit" if hit >= 0 else "false" for hit in hits]
@@ -96,7 +99,7 @@ def display_extent(grid: BEVGrid, view: FrameView) -> tuple[float, float, float,
 
 
 def _ticks(low: float, high: float) -> tuple[np.ndarray, list[str]]:
-    """Round positions every 10 m (5 m on a small map), and their labels."""
+    """Multiples of 10 m (5 m on a small map) between two bounds in metres, and their labels."""
     step = 10 if high - low > 20 else 5
     positions = np.arange(np.ceil(low / step) * step, high + 1e-6, step)
     labels = [f"{position:g}".replace("-", "\N{MINUS SIGN}") for position in positions]
@@ -104,10 +107,10 @@ def _ticks(low: float, high: float) -> tuple[np.ndarray, list[str]]:
     return positions, labels
 
 
-def _draw_ground(
+def _draw_background(
     ax: Axes, points: np.ndarray | None, grid: BEVGrid, view: FrameView, style: MapStyle
 ) -> None:
-    """Draw a metric grid with labels on the left and at the bottom, and LiDAR points."""
+    """Draw the metric grid, its labels on the left and at the bottom, and LiDAR points if given."""
     left, right, bottom, top = display_extent(grid, view)
     ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", facecolor=style.ground)
     x_positions, x_labels = _ticks(left, right)
@@ -128,7 +131,7 @@ def _draw_vehicle(ax: Axes, view: FrameView) -> None:
     rear, front, width = view.vehicle_m
     length = front - rear
     half_width = width / 2
-    pad = 0.35  # added by the box on each side
+    pad = 0.35  # the box style adds this padding on each side
     body = FancyBboxPatch(
         (-half_width + pad, rear + pad),
         width=width - 2 * pad,
@@ -160,7 +163,7 @@ def draw_lines(
     zorder: float = 10,
     fates: Sequence[str] = (),
 ) -> None:
-    """Draw polylines, false ones dashed, and fill closed classes.
+    """Draw polylines, and fill the elements of closed classes. False predictions are dashed.
 
     Args:
         ax: Axes to draw on.
@@ -169,8 +172,8 @@ def draw_lines(
         style: Style that defines the closed classes.
         colours: Colour of each polyline. (N,)
         width_pt: Width of the lines in points.
-        zorder: Drawing order of the lines.
-        fates: ``hit`` or ``false`` for each polyline; none is dashed if empty. (N,) or (0,)
+        zorder: Drawing order of the lines. Higher values are drawn later, on top.
+        fates: ``hit`` or ``false`` for each polyline (N,), or empty to dash none.
     """
     shapes = []
     faces = []
@@ -179,15 +182,18 @@ def draw_lines(
             shapes.append(line)
             faces.append((*mcolors.to_rgb(colour), 0.2))
     ax.add_collection(PolyCollection(shapes, facecolors=faces, edgecolors="none", zorder=4))
-    dashes = [FALSE_DASHES if fate == "false" else "-" for fate in fates] or "-"
-    strokes = LineCollection(lines, colors=colours, linewidths=width_pt, linestyles=dashes)
+    line_styles = [FALSE_DASHES if fate == "false" else "-" for fate in fates]
+    strokes = LineCollection(
+        lines, colors=colours, linewidths=width_pt, linestyles=line_styles or "-"
+    )
     strokes.set(joinstyle="round", zorder=zorder)
     ax.add_collection(strokes)
 
 
 def _draw_order(ax: Axes, lines: list[np.ndarray], colours: list[str]) -> None:
     """Mark the first vertex with a ring, and the direction with an arrow head at the middle."""
-    x, y = np.stack([line[0] for line in lines]).T
+    starts = np.stack([line[0] for line in lines])  # (N, 2)
+    x, y = starts.T
     ax.scatter(x, y, s=13, facecolors="white", edgecolors=colours, linewidths=1.0, zorder=13)
     for line, colour in zip(lines, colours, strict=True):
         middle = max(len(line) // 2, 1)
@@ -212,10 +218,11 @@ def _draw_gaussians(ax: Axes, elements: MapElements, view: FrameView, style: Map
     angles = elements.rotations + view.display_turn_rad
     cos = np.cos(angles)
     sin = np.sin(angles)
-    axes = np.stack([cos, sin, -sin, cos], axis=-1).reshape(-1, 2, 2)
-    edges = _CIRCLE @ (elements.scales[..., None] * axes) + centres[:, None]  # (M, 13, 2)
-    ellipses = [Path(edge, _CIRCLE_CODES) for edge in edges]
-    paths = []  # one of each element
+    axes = np.stack([cos, sin, -sin, cos], axis=-1).reshape(-1, 2, 2)  # one axis per row
+    half_axes = elements.scales[..., None] * axes  # (M, 2, 2)
+    outlines = _CIRCLE @ half_axes + centres[:, None]  # (M, 13, 2)
+    ellipses = [Path(outline, _CIRCLE_CODES) for outline in outlines]
+    paths = []  # one path per element
     for start, end in pairwise(elements.offsets.tolist()):
         paths.append(Path.make_compound_path(*ellipses[start:end]))
     colours = style.colours(elements.labels)
@@ -232,21 +239,26 @@ def _draw_scores(
     A vertex is free if its text overlaps neither the border, nor the vehicle, nor the score of a
     more confident element.
     """
-    low, high = np.transpose([ax.get_xlim(), ax.get_ylim()])
+    left, right = ax.get_xlim()
+    bottom, top = ax.get_ylim()
+    low = np.array([left, bottom])
+    high = np.array([right, top])
     rear, front, width = view.vehicle_m
-    letter_m = _SCORE_PT / 72 * ax.figure.dpi * (high - low)[1] / ax.get_window_extent().height
-    half_size = letter_m * np.array([1.4, 0.6])  # of the text of a score
+    font_px = _SCORE_PT / 72 * ax.figure.dpi
+    font_m = font_px * (top - bottom) / ax.get_window_extent().height
+    half_size = font_m * np.array([1.4, 0.6])  # half width and height of a text such as 0.87
     vehicle_centre = np.array([0, (rear + front) / 2])
     vehicle_size = np.array([width, front - rear])
     obstacles = [vehicle_centre]
-    clearances = [half_size + vehicle_size / 2]  # smallest distances along x or y
+    clearances = [half_size + vehicle_size / 2]  # a text is clear at this distance along x or y
     for index in np.argsort(-scores, kind="stable"):
         line = lines[index]
         from_middle = np.abs(np.arange(len(line)) - len(line) // 2)
         candidates = line[np.argsort(from_middle, kind="stable")]
         is_inside = (candidates > low + half_size) & (candidates < high - half_size)
         distances = np.abs(candidates[:, None] - obstacles)  # (P, obstacles, 2)
-        is_clear = (distances > clearances).any(axis=2).all(axis=1)
+        clears_obstacle = (distances > clearances).any(axis=2)  # (P, obstacles)
+        is_clear = clears_obstacle.all(axis=1)
         is_free = is_inside.all(axis=1) & is_clear
         if not is_free.any():
             continue
@@ -255,14 +267,16 @@ def _draw_scores(
         clearances.append(2 * half_size)
         x, y = position
         text = ax.text(x, y, f"{scores[index]:.2f}", ha="center", va="center", zorder=20)
-        text.set(fontsize=_SCORE_PT, color=0.62 * np.array(mcolors.to_rgb(colours[index])))
+        darker_colour = 0.62 * np.array(mcolors.to_rgb(colours[index]))
+        text.set(fontsize=_SCORE_PT, color=darker_colour)
         text.set_path_effects([withStroke(linewidth=2, foreground="white")])
 
 
 def raster_picture(rasters: np.ndarray, labels: np.ndarray, style: MapStyle) -> np.ndarray:
     """Blend the occupancies of elements into one picture.
 
-    Each class covers white by the largest occupancy of its elements.
+    Classes are painted over white one after another. The opacity of a class at a pixel is the
+    largest occupancy of its elements.
 
     Args:
         rasters: Occupancy of each element, in [0, 1]. (N, H, W)
@@ -280,9 +294,9 @@ def raster_picture(rasters: np.ndarray, labels: np.ndarray, style: MapStyle) -> 
 
 
 def _draw_rasters(ax: Axes, picture: np.ndarray, view: FrameView) -> None:
-    """Draw rendered masks in place of the ground."""
+    """Draw the picture of the rasters in place of the background."""
     if view.forward == "x":
-        picture = picture.transpose(1, 0, 2)[:, ::-1]  # row = x, column = -y
+        picture = picture.transpose(1, 0, 2)[:, ::-1]  # from (y, x) to rows of x and columns of -y
     extent = (*ax.get_xlim(), *ax.get_ylim())
     ax.imshow(picture, origin="lower", extent=extent, interpolation="bilinear", zorder=1)
     ax.grid(False)
@@ -308,7 +322,7 @@ def _draw_truth(ax: Axes, panel: BEVPanel, view: FrameView, style: MapStyle) -> 
 
 
 def _element_colours(panel: BEVPanel, labels: np.ndarray, style: MapStyle) -> list[str]:
-    """Colours of elements by their matches, as given, or by their classes. (N,)"""
+    """Colours of matches if there are any, else the given colours, else those of classes. (N,)"""
     fates, _ = panel.fates
     if fates:
         return [MATCH_COLOURS[fate] for fate in fates]
@@ -326,21 +340,23 @@ def draw_bev(ax: Axes, panel: BEVPanel, grid: BEVGrid, view: FrameView, style: M
         style: Colours and widths.
     """
     elements = panel.elements
-    _draw_ground(ax, panel.points, grid, view, style)
+    _draw_background(ax, panel.points, grid=grid, view=view, style=style)
     ax.set_title(panel.title, fontsize=8.5, color=style.ink, pad=5)
     _draw_vehicle(ax, view)
-    _draw_truth(ax, panel, view, style)
+    _draw_truth(ax, panel, view=view, style=style)
     if not elements:
         note = ax.text(0.5, 0.03, panel.note, transform=ax.transAxes, ha="center", va="bottom")
         note.set(fontsize=7, color=style.muted)
         return
     lines = [view.display_from_frame(line) for line in elements.polylines]
-    colours = _element_colours(panel, elements.labels, style)
+    colours = _element_colours(panel, elements.labels, style=style)
     if panel.rasters is not None:
-        _draw_rasters(ax, raster_picture(panel.rasters, elements.labels, style), view)
+        picture = raster_picture(panel.rasters, elements.labels, style=style)
+        _draw_rasters(ax, picture, view=view)
     if panel.gaussians and elements.has_gaussians:
-        _draw_gaussians(ax, elements, view, style)
+        _draw_gaussians(ax, elements, view=view, style=style)
     if panel.lines:
+        fates, _ = panel.fates
         draw_lines(
             ax,
             lines,
@@ -348,13 +364,13 @@ def draw_bev(ax: Axes, panel: BEVPanel, grid: BEVGrid, view: FrameView, style: M
             style=style,
             colours=colours,
             width_pt=style.bev_line_pt,
-            fates=panel.fates[0],
+            fates=fates,
         )
     if panel.vertices:
         for line, colour in zip(lines, colours, strict=True):
             x, y = line.T
             ax.plot(x, y, "o", color=colour, markersize=2.2, markeredgewidth=0, zorder=12)
     if panel.order:
-        _draw_order(ax, lines, colours)
+        _draw_order(ax, lines, colours=colours)
     if panel.scores:
-        _draw_scores(ax, lines, elements.confidence, colours, view)
+        _draw_scores(ax, lines, scores=elements.confidence, colours=colours, view=view)

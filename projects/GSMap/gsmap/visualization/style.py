@@ -19,8 +19,9 @@ CLASS_TITLES = {
     "boundary": "road boundary",
     "centerline": "centre line",
 }
-# Colours of predictions (hit, false) and ground truth (found, missed) by their matches.
-MATCH_COLOURS = {"hit": "#00A39A", "false": "#FF3B30", "found": "#8E8E93", "missed": "#AF52DE"}
+_GREY = "#8E8E93"
+# Colours of matches: a prediction is a hit or false, a ground truth is found or missed.
+MATCH_COLOURS = {"hit": "#00A39A", "false": "#FF3B30", "found": _GREY, "missed": "#AF52DE"}
 TRUTH_OPACITY = {"found": 0.4, "missed": 0.75}
 FALSE_DASHES = (0, (3, 1.5))  # a line style of matplotlib
 # Colours of runs and methods in plots, distinct from the colours of classes and matches.
@@ -34,12 +35,13 @@ RUN_COLOURS = (
     "#7F1D1D",
     "#000000",
 )
-_HUE_STEP = (5**0.5 - 1) / 2  # golden section, so that a dozen successive hues are distinct
-_TRACK_VALUES = (0.85, 0.6)  # brightness in HSV, by turns for six tracks each
+_HUE_STEP = (5**0.5 - 1) / 2  # golden section, which keeps the hues of successive numbers apart
+_TRACK_VALUES = (0.85, 0.6)  # brightness in HSV, which changes after every six tracks
+_TRACKS_PER_VALUE = 6
 
 
 def track_colours(tracks: Iterable[int]) -> list[str]:
-    """Assign a colour to each track, which depends on its number alone.
+    """Colours of tracks. The number of a track alone determines its colour.
 
     Args:
         tracks: Numbers of the tracks, -1 for elements without a track. (N,)
@@ -50,10 +52,10 @@ def track_colours(tracks: Iterable[int]) -> list[str]:
     colours = []
     for track in tracks:
         if track < 0:
-            colours.append(MATCH_COLOURS["found"])
+            colours.append(_GREY)
             continue
-        hue = track * _HUE_STEP % 1
-        value = _TRACK_VALUES[track // 6 % 2]
+        hue = (track * _HUE_STEP) % 1
+        value = _TRACK_VALUES[(track // _TRACKS_PER_VALUE) % len(_TRACK_VALUES)]
         colours.append(to_hex(hsv_to_rgb(hue, 0.85, value)))
     return colours
 
@@ -67,7 +69,7 @@ class MapStyle:
         bev_line_pt: Line width in bird's-eye view, in points.
         camera_line_pt: Line width over an image 10 m away, in points. Nearer lines are
             thicker.
-        halo: Colour of the edges of lines over an image, which keep them legible.
+        halo: Outline colour of lines over an image, for legibility.
         ink: Colour of titles.
         muted: Colour of labels and notes.
         ground: Background of bird's-eye views.
@@ -86,7 +88,7 @@ class MapStyle:
     spare: Sequence[str] = ("#AF52DE", "#FF3B30", "#5AC8FA", "#A2845E", "#FF2D92", "#34495E")
 
     def colour(self, label: int) -> str:
-        """Colour of a class. Named classes have one colour in all data sets."""
+        """Colour of a class, from ``CLASS_COLOURS`` or else from ``spare``."""
         return CLASS_COLOURS.get(self.classes[label], self.spare[label % len(self.spare)])
 
     def colours(self, labels: Iterable[int]) -> list[str]:
@@ -99,5 +101,5 @@ class MapStyle:
         return CLASS_TITLES.get(name, name.replace("_", " "))
 
     def is_closed(self, label: int) -> bool:
-        """Whether elements of a class enclose an area, which is filled with a faint colour."""
+        """Whether elements of a class enclose an area, and are drawn with a faint fill."""
         return self.classes[label] in AREA_CLASSES

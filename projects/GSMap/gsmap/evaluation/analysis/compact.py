@@ -1,4 +1,4 @@
-"""Compact result files with Bezier curves in place of points, within an error in metres."""
+"""Compact result files, whose Bezier curves approximate the points of the original file."""
 
 from collections.abc import Mapping
 from itertools import pairwise
@@ -18,17 +18,17 @@ from gsmap.structures.elements import FloatArray
 from gsmap.utils.errors import InputError
 
 _DECIMALS = 3  # control points are written in whole millimetres
-_ROUNDING_M = 0.001
+_ROUNDING_M = 0.001  # bound on the displacement of a curve by that rounding
 _POINT_KEYS = ("pts", "pts_num", "gaussian_scales", "gaussian_rotations")
 
 
 class Compaction(NamedTuple):
-    """Size of a result file before and after the compaction.
+    """Numbers of points of a result file before and after its compaction.
 
     Args:
-        elements: Number of elements that have become curves.
-        vertices: Number of their vertices.
-        controls: Number of their control points.
+        elements: Number of elements replaced by curves.
+        vertices: Number of vertices of these elements.
+        controls: Number of control points of the curves.
         largest_m: Largest distance of a curve from its line, in metres.
     """
 
@@ -43,18 +43,18 @@ def compact_results(
 ) -> Compaction:
     """Write a result file with piecewise Bezier curves, which all readers of GSMap accept.
 
-    Vectors keep their other entries, except Gaussians, which belong to vertices. A vector of one
-    point is not changed.
+    A curve replaces the points of a vector and its Gaussians, one of which belongs to each point.
+    Other entries are kept. A vector of one point is not changed.
 
     Args:
         results: Path of the result file.
         out: Path of the file to write.
         degree: Degree of the curves, in [1, 5].
-        max_error_m: Largest distance of a curve from its line in the plane, in metres; more than
-            0.001, to which control points are rounded.
+        max_error_m: Largest distance of a curve from its line in the plane, in metres. It must be
+            more than 0.001, because control points are rounded to millimetres.
 
     Returns:
-        Size of the file before and after, and the largest error.
+        Numbers of points before and after, and the largest error.
 
     Raises:
         FileNotFoundError: If the result file does not exist.
@@ -62,7 +62,7 @@ def compact_results(
     """
     if max_error_m <= _ROUNDING_M:
         raise InputError(f"the error must be more than {_ROUNDING_M} m, got {max_error_m}.")
-    file = SampleFile(results, key=RESULTS_KEY, classes=())
+    file = SampleFile(results, key=RESULTS_KEY, classes=())  # labels are not needed
     samples = []
     num_elements = 0
     num_vertices = 0
@@ -100,12 +100,12 @@ def _replace_points(vector: Mapping[str, Any], controls: FloatArray, degree: int
 def _largest_error(
     points: FloatArray, joints: list[int], controls: FloatArray, degree: int
 ) -> float:
-    """Compute the largest distance in metres of the pieces of a curve from their parts of a line.
+    """Compute the largest distance, in metres, of a piecewise curve from its line.
 
     Args:
         points: Vertices of the line in metres. (n, D)
         joints: Indices of the vertices at which pieces begin and end.
-        controls: Control points of all pieces; neighbours have one in common. (m, D)
+        controls: Control points of all pieces. Consecutive pieces share one point. (m, D)
         degree: Degree of the curve.
     """
     errors = []

@@ -15,7 +15,7 @@ from gsmap.utils.errors import InputError
 
 
 class BuiltHead(Protocol):
-    """Interface of a built head to the checks of its costs and losses."""
+    """Attributes of a built head that the checks of costs and losses may use."""
 
     classes: tuple[str, ...]
     reference: RefinedReference
@@ -26,15 +26,15 @@ class BuiltHead(Protocol):
 class Predictions:
     """Predictions of the head after one or several decoder layers, for a batch.
 
-    Predictions of several layers are concatenated along the queries, so that N stands for L * N
-    (`join`).
+    `join` concatenates the predictions of L layers along the queries. N is then the number of
+    queries of all layers together.
 
     Args:
         scores: Class logits. (B, N, classes)
         decoded: Output of the decoder layer, with states and references.
         bev_feats: BEV features. (B, C, H, W)
-        reference: Decoding of ``decoded.references``.
-        masks: Rasters for the comparison with the ground truth.
+        reference: Decodes ``decoded.references`` to points, metres and masks.
+        masks: Settings and rasters of masks, of losses and of matching costs.
 
     Attributes:
         references: References of points or Gaussians. (B, N, P, D)
@@ -56,7 +56,7 @@ class Predictions:
         self.masks = masks
         self.references = decoded.references
         self.pts = decoded.references[..., : reference.coords]
-        self._layers: Sequence[Predictions] = ()
+        self._layers: Sequence[Predictions] = ()  # empty unless joined
 
     @property
     def layers(self) -> Sequence["Predictions"]:
@@ -83,7 +83,7 @@ class Predictions:
 
     @cached_property
     def cost_masks(self) -> Tensor:
-        """Rendered masks of matching costs, without gradient. (B, N, h, w)"""
+        """Masks for matching costs, rendered without gradient. (B, N, h, w)"""
         return self.reference.render(self.references.detach(), self.masks.cost_grid)
 
     def of_queries(self, queries: slice) -> "Predictions":
@@ -97,7 +97,7 @@ class Predictions:
         )
 
     def sample(self, index: int) -> "SampleView":
-        """Predictions of the sample of an index, for matching costs."""
+        """Predictions of one sample, by its index in the batch, for matching costs."""
         return SampleView(self, index)
 
 
@@ -108,10 +108,10 @@ class GroundTruth:
 
     Args:
         instances: Elements of each sample, with ``labels_3d`` (K,), ``pts`` (K, P, 2 or 3) and
-            ``pts_shifts`` (K, S, P, 2 or 3) in metres. Masks also need ``polylines``
-            (K, M, 2 or 3) in metres.
-        reference: Normalisation of points to [0, 1] over the map.
-        masks: Rasters and drawing of masks.
+            ``pts_shifts`` (K, S, P, 2 or 3) in metres, which are the points in S equivalent
+            orders. Masks also need ``polylines`` (K, M, 2 or 3) in metres.
+        reference: Normalises points to [0, 1] over the map.
+        masks: Draws the masks.
 
     Attributes:
         counts: Number K of elements of each sample.
@@ -146,12 +146,12 @@ class GroundTruth:
 
     @cached_property
     def masks(self) -> Tensor:
-        """Masks of losses. (T, H, W)"""
+        """Masks for losses. (T, H, W)"""
         return self._element_masks.draw_batch(self._instances, self._element_masks.grid)
 
     @cached_property
     def cost_masks(self) -> Tensor:
-        """Masks of matching costs, of a lower resolution. (T, h, w)"""
+        """Masks for matching costs, at a lower resolution. (T, h, w)"""
         return self._element_masks.draw_batch(self._instances, self._element_masks.cost_grid)
 
     @cached_property
@@ -172,7 +172,7 @@ class GroundTruth:
         return torch.cat(masks)
 
     def sample(self, index: int) -> "SampleView":
-        """Ground truth of the sample of an index, for matching costs."""
+        """Ground truth of one sample, by its index in the batch, for matching costs."""
         start = self.first[index]
         return SampleView(self, slice(start, start + self.counts[index]))
 
@@ -180,7 +180,7 @@ class GroundTruth:
 class SampleView:
     """View of the predictions or the ground truth of one sample, for matching costs.
 
-    Its attributes are the rows of the sample in the attributes of the batch. Predictions have
+    Reading an attribute selects the sample from that attribute of the batch. Predictions have
     ``scores`` (N, classes), ``pts`` (N, P, 2 or 3), ``references`` (N, P, D) and ``cost_masks``
     (N, h, w). Ground truth has ``labels`` (K,), ``first_pts`` (K, P, 2 or 3), ``pts_shifts``
     (K, S, P, 2 or 3) and ``cost_masks`` (K, h, w).
@@ -207,9 +207,9 @@ class MapMatches(NamedTuple):
         query_inds: Index of the query in its layer. (L, M)
         joined_inds: Index of the query among the queries of all layers. (L, M)
         gt_inds: Index of the ground truth in its sample. (L, M)
-        rows: Index of the ground truth in the batch. (L, M)
+        rows: Index of the ground truth among the T of the batch. (L, M)
         order_inds: Index of the closest equivalent point order of the ground truth. (L, M)
-        host_labels: Class index of the ground truth, on the CPU. (L, M)
+        host_labels: Class index of the ground truth, kept on the CPU. (L, M)
         counts: Number of pairs of each sample, in one layer: B integers.
     """
 
@@ -224,16 +224,17 @@ class MapMatches(NamedTuple):
 
 
 class MatchedPairs:
-    """Matched pairs of a batch: M pairs of one or several layers, layer after layer.
+    """Matched pairs of a batch: M pairs of L layers in all, layer after layer.
 
-    All layers have an equal number of pairs, sorted by sample and query. Attributes are computed
-    on first access and cached.
+    Each layer has M / L pairs, sorted by sample and query. Attributes are computed on first access
+    and cached.
 
     Args:
         predictions: Predictions of the layers, of one query group.
         truths: Ground truth of the batch.
         matches: Indices of the pairs.
-        avg_factor: Number of pairs of a layer, averaged over the ranks, at least 1. ()
+        avg_factor: Divisor of losses: number of pairs of a layer, averaged over the ranks, at
+            least 1. ()
 
     Attributes:
         num_layers: Number L of layers.
@@ -267,7 +268,7 @@ class MatchedPairs:
         self._layer_pairs: dict[int, MatchedPairs] = {}
 
     def layer(self, number: int) -> "MatchedPairs":
-        """Pairs of one layer, including the attributes that are already computed.
+        """Pairs of one layer, which reuse the cached attributes of these pairs.
 
         Args:
             number: Index of the layer. Negative indices count from the last layer.
@@ -279,8 +280,9 @@ class MatchedPairs:
             self._layer_pairs[number] = self._select_layer(number)
         layer_pairs = self._layer_pairs[number]
         for name, values in vars(self).items():
-            if isinstance(getattr(type(self), name, None), cached_property):
-                vars(layer_pairs).setdefault(name, self.by_layer(values)[number])
+            is_cached = isinstance(getattr(type(self), name, None), cached_property)
+            if is_cached and name not in vars(layer_pairs):
+                vars(layer_pairs)[name] = self.by_layer(values)[number]
         return layer_pairs
 
     def _select_layer(self, number: int) -> "MatchedPairs":
@@ -289,7 +291,7 @@ class MatchedPairs:
         matches = MapMatches(
             samples=self._matches.samples[row],
             query_inds=self._matches.query_inds[row],
-            joined_inds=self._matches.query_inds[row],  # the layer has no other queries
+            joined_inds=self._matches.query_inds[row],  # one layer alone is not joined
             gt_inds=self._matches.gt_inds[row],
             rows=self._matches.rows[row],
             order_inds=self._matches.order_inds[row],
@@ -352,17 +354,17 @@ class MatchedPairs:
 
     @cached_property
     def gt_pts(self) -> Tensor:
-        """Annotated points in the matched order, [0, 1] over the map. (M, P, 2 or 3)"""
+        """Ground-truth points in the matched order, [0, 1] over the map. (M, P, 2 or 3)"""
         return self.truths.pts_shifts[self._rows, self.order_inds]
 
     @cached_property
     def gt_first_pts(self) -> Tensor:
-        """Annotated points in the annotated order, [0, 1] over the map. (M, P, 2 or 3)"""
+        """Ground-truth points in the annotated order, [0, 1] over the map. (M, P, 2 or 3)"""
         return self.of_truths(self.truths.first_pts)
 
     @cached_property
     def gt_pts_m(self) -> Tensor:
-        """Annotated points in the matched order, in metres. (M, P, 2 or 3)"""
+        """Ground-truth points in the matched order, in metres. (M, P, 2 or 3)"""
         return self.predictions.reference.metres(self.gt_pts)
 
     @cached_property

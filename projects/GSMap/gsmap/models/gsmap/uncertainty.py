@@ -1,4 +1,4 @@
-"""Uncertainty of predicted points: Gaussians of their errors, and the loss of the Gaussians."""
+"""Uncertainty of predicted points: Gaussians of the errors, and a loss that trains them."""
 
 from typing import Any, cast
 
@@ -22,16 +22,21 @@ from gsmap.structures.gaussians import (
 )
 from gsmap.structures.grid import BEVGrid
 
+GAUSSIAN_FEATURES = 6  # size of `GaussianSpace.describe`
+
 
 @MODELS.register_module()
 class ErrorReference(GaussianReference):
     """Rendered Gaussians, with separate sigmas for the errors of the points.
 
-    Rendered Gaussians are as wide as a drawn line, but errors grow with the distance to the
-    vehicle. A reference therefore has two further entries: sigmas of the error along and across the
-    line. A network predicts them after each layer from the state and the Gaussian of the point,
-    without a gradient in these inputs, so that the loss of the sigmas does not change the points.
-    `decode` returns the Gaussians of the errors.
+    Rendered Gaussians have the width of a drawn line everywhere, whereas errors grow with the
+    distance to the vehicle. A reference therefore has two further entries: sigmas of the error
+    along and across the line, before their activation. Its D entries are the 2 or 3 coordinates of
+    the point, the 2 sigmas of the error, and the 2 sigmas and the angle of the rendered Gaussian.
+
+    After each layer, a network predicts the sigmas of the error from the state and the Gaussian of
+    the point. These inputs are detached, so that the loss of the sigmas does not change the points.
+    `errors` and `decode` return the Gaussians of the errors.
 
     Args:
         grid: Extent of the map.
@@ -46,22 +51,22 @@ class ErrorReference(GaussianReference):
         self.error_space = GaussianSpace(grid, min_scale_m=0.05, max_scale_m=20.0, activation="exp")
         self.metainfo = {"min_scale_m": self.error_space.floor_m}
         self.error_branches = nn.ModuleList(
-            layers.mlp(embed_dims + 6, embed_dims, 2) for _ in self.branches
+            layers.mlp(embed_dims + GAUSSIAN_FEATURES, embed_dims, 2) for _ in self.branches
         )
         self.reset_errors()
 
     def init_weights(self) -> None:
-        """Initialise the Gaussians, and equal sigmas of all errors."""
+        """Initialise the Gaussians, and set the sigmas of all errors to one value."""
         super().init_weights()
         self.reset_errors()
 
     def reset_errors(self) -> None:
-        """Initialise equal sigmas of all errors."""
+        """Set the sigmas of all errors to one value, whatever the input."""
         for branch in self.error_branches:
             constant_init(cast(nn.Sequential, branch)[-1], 0.0)
 
     def start(self, query_pos: Tensor) -> Tensor:
-        """Initial references, from the positional queries. (..., Q, C) -> (..., Q * n, D)"""
+        """Initial references of n points per query. (..., Q, C) -> (..., Q * n, D)"""
         start = super().start(query_pos)
         return self._with_errors(start, torch.zeros_like(start[..., :2]))
 
@@ -70,7 +75,7 @@ class ErrorReference(GaussianReference):
 
         Args:
             layer: Index of the layer.
-            point_states: States of the points. (..., Q, C)
+            point_states: States, each of which refines n points. (..., Q, C)
             reference: References of the previous layer. (..., Q * n, D)
 
         Returns:
@@ -78,17 +83,26 @@ class ErrorReference(GaussianReference):
         """
         points = reference[..., : self.coords]
         gaussians = reference[..., -3:]
-        refined = super().refine(layer, point_states, torch.cat([points, gaussians], dim=-1))
-        states = point_states.repeat_interleave(self.points_per_state, -2)
+        without_errors = torch.cat([points, gaussians], dim=-1)  # (..., Q * n, D - 2)
+        refined = super().refine(layer, point_states, reference=without_errors)
+        states = point_states.repeat_interleave(self.points_per_state, dim=-2)
         inputs = torch.cat([states, self.space.describe(refined)], dim=-1).detach()
-        return self._with_errors(refined, self.error_branches[layer](inputs).to(refined))
+        errors = self.error_branches[layer](inputs)  # (..., Q * n, 2)
+        return self._with_errors(refined, errors.to(refined))
 
     def _with_errors(self, reference: Tensor, errors: Tensor) -> Tensor:
-        """Insert the entries of the errors between point and Gaussian."""
+        """Insert sigmas before the Gaussian. (..., D - 2), (..., 2) -> (..., D)"""
         return torch.cat([reference[..., :-3], errors, reference[..., -3:]], dim=-1)
 
     def errors(self, references: Tensor) -> Gaussians:
-        """Gaussians of the errors of points, oriented along the line. (..., P, D) -> (..., P)"""
+        """Gaussians of the errors of points, oriented along the line.
+
+        Args:
+            references: References of the decoder. (..., P, D)
+
+        Returns:
+            Points as centres, sigmas in metres, and angles of the line in radians. (..., P)
+        """
         means = self.space.decode(references).means
         scales = self.error_space.scales(references[..., -5:-3])
         return Gaussians(means, scales, angles_of_line(means))
@@ -103,11 +117,11 @@ class GaussianNLLLoss(MapLoss):
 
     Args:
         loss_weight: Weight of the loss, or a weight for each class.
-        laplace: Use a Laplace distribution of equal variance instead of a normal one. Large errors
-            have less influence on it.
+        laplace: Use a Laplace distribution of equal variance instead of a normal one. It gives
+            large errors less influence on the loss.
         detach_points: Stop the gradient in the points, so that only the sigmas are trained.
-        match_m: Largest mean distance of the points to the line, in metres. Pairs with a larger one
-            are no detections and have the loss 0.
+        match_m: Largest mean distance of the points from the true line, in metres. The loss of
+            pairs farther apart is 0, because they do not count as detections.
         flags: Flags of `MapLoss`.
     """
 
@@ -131,16 +145,17 @@ class GaussianNLLLoss(MapLoss):
         require_gaussians(self, head)
 
     def values(self, pairs: MatchedPairs) -> Tensor:
-        """Negative log-likelihoods along and across the line. (M, 2)"""
+        """Negative log-likelihoods along and across the line, averaged over the points. (M, 2)"""
         reference = cast(GaussianReference, pairs.predictions.reference)
         gaussians = reference.errors(pairs.pred_references)
         points = gaussians.means.detach() if self.detach_points else gaussians.means
         sigma = extents_along_line(gaussians._replace(means=points))  # (M, P, 2)
-        errors = line_errors(points, pairs.gt_pts_m[..., :2])
+        errors = line_errors(points, pairs.gt_pts_m[..., :2])  # along, across (M, P, 2)
         distribution: Laplace | Normal
         if self.laplace:
             distribution = Laplace(0, sigma / 2**0.5, validate_args=False)
         else:
             distribution = Normal(0, sigma, validate_args=False)
-        is_detection = errors[..., 1].mean(-1) <= self.match_m
+        errors_across = errors[..., 1]
+        is_detection = errors_across.mean(-1) <= self.match_m  # (M,)
         return -distribution.log_prob(errors).mean(1) * is_detection[:, None]

@@ -1,4 +1,4 @@
-"""HDMapNet's BEV network: maps of classes, instance embeddings and directions."""
+"""HDMapNet's BEV network: class logits, instance embeddings and directions of each pixel."""
 
 from typing import NamedTuple, cast
 
@@ -10,7 +10,7 @@ from gsmap.models.hdmapnet.encoder import JoinedMaps, conv_block
 
 
 class LineMaps(NamedTuple):
-    """Predictions for each pixel."""
+    """Predictions for each pixel of the BEV features."""
 
     semantic: Tensor  # logits of the background and the classes (B, 1 + classes, H, W)
     embedding: Tensor  # instance embeddings, similar within an element (B, E, H, W)
@@ -18,10 +18,10 @@ class LineMaps(NamedTuple):
 
 
 class FineMaps(nn.Sequential):
-    """Prediction branch that enlarges a map to the resolution of the pixels.
+    """Prediction branch that resizes features to the resolution of the output.
 
     Args:
-        inputs: Channels C of the map.
+        inputs: Channels C of the features.
         outputs: Channels D of the predictions.
     """
 
@@ -31,12 +31,22 @@ class FineMaps(nn.Sequential):
         super().__init__(*conv_block(inputs, hidden), projection)
 
     def forward(self, feats: Tensor, like: Tensor) -> Tensor:  # type: ignore[override]
-        """Predict at the size of ``like``. (B, C, h, w), (B, _, H, W) -> (B, D, H, W)"""
+        """Predict at the resolution of another tensor.
+
+        Args:
+            feats: Features. (B, C, h, w)
+            like: Tensor of the wanted resolution, with any number of channels. (B, ..., H, W)
+
+        Returns:
+            Predictions. (B, D, H, W)
+        """
         return super().forward(resize_map(feats, like.shape[-2:]))
 
 
 class LineMapDecoder(nn.Module):
-    """Three stages of ResNet-18, and three branches on the first and the last (HDMapNet, III-C).
+    """Three stages of ResNet-18 and three prediction branches (HDMapNet, section III-C).
+
+    The branches take the features of the first and the last stage.
 
     Args:
         embed_dims: Channels C of the BEV features.
@@ -64,8 +74,8 @@ class LineMapDecoder(nn.Module):
         for _ in range(2 if shared_direction_block else 3):
             self.joined.append(JoinedMaps(widths[0] + widths[2], widths[2]))
         if shared_direction_block:
-            # The release runs the shared block twice per step, which updates its running
-            # statistics twice.
+            # The released code runs the shared block twice per step, so its running statistics
+            # are updated twice. One update with this momentum has an equal effect.
             for module in self.joined[1].modules():
                 if isinstance(module, nn.BatchNorm2d):
                     module.momentum = 1 - (1 - cast(float, module.momentum)) ** 2
@@ -74,7 +84,11 @@ class LineMapDecoder(nn.Module):
             self.maps.append(FineMaps(widths[2], channels))
 
     def init_weights(self) -> None:
-        """Initialise the stages with Kaiming's method and each block's last normalisation at 0."""
+        """Initialise the stages.
+
+        Convolutions follow Kaiming's method. The last normalisation of each block has weight 0, so
+        that the block initially returns its shortcut alone.
+        """
         for module in self.stages.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
@@ -82,8 +96,9 @@ class LineMapDecoder(nn.Module):
                 nn.init.zeros_(module.norm2.weight)
 
     def forward(self, bev_feats: Tensor) -> LineMaps:
-        """Predict maps of the size of the BEV features. (B, C, H, W)"""
+        """Predict at the resolution of the BEV features. (B, C, H, W) -> (B, ..., H, W) each"""
         first, _, last = self.stage_maps(bev_feats)
+        # one for classes, one for embeddings, and one for directions unless shared
         blocks = [block(first, last) for block in self.joined]
         semantic_branch, embedding_branch, direction_branch = self.maps
         return LineMaps(
@@ -93,7 +108,7 @@ class LineMapDecoder(nn.Module):
         )
 
     def stage_maps(self, bev_feats: Tensor) -> list[Tensor]:
-        """Compute the features of the stages, at 1/2, 1/4 and 1/8 of the size. (B, C, H, W)"""
+        """Compute the features of each stage, at 1/2, 1/4 and 1/8 of the size of (B, C, H, W)."""
         feats = self.stem(bev_feats)
         outputs = []
         for stage in self.stages:

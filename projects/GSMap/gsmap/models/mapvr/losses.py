@@ -1,4 +1,4 @@
-"""Losses of MapVR: dice of softly rendered elements, and directions of consecutive edges."""
+"""Losses of MapVR: dice loss of softly rendered elements, and direction loss of their edges."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -55,7 +55,7 @@ class ElementRenderer:
         """Raise ValueError if a class of ``polygon_classes`` does not exist.
 
         Args:
-            part: Loss or cost that uses the renderer; the message contains its name.
+            part: Loss or cost that uses the renderer, named in the error message.
             head: Head with the classes.
         """
         name = f"{type(part).__name__}.polygon_classes"
@@ -70,7 +70,7 @@ class ElementRenderer:
 
         Args:
             points: Normalised vertices. (n, P, 2)
-            is_polygon: Whether to fill an element. (n,)
+            is_polygon: True for filled polygons, False for lines. (n,)
 
         Returns:
             Masks in [0, 1]. (n, H, W)
@@ -92,8 +92,8 @@ class ElementRenderer:
 class RenderedDiceLoss(MapLoss):
     """Dice loss between softly rendered predictions and ground truths (MapVR, section 4.3).
 
-    The class of the ground truth decides whether a pair is rendered as lines or as polygons. The
-    points are in the annotated order.
+    The class of the ground truth decides whether a pair is rendered as lines or as polygons. All
+    equivalent point orders render to equal masks, so the annotated order is used.
 
     Args:
         loss_weight: Weight of the loss.
@@ -113,7 +113,11 @@ class RenderedDiceLoss(MapLoss):
         first_group_only: bool = False,
         **rendering: Any,
     ) -> None:
-        super().__init__(loss_weight, last_layer_only, first_group_only)
+        super().__init__(
+            loss_weight,
+            last_layer_only=last_layer_only,
+            first_group_only=first_group_only,
+        )
         self.renderer = ElementRenderer(size, **rendering)
 
     def check(self, head: BuiltHead) -> None:
@@ -132,8 +136,8 @@ class RenderedDiceLoss(MapLoss):
 class SelfDirectionLoss(MapLoss):
     """One minus the cosine between consecutive edges of a prediction (MapVR Eq. 4).
 
-    It penalises folded predictions, which a loss of rasters alone permits. Both edges of a pair
-    receive a gradient. The last and the first edge of a ring do not form a pair.
+    It penalises folded predictions, because a loss of rasters alone permits folds. Both edges of a
+    pair receive a gradient. The angle at the first vertex of a ring is not penalised.
 
     Args:
         loss_weight: Weight of the loss.
@@ -147,6 +151,6 @@ class SelfDirectionLoss(MapLoss):
 
     def values(self, pairs: MatchedPairs) -> Tensor:
         """One minus the cosine at each inner vertex of M matched pairs. (M, P - 2)"""
-        # Differs from MapVR Eq. (4), which sums the cosines: their sign would reward folding.
+        # Differs from MapVR Eq. (4), which adds the cosines: minimising them would reward folds.
         edges = pairs.pred_pts_m.diff(dim=1)
         return turns(edges[:, :-1], edges[:, 1:])

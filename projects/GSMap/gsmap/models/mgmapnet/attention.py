@@ -1,4 +1,4 @@
-"""MGMapNet's attention, in which an instance query and its point queries share BEV samples."""
+"""MGMapNet's attention: instance queries and their point queries use common BEV samples."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -16,20 +16,20 @@ from gsmap.utils.errors import InputError
 
 
 class Granularities(NamedTuple):
-    """Queries of all map elements at both granularities, passed from layer to layer."""
+    """Instance and point queries of all map elements, passed from layer to layer."""
 
     instances: Tensor  # instance queries (B, N, C)
     points: Tensor | None = None  # point queries, None before the first layer (B, N, P, C)
-    point_code: Tensor | float = 0.0  # position codes of the points, or 0 (B, N, P, C)
+    point_code: Tensor | float = 0.0  # position codes of the points (B, N, P, C), or 0 for none
     mean_locations: Tensor | None = None  # mean location of each point's samples (B, N, P, 2)
 
 
 class Samples(NamedTuple):
-    """Locations and weights of BEV samples. (B, N, P, levels, heads, K) each"""
+    """Locations and weights of K BEV samples per point, level and head."""
 
-    locations: Tensor  # (x, y) in [0, 1] over the map (..., 2)
-    point_weights: Tensor  # sum to 1 over K
-    weights: Tensor  # sum to 1 over P, levels and K
+    locations: Tensor  # (x, y) in [0, 1] over the map (B, N, P, levels, heads, K, 2)
+    point_weights: Tensor  # for point queries, sum to 1 over K (B, N, P, levels, heads, K)
+    weights: Tensor  # for instances, sum to 1 over P, levels, K (B, N, P, levels, heads, K)
 
 
 class PerPointSampling(SamplingAttention):
@@ -46,7 +46,9 @@ class PerPointSampling(SamplingAttention):
     def __init__(
         self, num_points: int = 20, num_samples: int = 8, num_levels: int = 2, **kwargs: Any
     ) -> None:
-        self.layout = (num_levels, num_points, num_samples)
+        self.sample_shape = (num_levels, num_points, num_samples)
+        self.points_per_instance = num_points
+        # the parent counts samples as points, and every point of every level as a part
         super().__init__(num_points=num_samples, num_parts=num_levels * num_points, **kwargs)
 
     def forward(
@@ -76,7 +78,8 @@ class PerPointSampling(SamplingAttention):
         query = state.instances + position
         samples = self.compute_samples(query, reference, feats=feats, frames=frames)
         state = self.update(state, feats, samples=samples)
-        return state._replace(mean_locations=samples.locations.mean(dim=(3, 4, 5)))
+        mean_locations = samples.locations.mean(dim=(3, 4, 5))  # (B, N, P, 2)
+        return state._replace(mean_locations=mean_locations)
 
     def update(
         self, state: Granularities, feats: Sequence[Tensor], samples: Samples
@@ -109,25 +112,29 @@ class PerPointSampling(SamplingAttention):
         Raises:
             ValueError: If the number of levels or of points differs from the settings.
         """
-        num_levels, num_points, _ = self.layout
+        num_levels, num_points, _ = self.sample_shape
         if len(feats) != num_levels or reference.shape[2] != num_points:
             raise InputError(
                 f"expected {num_levels} levels of BEV features and {num_points} points per "
                 f"instance, got {len(feats)} and {reference.shape[2]}."
             )
-        offsets = self.offsets_in_cells(query).unflatten(-2, self.layout)
+        offsets = self.offsets_in_cells(query).unflatten(-2, self.sample_shape)
+        # (B, N, heads, levels, P, K, 2) -> (levels, B, N, P, heads, K, 2)
         offsets = offsets.permute(3, 0, 1, 4, 2, 5, 6)
         offsets = offsets.flatten(2, 3)  # (levels, B, N * P, heads, K, 2)
         point_references = reference.flatten(1, 2)  # (B, N * P, D)
         level_locations = []
         for level_offsets, level in zip(offsets, feats, strict=True):
-            shape = (level.shape[-2], level.shape[-1])
-            locations = place_samples(level_offsets, point_references, shape=shape, frames=frames)
+            height, width = level.shape[-2:]
+            locations = place_samples(
+                level_offsets, point_references, shape=(height, width), frames=frames
+            )
             level_locations.append(locations)
         logits = at_least_float32(self.attention_weights(query))
-        logits = logits.unflatten(-1, (self.num_heads, *self.layout))
-        weights = logits.flatten(-3).softmax(dim=-1).unflatten(-1, self.layout)
+        logits = logits.unflatten(-1, (self.num_heads, *self.sample_shape))
         point_weights = logits.softmax(dim=-1)
+        weights = logits.flatten(-3).softmax(dim=-1)  # over levels, P and K
+        weights = weights.unflatten(-1, self.sample_shape)
         order = (0, 1, 4, 3, 2, 5)  # (B, N, heads, levels, P, K) -> (B, N, P, levels, heads, K)
         return Samples(
             locations=torch.stack(level_locations, dim=2).unflatten(1, (-1, num_points)),
@@ -136,7 +143,7 @@ class PerPointSampling(SamplingAttention):
         )
 
     def sample(self, feats: Sequence[Tensor], locations: Tensor, weights: Tensor) -> Tensor:
-        """Sample each level and compute weighted sums.
+        """Sample each level and compute weighted sums over S samples of each query.
 
         Args:
             feats: Levels of BEV features, the finest first. (B, C, H, W) each
@@ -147,12 +154,14 @@ class PerPointSampling(SamplingAttention):
             Weighted sums of each level and head. (B, Q, levels, heads, C / heads)
         """
         sums = []
-        for number, level in enumerate(feats):
+        for index, level in enumerate(feats):
+            cells = level.flatten(2).transpose(1, 2)  # (B, H * W, C)
+            height, width = level.shape[-2:]
             level_sum = deformable_sample(
-                self.values(level.flatten(2).transpose(1, 2)),
-                (level.shape[-2], level.shape[-1]),
-                locations=locations[:, :, number],
-                weights=weights[:, :, number],
+                self.values(cells),
+                (height, width),
+                locations=locations[:, :, index],
+                weights=weights[:, :, index],
             )
             sums.append(level_sum)
         return torch.stack(sums, dim=2).unflatten(-1, (self.num_heads, -1))
@@ -160,10 +169,10 @@ class PerPointSampling(SamplingAttention):
 
 @MODELS.register_module()
 class MultiPointAttention(PerPointSampling):
-    """Attention of instance queries alone around all of their points, as `LinePointAttention`.
+    """Attention that updates the instance queries alone, from samples around all of their points.
 
-    A linear layer computes the point queries from the instance query. This is the baseline of
-    MGMapNet's tables.
+    A linear layer computes the point queries from the instance query. This attention is the
+    baseline in the tables of MGMapNet and corresponds to `LinePointAttention`.
 
     Args:
         embed_dims: Channels C.
@@ -172,7 +181,7 @@ class MultiPointAttention(PerPointSampling):
 
     def __init__(self, embed_dims: int = 256, **kwargs: Any) -> None:
         super().__init__(embed_dims=embed_dims, **kwargs)
-        self.point_proj = nn.Linear(embed_dims, self.layout[1] * embed_dims)
+        self.point_proj = nn.Linear(embed_dims, self.points_per_instance * embed_dims)
 
     def update(
         self, state: Granularities, feats: Sequence[Tensor], samples: Samples
@@ -187,9 +196,10 @@ class MultiPointAttention(PerPointSampling):
         # (B, N, P, levels, heads, K, ...) -> (B, N, levels, heads, P * K, ...)
         locations = samples.locations.movedim(2, 4).flatten(4, 5)
         weights = samples.weights.movedim(2, 4).flatten(4, 5)
-        features = self.sample(feats, locations, weights=weights).sum(dim=2)  # (B, N, heads, C')
+        features = self.sample(feats, locations, weights=weights)
+        features = features.sum(dim=2)  # over the levels (B, N, heads, C / heads)
         instances = state.instances + self.dropout(self.output_proj(features.flatten(2)))
-        points = self.point_proj(instances).unflatten(-1, (self.layout[1], -1))
+        points = self.point_proj(instances).unflatten(-1, (self.points_per_instance, -1))
         return Granularities(instances, points)
 
 
@@ -202,9 +212,12 @@ class MultiGranularityAttention(PerPointSampling):
     Args:
         embed_dims: Channels C.
         ffn_dims: Hidden channels of the interactions.
-        add_instance: Whether the aggregated instance query is added to its points before P2I.
-        p2p: Whether the points of an instance attend to each other and to their previous states.
-        p2i: Whether points attend to all aggregated instance queries of the sample.
+        add_instance: Whether the aggregated instance query is added to its points before they
+            attend to instance queries.
+        p2p: Whether the points of an instance attend to each other and to their states of the
+            previous layer (point to point).
+        p2i: Whether points attend to the aggregated instance queries of the sample (point to
+            instance).
         position_codes: Whether codes of the sampling locations are added to queries and keys.
         kwargs: Further arguments of :class:`PerPointSampling`.
     """
@@ -220,7 +233,7 @@ class MultiGranularityAttention(PerPointSampling):
         **kwargs: Any,
     ) -> None:
         super().__init__(embed_dims=embed_dims, **kwargs)
-        _, num_points, num_samples = self.layout
+        _, num_points, num_samples = self.sample_shape
         interaction = partial(
             Interaction,
             embed_dims=embed_dims,
@@ -251,10 +264,10 @@ class MultiGranularityAttention(PerPointSampling):
         """
         instances, points = self.aggregate(feats, samples)
         point_code, instance_code = self.codes(samples)
-        points = self.interact_points(points, point_code, before=state)
+        points = self.attend_to_points(points, point_code, previous=state)
         if self.add_instance:
             points = points + instances[:, :, None]
-        points = self.interact_instances(
+        points = self.attend_to_instances(
             points, point_code, instances=instances, instance_code=instance_code
         )
         # Differs from the poster, which sums the points: the released model concatenates them.
@@ -267,8 +280,9 @@ class MultiGranularityAttention(PerPointSampling):
     def aggregate(self, feats: Sequence[Tensor], samples: Samples) -> tuple[Tensor, Tensor]:
         """Aggregate the sampled features to instance queries and point queries.
 
-        The joint weight of a sample is its weight within the point times the share of the point and
-        level in the instance, so an instance query is a weighted sum of the features of its points.
+        Summed over K, the weights for instances give the share of each point and level. The weight
+        of a sample is this share times its weight for the point query. An instance query is
+        therefore the sum of the point features, weighted by their shares.
 
         Args:
             feats: Levels of BEV features, the finest first. (B, C, H, W) each
@@ -282,7 +296,8 @@ class MultiGranularityAttention(PerPointSampling):
             locations=samples.locations.flatten(1, 2),
             weights=samples.point_weights.flatten(1, 2),
         )
-        by_head = by_head.unflatten(1, (-1, self.layout[1]))  # (B, N, P, levels, heads, C / heads)
+        # The shape becomes (B, N, P, levels, heads, C / heads).
+        by_head = by_head.unflatten(1, (-1, self.points_per_instance))
         shares = samples.weights.sum(dim=-1)  # (B, N, P, levels, heads)
         instances = torch.einsum("bnplh,bnplhc->bnhc", shares, by_head)
         return instances.flatten(2), by_head.mean(dim=3).flatten(3)
@@ -294,22 +309,24 @@ class MultiGranularityAttention(PerPointSampling):
         instance_code: Tensor | float = 0.0
         # Differs from the poster's MLP(S, W): the released model encodes their product.
         if self.point_code is not None:
-            weighted_locations = locations * samples.point_weights.mean(dim=(3, 4))[..., None]
+            point_weights = samples.point_weights.mean(dim=(3, 4))  # (B, N, P, K)
+            weighted_locations = locations * point_weights[..., None]
             point_code = self.point_code(weighted_locations.flatten(3))
         if self.instance_code is not None:
-            weighted_locations = locations * samples.weights.mean(dim=(3, 4))[..., None]
+            weights = samples.weights.mean(dim=(3, 4))  # (B, N, P, K)
+            weighted_locations = locations * weights[..., None]
             instance_code = self.instance_code(weighted_locations.flatten(2))
         return point_code, instance_code
 
-    def interact_points(
-        self, points: Tensor, code: Tensor | float, before: Granularities
+    def attend_to_points(
+        self, points: Tensor, code: Tensor | float, previous: Granularities
     ) -> Tensor:
-        """Attend from points to the points of their instance, now and in the previous layer.
+        """Attend from points to the points of their instance, of this and of the previous layer.
 
         Args:
             points: Point queries. (B, N, P, C)
             code: Position codes of the points, or 0. (B, N, P, C)
-            before: Queries of the previous layer.
+            previous: Queries of the previous layer.
 
         Returns:
             Updated point queries. (B, N, P, C)
@@ -320,9 +337,9 @@ class MultiGranularityAttention(PerPointSampling):
         query = points + code
         key = query
         # Differs from the poster, whose later layers attend to the previous points alone.
-        if before.points is not None:
-            value = torch.cat([before.points, value], dim=2)  # (B, N, 2 P, C)
-            key = torch.cat([before.points + before.point_code, key], dim=2)
+        if previous.points is not None:
+            value = torch.cat([previous.points, value], dim=2)  # (B, N, 2 P, C)
+            key = torch.cat([previous.points + previous.point_code, key], dim=2)
         updated_points = self.p2p(
             points.flatten(0, 1),
             query=query.flatten(0, 1),
@@ -331,7 +348,7 @@ class MultiGranularityAttention(PerPointSampling):
         )
         return updated_points.unflatten(0, points.shape[:2])
 
-    def interact_instances(
+    def attend_to_instances(
         self, points: Tensor, code: Tensor | float, instances: Tensor, instance_code: Tensor | float
     ) -> Tensor:
         """Attend from points to all aggregated instance queries of the sample.

@@ -1,4 +1,4 @@
-"""MGMapNet's head, with instance and point queries, instance masks and supervised samples."""
+"""MGMapNet's head: instance and point queries, with losses of masks and sampling locations."""
 
 import logging
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,7 @@ from gsmap.models.mgmapnet.decoder import MGMapNetDecoder, MGMapNetDecoderLayer
 from gsmap.models.mgmapnet.losses import InstanceMaskLoss, SamplingLocationLoss
 from gsmap.structures.grid import BEVGrid
 
-LINE_PX = 3
+LINE_WIDTH_PX = 3
 QUERY_GROUPS: tuple[PARTS, ...] = ({"num": 100}, {"name": "one2many", "num": 600, "repeats": 6})
 
 
@@ -26,9 +26,9 @@ class MGMapHead(MapHead):
 
     Args:
         grid: Extent of the map, in metres.
-        decoder: Settings of the decoder. Another class is replaced by `MGMapNetDecoder`, see
-            `with_granularities`.
-        losses: Settings of further losses.
+        decoder: Settings of the decoder. `convert_decoder` converts settings of a class other
+            than `MGMapNetDecoder`.
+        losses: Settings of the losses besides the two below.
         query_groups: Settings of the query groups.
         loss_mean_loc: Settings of `SamplingLocationLoss`, or None to train without it.
         loss_ins_seg: Settings of `InstanceMaskLoss`, or None to train without it.
@@ -52,12 +52,13 @@ class MGMapHead(MapHead):
         mask_settings = masks or {}
         element_masks = ElementMasks(grid, **mask_settings)
         if "line_width_m" not in mask_settings:
-            element_masks.line_width_m = LINE_PX * 2 * element_masks.half_pixel_m
+            pixel_m = 2 * element_masks.half_pixel_m
+            element_masks.line_width_m = LINE_WIDTH_PX * pixel_m
         mean_loc = optional_part(SamplingLocationLoss, loss_mean_loc)
         ins_seg = optional_part(InstanceMaskLoss, loss_ins_seg, embed_dims=embed_dims)
         super().__init__(
             grid=grid,
-            decoder=with_granularities(decoder),
+            decoder=convert_decoder(decoder),
             losses=[*losses, *mean_loc, *ins_seg],
             query_groups=query_groups,
             masks=element_masks,
@@ -66,11 +67,11 @@ class MGMapHead(MapHead):
         )
 
 
-def with_granularities(decoder: PARTS) -> PARTS:
+def convert_decoder(decoder: PARTS) -> PARTS:
     """Convert the settings of a decoder to settings of `MGMapNetDecoder`.
 
-    Layers and attentions of MapTR's and MapTRv2's configs, which require point queries, are
-    replaced and logged. Other attentions are kept.
+    The layers and attentions in the configs of MapTR and MapTRv2 need one query per point. They are
+    replaced, and a log message names them. Other attentions are kept.
     """
     decoder_class = class_of(decoder)
     if decoder_class is not None and issubclass(decoder_class, MGMapNetDecoder):
@@ -80,13 +81,14 @@ def with_granularities(decoder: PARTS) -> PARTS:
     layer_class = class_of(layer)
     if layer_class is None or not issubclass(layer_class, MGMapNetDecoderLayer):
         replaced_parts["type"] = layer.pop("type", None)
-    if class_of(layer.get("self_attn") or {}) is DecoupledSelfAttention:
+    self_attn = layer.get("self_attn") or {}
+    if class_of(self_attn) is DecoupledSelfAttention:
         replaced_parts["self_attn"] = layer.pop("self_attn")
     cross_attn = layer.get("cross_attn") or {}
     if class_of(cross_attn) in (None, BEVDeformableAttention):
         replaced_parts["cross_attn"] = layer.pop("cross_attn", None)
-    logged_parts = {name: part for name, part in replaced_parts.items() if part}
-    if logged_parts:
-        text = f"MGMapHead replaces {logged_parts} of its decoder's layers."
+    configured_parts = {name: part for name, part in replaced_parts.items() if part}
+    if configured_parts:
+        text = f"MGMapHead replaces {configured_parts} of its decoder's layers."
         print_log(text, "current", logging.INFO)
     return {**decoder, "type": MGMapNetDecoder, "layer": layer}

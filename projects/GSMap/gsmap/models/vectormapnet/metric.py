@@ -1,4 +1,4 @@
-"""VectorMapNet's metric: AP_chamfer of the samples that have predictions and ground truth."""
+"""VectorMapNet's metric: AP_chamfer without the samples that lack predictions or ground truth."""
 
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
@@ -12,13 +12,16 @@ from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.errors import InputError
 
-SHRUNK_MARGIN_M = 2.0
+MARGIN_M = 2.0  # added to the extent by the released code, see `_shrink`
 
 
 @register_metric
 @dataclass(frozen=True)
 class VectorMapNetAP(ChamferConfig):
-    """AP_chamfer at 0.5, 1.0 and 1.5 m over the samples with predictions and ground truth."""
+    """AP_chamfer at 0.5, 1.0 and 1.5 m.
+
+    Samples without predictions or without ground truth are not counted.
+    """
 
     name: ClassVar[str] = "vectormapnet"
     beside: ClassVar[tuple[str, ...]] = ("chamfer",)
@@ -46,7 +49,9 @@ class VectorMapNetAP(ChamferConfig):
 @register_metric
 @dataclass(frozen=True)
 class ShrunkVectorMapNetAP(VectorMapNetAP):
-    """`VectorMapNetAP` in the units of the released code, which shrink the map by its margin.
+    """`VectorMapNetAP` of maps that are scaled down as in the released code.
+
+    The released code normalises coordinates with a margin of 2 m, but restores them without it.
 
     Args:
         grid: Extent of the map, in metres, by which predictions and ground truth are scaled.
@@ -67,18 +72,21 @@ class ShrunkVectorMapNetAP(VectorMapNetAP):
         return cls(plain.classes, grid=settings.canvas)
 
     def match(self, sample: Sample) -> FrameMatches:
-        """Match one sample in the units of the released code."""
+        """Match one sample after scaling down both sides."""
         predictions = _shrink(sample.predictions, self.grid)
         ground_truth = _shrink(sample.ground_truth, self.grid)
-        return super().match(Sample(sample.token, predictions, ground_truth=ground_truth))
+        return super().match(
+            Sample(sample.token, predictions=predictions, ground_truth=ground_truth)
+        )
 
 
 def _shrink(elements: MapElements, grid: BEVGrid) -> MapElements:
-    """Scale the elements of a map to the units of the released code.
+    """Scale elements down as in the released code.
 
-    The release divides coordinates by the extent of the map plus 2 m and multiplies them by the
-    extent alone. The origin of the scaling has no effect on distances.
+    The released code divides coordinates by the extent of the map plus 2 m and multiplies them by
+    the extent alone. Here elements are scaled about another origin, which does not change
+    distances.
     """
     size = np.array(grid.extent_m)
-    points = elements.with_coordinates(2).points * (size / (size + SHRUNK_MARGIN_M))
+    points = elements.with_coordinates(2).points * (size / (size + MARGIN_M))
     return replace(elements, points=points)
