@@ -21,7 +21,7 @@ import shapely
 from mmdet3d import registry as of_mmdet3d
 from mmengine import registry
 from mmengine.config import Config
-from model_cases import IMAGE_SHAPE, NUM_CAMS, build_small
+from model_cases import IMAGE_SHAPE, NUM_CAMS, build_small, small_config
 from report_case import write_case
 
 import gsmap.registered  # noqa: F401 - the configs name its classes
@@ -71,39 +71,40 @@ def samples(folder: Path, minicity: Path) -> dict[str, Any]:
     return {"dataset": dataset, "data_sample": dataset[0]["data_samples"]}
 
 
-def with_exported_model(folder: Path, minicity: Path) -> dict[str, Any]:
-    """Export a model to model.onnx, and give the cameras and the motion of a sample."""
+def export_small(path: Path, **overrides: Any) -> None:
+    """Export a model with few channels: how a file is read does not depend on its size."""
     from gsmap.apis.export import export_onnx
-    from gsmap.apis.map_inferencer import MapInferencer
 
-    inferencer = MapInferencer("gsmap_r18_minicity", device="cpu")
-    cameras = inferencer.cfg.test_dataloader.dataset.cameras
-    export_onnx(inferencer.model, folder / "model.onnx", cameras, (96, 160))
-    cv2.imwrite(str(folder / "image.jpg"), np.full((225, 400, 3), 90, np.uint8))
-    intrinsics = np.array([[320.0, 0, 200], [0, 320, 112], [0, 0, 1]])
-    cameras = [("image.jpg", intrinsics, np.eye(4))] * 6
-    return {"my_cameras": cameras, "my_can_bus": np.zeros(18)}
+    model = build_small(**overrides).eval()
+    cameras = [f"CAM_{number}" for number in range(NUM_CAMS)]
+    export_onnx(model, path, cameras, IMAGE_SHAPE)
 
 
 def deployment(folder: Path, minicity: Path) -> dict[str, Any]:
-    """What a reader of docs/deployment.md has: two files, one with memory, and a drive."""
-    from gsmap.apis.export import export_onnx
+    """What a reader of docs/deployment.md has: two files, one with memory, and a drive.
 
-    model = build_small(temporal={"bev": {}, "queries": {"num": 3}, "embed_dims": 16}).eval()
-    cameras = [f"CAM_{number}" for number in range(NUM_CAMS)]
-    export_onnx(model, folder / "stream.onnx", cameras, IMAGE_SHAPE)
+    The file without memory is a GSMap's, whose elements have scales.
+    """
+    head = {**small_config()["map_head"], "type": "GSMapHead", "masks": {"pixel_m": 1.5}}
+    export_small(folder / "model.onnx", map_head=head)
+    memory = {"bev": {}, "queries": {"num": 3}, "embed_dims": 16}
+    export_small(folder / "stream.onnx", temporal=memory)
+    cv2.imwrite(str(folder / "image.jpg"), np.full((225, 400, 3), 90, np.uint8))
+    intrinsics = np.array([[320.0, 0, 200], [0, 320, 112], [0, 0, 1]])
+    cameras = [("image.jpg", intrinsics, np.eye(4))] * NUM_CAMS
     images = [np.zeros((*IMAGE_SHAPE, 3), np.uint8)] * NUM_CAMS
     meta = {"scene": "a", "lidar2global": np.eye(4), "can_bus": np.zeros(18)}
     meta["lidar2img"] = np.stack([np.eye(4)] * NUM_CAMS)
     drive = [(images, {**meta, "timestamp_ns": time}) for time in (0, 500_000_000)]
-    return {**with_exported_model(folder, minicity), "my_drive": drive}
+    return {"my_cameras": cameras, "my_can_bus": np.zeros(18), "my_drive": drive}
 
 
 def tutorial(folder: Path, minicity: Path) -> dict[str, Any]:
     """Export a model to where the tutorial does."""
     out = folder / "work_dirs/tutorial"
     out.mkdir(parents=True)
-    return with_exported_model(out, minicity)
+    export_small(out / "model.onnx")
+    return {}
 
 
 def town(folder: Path, minicity: Path) -> dict[str, Any]:
