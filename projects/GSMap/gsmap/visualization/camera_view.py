@@ -150,7 +150,7 @@ def _draw_areas(
 def _draw_polylines(
     ax: Axes, elements: MapElements, camera: CameraView, view: FrameView, style: MapStyle
 ) -> None:
-    """Draw polylines on a dark edge, thinner with distance within legible limits."""
+    """Draw polylines with a dark outline. Lines far away are thinner, but still legible."""
     starts = []
     ends = []
     num_segments = []
@@ -168,18 +168,19 @@ def _draw_polylines(
     )
     box = ax.get_window_extent()
     scale = np.sqrt(box.width * box.height) / ax.figure.dpi / _NOMINAL_SIZE_IN
-    level = np.rint(0.6 * np.log(10 / np.maximum(depth_m, 0.1)) / _WIDTH_STEP).astype(int)
+    nearness = np.log(10 / np.maximum(depth_m, 0.1))  # 0 at 10 m
+    width_level = np.rint(0.6 * nearness / _WIDTH_STEP).astype(int)
     # One path for each class and width.
-    keys = np.c_[segment_labels[index], level]
+    keys = np.c_[segment_labels[index], width_level]
     kinds, kind_of_segment = np.unique(keys, axis=0, return_inverse=True)
     paths = []
     for kind in range(len(kinds)):
         parts = segments[kind_of_segment == kind]  # (m, 2, 2)
         codes = [Outline.MOVETO, Outline.LINETO] * len(parts)
         paths.append(Outline(np.concatenate(parts), codes))
-    thinning = np.exp(_WIDTH_STEP * kinds[:, 1]).clip(0.45, 2.6)
-    widths = scale * style.camera_line_pt * thinning
-    edges = PathCollection(
+    width_factors = np.exp(_WIDTH_STEP * kinds[:, 1]).clip(0.45, 2.6)
+    widths = scale * style.camera_line_pt * width_factors
+    outlines = PathCollection(
         paths,
         edgecolors=mcolors.to_rgba(style.halo, 0.55),
         linewidths=widths + 1.1 * scale,
@@ -188,9 +189,9 @@ def _draw_polylines(
     lines = PathCollection(
         paths, edgecolors=style.colours(kinds[:, 0]), linewidths=widths, **_OPEN_PATHS
     )
-    edges.set_zorder(4)
+    outlines.set_zorder(4)
     lines.set_zorder(5)
-    ax.add_collection(edges)
+    ax.add_collection(outlines)
     ax.add_collection(lines)
 
 
@@ -210,16 +211,16 @@ def draw_camera(
         elements: Map elements in the annotation frame, or None for the image alone.
         view: Ground plane of the annotation frame.
         style: Colours and widths.
-        size_px: Width and height of the axes on the canvas in pixels; the image is resampled to
-            them.
+        size_px: Width and height of the axes on the canvas in pixels, to which the image is
+            resampled.
     """
     width, height = camera.size_px
     method = cv2.INTER_AREA if size_px[0] < width else cv2.INTER_CUBIC
     image = cv2.resize(camera.image, size_px, interpolation=method)
     ax.imshow(image, extent=(0, width, height, 0), interpolation="nearest", zorder=1)
     if elements is not None and len(elements):
-        _draw_areas(ax, elements, camera, view, style)
-        _draw_polylines(ax, elements, camera, view, style)
+        _draw_areas(ax, elements, camera=camera, view=view, style=style)
+        _draw_polylines(ax, elements, camera=camera, view=view, style=style)
     ax.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[])
     ax.spines[:].set_visible(False)
     plate = {"boxstyle": "round,pad=0.3", "facecolor": (0, 0, 0, 0.5), "edgecolor": "none"}

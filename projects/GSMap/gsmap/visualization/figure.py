@@ -39,8 +39,8 @@ FORMATS = tuple(_SAVE_OPTIONS)
 _MARGIN = 26  # px at DPI, as all lengths of the layout
 _GAP = 6  # between cameras
 _HEADER = 84
-_TICKS = 60  # labels at the left of and below a panel
-_TITLE = 44  # of a panel
+_TICKS = 60  # space for the labels at the left of a panel and below it
+_TITLE = 44  # space for the title of a panel
 _USABLE = _WIDTH - 2 * _MARGIN
 _PNG_IN_SVG = re.compile(rb"data:image/png;base64,([\w+/=\s]+)")
 _RANDOM_TOKEN = re.compile(r"[0-9a-f]{16,}")
@@ -106,8 +106,8 @@ def _layout(
         Boxes of the cameras, boxes of the panels, and the lower edge of all in px.
     """
     if num_panels == 1 and len(rows) > 1:
-        # The height of the cameras is slope * width + offset, and the width of the panel follows
-        # from its height, so there is one width at which both have one height.
+        # The rows of cameras have the height slope * width + offset, and the panel has the width
+        # aspect * height. At one width of the cameras, both heights are equal.
         slope = sum(1 / sum(row) for row in rows)
         offset = _GAP * (len(rows) - 1) - sum(_GAP * (len(row) - 1) / sum(row) for row in rows)
         frame_height = _TITLE + _TICKS  # above and below the panel
@@ -143,7 +143,7 @@ def _add_axes(figure: Figure, box: Box) -> Axes:
 def _legend_lines(
     maps: Sequence[MapElements | None], panels: Sequence[BEVPanel], style: MapStyle
 ) -> list[Line2D]:
-    """Legend entries of the classes and the kinds of matches that are drawn."""
+    """Legend entries of all classes and kinds of matches in a figure."""
     labels: set[int] = set()
     for elements in maps:
         if elements:

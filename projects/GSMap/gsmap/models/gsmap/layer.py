@@ -16,7 +16,7 @@ class GaussianDecoderLayer(MapDecoderLayer):
     Args:
         guide_sampling: Transform sampling offsets by the orientation and size of each Gaussian.
         embed_gaussians: Add an embedding of (mu, sigma, theta) to the positional queries.
-        invariant_frame: Use matrices of the offsets that are equal for theta and theta + pi.
+        invariant_frame: Transform offsets by matrices that are equal for theta and theta + pi.
         embed_hidden_dims: Hidden channels of the embedding.
         kwargs: Arguments of `MapDecoderLayer`.
     """
@@ -40,10 +40,10 @@ class GaussianDecoderLayer(MapDecoderLayer):
 
 
 def add_guidance(decoder: PARTS) -> PARTS:
-    """Copy the config of a decoder, with layers that are conditioned on Gaussians by default.
+    """Copy the config of a decoder, and condition its layers on Gaussians by default.
 
     Args:
-        decoder: Config of a decoder. Its settings take precedence.
+        decoder: Config of a decoder, whose settings take precedence.
     """
     layer = decoder.get("layer", {})
     kind = class_of(with_defaults(decoder, type=MapDecoder))

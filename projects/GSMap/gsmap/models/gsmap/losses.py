@@ -1,4 +1,4 @@
-"""Losses of rendered masks: the raster loss of GSMap (Eq. 12), and a loss of the overlap."""
+"""Losses of rendered masks: the raster loss of GSMap (Eq. 12), and dice and IoU losses."""
 
 from typing import Any
 
@@ -18,14 +18,13 @@ from gsmap.utils.errors import InputError
 class MaskLoss(MapLoss):
     """Base class of losses of the rendered masks of matched instances.
 
-    The gradient of masks without overlap has no useful direction, so that the loss of pairs with a
-    small overlap can be reduced.
+    Without overlap of the masks, the gradient has no useful direction. ``full_iou`` therefore
+    reduces the loss of pairs with a small overlap.
 
     Args:
         loss_weight: Weight of the loss, or a weight for each class.
-        full_iou: Smallest soft IoU of a pair with the full loss, or one for each class. With a
-            smaller IoU, the loss is multiplied by IoU / full_iou. 0 means the full loss for all
-            pairs.
+        full_iou: Soft IoU from which a pair has the full loss, or one for each class. Below it, the
+            loss is multiplied by IoU / full_iou. With 0, all pairs have the full loss.
         flags: Flags of `MapLoss`.
     """
 
@@ -36,7 +35,7 @@ class MaskLoss(MapLoss):
         self.full_iou = full_iou
 
     def check(self, head: BuiltHead) -> None:
-        """Raise ValueError if the head has no Gaussians, or another number of classes."""
+        """Raise ValueError if the head has no Gaussians or ``full_iou`` does not fit its classes."""
         require_gaussians(self, head)
         check_weight(self, self.full_iou, classes=head.classes)
 

@@ -18,8 +18,8 @@ from gsmap.structures.gaussians import extents_along_line, line_errors
 class ErrorQuality(Quality):
     r"""Quality by the predicted uncertainty of points: the mean of :math:`\exp(-d^2 / 2 \sigma^2)`.
 
-    The mean is over the points of an element, with error d and standard deviation sigma across its
-    line, in metres.
+    The mean is over the points of an element. d is the error and sigma the standard deviation
+    across the line, both in metres.
 
     Args:
         largest_m: Upper limit of sigma in metres, so that a large sigma cannot raise the quality of
@@ -38,9 +38,11 @@ class ErrorQuality(Quality):
         """Quality of each matched pair. (M,)"""
         reference = cast(GaussianReference, pairs.predictions.reference)
         gaussians = reference.errors(pairs.pred_references.detach())
-        sigma = extents_along_line(gaussians)[..., 1].clamp(max=self.largest_m)  # (M, P)
-        distance = line_errors(gaussians.means, pairs.gt_pts_m[..., :2])[..., 1]
-        return (-(distance / sigma).square() / 2).exp().mean(-1)
+        sigmas = extents_along_line(gaussians)  # along, across (M, P, 2)
+        errors = line_errors(gaussians.means, pairs.gt_pts_m[..., :2])  # along, across (M, P, 2)
+        sigma_across = sigmas[..., 1].clamp(max=self.largest_m)
+        exponents = -(errors[..., 1] / sigma_across).square() / 2  # (M, P)
+        return exponents.exp().mean(-1)
 
 
 @MODELS.register_module()

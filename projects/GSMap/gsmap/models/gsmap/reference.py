@@ -21,10 +21,12 @@ from gsmap.utils.errors import InputError
 
 @MODELS.register_module()
 class GaussianReference(PointReference, AddsWeights):
-    """References of Gaussians: the point, which is the centre, then sigma and theta (GSMap Eq. 1).
+    """References of Gaussians (GSMap Eq. 1).
 
-    At the start of a training all Gaussians are equal, and layers do not change sigma and theta.
-    Points may have a height; the Gaussians lie in the plane.
+    The D entries of a reference are the 2 or 3 coordinates of the point, which is the centre of the
+    Gaussian, then the two sigmas before their activation, and theta. At the start of a training all
+    Gaussians are equal, and layers do not change sigma and theta. Points may have a height, but
+    Gaussians lie in the plane.
 
     Args:
         grid: Extent of the map.
@@ -72,20 +74,20 @@ class GaussianReference(PointReference, AddsWeights):
         self.reset_gaussian_parts()
 
     def init_weights(self) -> None:
-        """Initialise the networks of the points, and of sigma and theta without effect."""
+        """Initialise the networks of the points, and set the networks of sigma and theta to 0."""
         super().init_weights()
         self.reset_gaussian_parts()
 
     def reset_gaussian_parts(self) -> None:
-        """Initialise equal Gaussians for all queries, and no change by the layers."""
+        """Make the Gaussians of all queries equal, and their changes by the layers 0."""
         constant_init(self.gaussian_init, 0.0)
         for branch in self.gaussian_branches:
             *_, last = branch.children()
             constant_init(last, 0.0)
 
     def start(self, query_pos: Tensor) -> Tensor:
-        """Initial references, from the positional queries. (..., Q, C) -> (..., Q * n, D)"""
-        shapes = self.by_point(self.gaussian_init(query_pos))
+        """Initial references of n points per query. (..., Q, C) -> (..., Q * n, D)"""
+        shapes = self.by_point(self.gaussian_init(query_pos))  # sigma, theta (..., Q * n, 3)
         return torch.cat([super().start(query_pos), shapes], dim=-1)
 
     def refine(self, layer: int, point_states: Tensor, reference: Tensor) -> Tensor:
@@ -93,7 +95,7 @@ class GaussianReference(PointReference, AddsWeights):
 
         Args:
             layer: Index of the layer.
-            point_states: States of the points. (..., Q, C)
+            point_states: States, each of which refines n points. (..., Q, C)
             reference: References of the previous layer. (..., Q * n, D)
 
         Returns:
@@ -101,7 +103,8 @@ class GaussianReference(PointReference, AddsWeights):
         """
         points = super().refine(layer, point_states, reference[..., : self.coords])
         changes = self.by_point(self.gaussian_branches[layer](point_states))
-        return torch.cat([points, reference[..., self.coords :] + changes], dim=-1)
+        shapes = reference[..., self.coords :] + changes  # sigma, theta (..., Q * n, 3)
+        return torch.cat([points, shapes], dim=-1)
 
     def transform_references(self, references: Tensor, motion: Tensor) -> Tensor:
         """Transform Gaussians of an earlier frame to the current frame, and rotate them.
@@ -121,7 +124,14 @@ class GaussianReference(PointReference, AddsWeights):
         return torch.cat([transformed[..., :-1], theta], dim=-1)
 
     def errors(self, references: Tensor) -> Gaussians:
-        """Gaussians of the errors of points, here the rendered ones. (..., P, D) -> (..., P)"""
+        """Gaussians of the errors of points, here the rendered Gaussians.
+
+        Args:
+            references: References. (..., P, D)
+
+        Returns:
+            Centres and sigmas in metres, angles in radians. (..., P)
+        """
         return self.space.decode(references)
 
     def decode(self, references: Tensor) -> dict[str, Tensor]:

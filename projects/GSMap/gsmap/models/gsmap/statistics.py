@@ -32,7 +32,7 @@ def gaussian_statistics(
     Returns:
         Scalars by name. For each class with pairs: ``soft_iou/<name>`` (mean),
         ``sigma_along/<name>`` and ``sigma_across/<name>`` (medians in metres). For all pairs:
-        ``at_floor``, the share of Gaussians with both sigmas less than 10 % above the smallest one.
+        ``at_floor``, the share of Gaussians with both sigmas less than 10 % above ``floor_m``.
     """
     if not len(labels):
         return {}

@@ -24,10 +24,10 @@ def conv_block(inputs: int, outputs: int) -> list[nn.Module]:
 
 
 class JoinedMaps(nn.Sequential):
-    """Fusion of a fine map and an enlarged coarse map by two convolutions.
+    """Fusion of a fine and a resized coarse map by two convolutions.
 
     Args:
-        inputs: Sum of the channels C and D of both maps.
+        inputs: C + D, the channels of the fine map plus the channels of the coarse one.
         outputs: Channels E of the result.
     """
 
@@ -72,9 +72,9 @@ class ViewTransformEncoder(CameraEncoder):
 
     For each camera, a fully connected network transforms the pixels of a feature channel to a
     top-down camera map, with weights shared by all channels. The camera map has 2/3 of the length
-    and width of the BEV and begins a sixth of that length behind the camera. A BEV cell has the
-    maximum of all camera maps. Intrinsics are not used, so the weights fit one set of cameras and
-    one image size.
+    and width of the BEV and begins a sixth of that length behind the camera. A BEV cell takes
+    the maximum over all camera maps. Intrinsics are not used, so the weights fit one set of cameras
+    and one image size.
 
     Args:
         grid: Extent of the map, in metres.
@@ -105,7 +105,7 @@ class ViewTransformEncoder(CameraEncoder):
         super().__init__(init_cfg)
         self.grid = grid.rasterized(bev_pixel_m)
         self.released_units = released_units
-        self.view_pixel_m = bev_pixel_m / 0.6
+        self.view_pixel_m = bev_pixel_m / 0.6  # side of a cell of a camera map
         self.feature_size = (image_size[0] // stride, image_size[1] // stride)
         num_rows, num_columns = forward_size(self.grid)
         self.view_size = (2 * num_rows // 5, 2 * num_columns // 5)
@@ -115,12 +115,15 @@ class ViewTransformEncoder(CameraEncoder):
                 f"feature pixels, and the map a camera's map of {self.view_size} cells: neither "
                 "may be empty."
             )
-        inputs = self.feature_size[0] * self.feature_size[1]
-        cells = self.view_size[0] * self.view_size[1]
+        num_inputs = self.feature_size[0] * self.feature_size[1]
+        num_cells = self.view_size[0] * self.view_size[1]
         self.views = nn.ModuleList()
         for _ in range(num_cams):
             view = nn.Sequential(
-                nn.Linear(inputs, cells), nn.ReLU(), nn.Linear(cells, cells), nn.ReLU()
+                nn.Linear(num_inputs, num_cells),
+                nn.ReLU(),
+                nn.Linear(num_cells, num_cells),
+                nn.ReLU(),
             )
             self.views.append(view)
 
@@ -205,7 +208,9 @@ class ViewTransformEncoder(CameraEncoder):
 
 
 def sample_maps(maps: Tensor, positions: Tensor) -> Tensor:
-    """Sample maps bilinearly; 0 from the last row or column on, as in the released code.
+    """Sample maps bilinearly.
+
+    As in the released code, values at and behind the last row or column are 0.
 
     Args:
         maps: Maps. (n, C, h, w)
@@ -216,5 +221,6 @@ def sample_maps(maps: Tensor, positions: Tensor) -> Tensor:
     """
     last = constant(positions, [maps.shape[-1] - 1, maps.shape[-2] - 1])
     inside = ((positions >= 0) & (positions < last)).all(dim=-1)
-    values = F.grid_sample(maps, 2 * positions / last - 1, align_corners=True)
+    positions_norm = 2 * positions / last - 1  # [-1, 1] over the map
+    values = F.grid_sample(maps, positions_norm, align_corners=True)
     return values * inside[:, None]

@@ -46,9 +46,9 @@ class LineMapLosses:
 
         Args:
             maps: Predictions of a batch.
-            numbers: Number of each pixel's instance of a class, 0 for none. (B, classes, H, W)
-            directions: Forward and backward direction 1 to K of each pixel, 0 for none.
-                (B, 2, H, W)
+            numbers: Instance number of each pixel in each class, 0 for none. (B, classes, H, W)
+            directions: Index, 1 to K, of the forward and of the backward direction of each pixel, 0
+                for none. (B, 2, H, W)
 
         Returns:
             ``loss_semantic``, ``loss_pull``, ``loss_push`` and ``loss_direction``.

@@ -6,7 +6,7 @@ from gsmap.utils.errors import InputError
 
 
 class PatchMerging(nn.Module):
-    """Downsampling by two: the channels of 2 x 2 cells are normalised and projected (MGMapNet).
+    """Downsampling by two: joins the channels of 2 x 2 cells and projects them (MGMapNet).
 
     Args:
         embed_dims: Channels C.
@@ -30,7 +30,8 @@ class PatchMerging(nn.Module):
         # Channel order of the released checkpoints: both rows of the even column, then both rows of
         # the odd column. mmdet's PatchMerging has another order.
         patches = patches.permute(0, 2, 4, 5, 3, 1).flatten(3)  # (B, h, w, 4 C)
-        return self.reduction(self.norm(patches)).permute(0, 3, 1, 2)
+        cells = self.reduction(self.norm(patches))  # (B, h, w, C)
+        return cells.permute(0, 3, 1, 2)
 
 
 class BEVPyramid(nn.Module):

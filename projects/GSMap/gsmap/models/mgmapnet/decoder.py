@@ -113,14 +113,16 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
         by_instance = reference.unflatten(1, (-1, self.num_points))  # (B, N, P, D)
         position = query_pos
         if self.reference_code is not None:
-            position = self.reference_code(by_instance[..., : self.reference_dims].flatten(2))
+            encoded_entries = by_instance[..., : self.reference_dims]
+            position = self.reference_code(encoded_entries.flatten(2))
         frames = None
         if self.guidance is not None:
-            # Each level halves both sides, so the rotations of the finest one hold for all.
+            # Each level halves both sides, so all levels share the rotations of the finest one.
             frames = self.guidance.frames(reference, feats[0])
         position = self.guide_position(position, reference)
         state = self.cross_attn(state, position, reference=by_instance, feats=feats, frames=frames)
-        return state._replace(instances=self.norms[2](self.ffn(self.norms[1](state.instances))))
+        instances = self.ffn(self.norms[1](state.instances))
+        return state._replace(instances=self.norms[2](instances))
 
     def guide_position(self, position: Tensor, reference: Tensor) -> Tensor:
         """Apply the guidance to the position of each point, and average over the points.
@@ -160,12 +162,12 @@ class MGMapNetDecoded(Decoded):
 class MGMapNetDecoder(MapDecoder):
     """Decoder of instance and point queries that refine one reference (MGMapNet).
 
-    Its inputs are instance queries with one reference each, which all points of an instance share
-    before the first layer.
+    Its inputs are instance queries with one reference each. All points of an instance start from
+    this reference.
 
     Args:
         layer: Settings of `MGMapNetDecoderLayer`. Its ``reference_dims`` applies from the second
-            layer on, as the references of an instance's points are equal before.
+            layer on, because all points of an instance have one reference in the first layer.
         embed_dims: Channels C of the queries and of the BEV features.
         num_levels: Number of levels of BEV features.
         kwargs: Further arguments of `MapDecoder`.
@@ -182,7 +184,8 @@ class MGMapNetDecoder(MapDecoder):
         **kwargs: Any,
     ) -> None:
         super().__init__(layer or {}, **kwargs, embed_dims=embed_dims, num_levels=num_levels)
-        # Differs from the poster: the released model's first layer adds the learned position.
+        # Differs from the poster: as in the released model, the first layer adds the learned
+        # position.
         self.layers[0].reference_code = None
         self.bev_pyramid = BEVPyramid(embed_dims, num_levels)
 

@@ -85,7 +85,7 @@ class InstanceMaskLoss(MapLoss):
         return torch.einsum("nc,chw->nhw", self.embedding(states), bev_feats.to(states))
 
     def forward(self, pairs: MatchedPairs) -> Tensor:
-        """Compute the weighted loss; masks are averaged over the cells of the BEV features."""
+        """Compute the weighted loss of masks at the resolution of the BEV features."""
         sample_states = pairs.pred_instance_states.split(pairs.counts)
         sample_logits = []
         for states, feats in zip(sample_states, pairs.predictions.bev_feats, strict=True):
@@ -96,8 +96,8 @@ class InstanceMaskLoss(MapLoss):
             sample_masks = masks.split(pairs.counts)
             sample_indices = pairs.gt_inds.split(pairs.counts)
             sorted_masks = []
-            for own_masks, indices in zip(sample_masks, sample_indices, strict=True):
-                sorted_masks.append(own_masks[indices.argsort()])
+            for matched_masks, indices in zip(sample_masks, sample_indices, strict=True):
+                sorted_masks.append(matched_masks[indices.argsort()])
             masks = torch.cat(sorted_masks)
         if masks.shape != logits.shape and len(masks):
             masks = F.interpolate(masks[:, None], size=logits.shape[-2:], mode="area")[:, 0]
@@ -108,7 +108,7 @@ class InstanceMaskLoss(MapLoss):
 
 @MODELS.register_module()
 class SamplingLocationLoss(MapLoss):
-    """L1 distance of each point's mean sampling location from the annotated point (MGMapNet).
+    """L1 distance between the mean sampling location of a point and its target (MGMapNet).
 
     Args:
         loss_weight: Weight of the loss.
@@ -135,4 +135,5 @@ class SamplingLocationLoss(MapLoss):
     def values(self, pairs: MatchedPairs) -> Tensor:
         """Compute the distance of x and y, [0, 1] over the map. (M, P, 2)"""
         decoded = cast(MGMapNetDecoded, pairs.predictions.decoded)
-        return (pairs.of_queries(decoded.mean_locations) - pairs.gt_pts[..., :2]).abs()
+        locations = pairs.of_queries(decoded.mean_locations)  # (M, P, 2)
+        return (locations - pairs.gt_pts[..., :2]).abs()
