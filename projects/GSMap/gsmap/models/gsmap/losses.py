@@ -35,7 +35,7 @@ class MaskLoss(MapLoss):
         self.full_iou = full_iou
 
     def check(self, head: BuiltHead) -> None:
-        """Raise ValueError if the head has no Gaussians or ``full_iou`` does not fit its classes."""
+        """Raise ValueError if the head has no Gaussians, or ``full_iou`` other classes."""
         require_gaussians(self, head)
         check_weight(self, self.full_iou, classes=head.classes)
 

@@ -72,9 +72,9 @@ class ViewTransformEncoder(CameraEncoder):
 
     For each camera, a fully connected network transforms the pixels of a feature channel to a
     top-down camera map, with weights shared by all channels. The camera map has 2/3 of the length
-    and width of the BEV and begins a sixth of that length behind the camera. A BEV cell takes
-    the maximum over all camera maps. Intrinsics are not used, so the weights fit one set of cameras
-    and one image size.
+    and width of the BEV and begins ahead of the camera, by an eighth of its length. A BEV cell
+    takes the maximum over all camera maps. Intrinsics are not used, so the weights fit one set of
+    cameras and one image size.
 
     Args:
         grid: Extent of the map, in metres.
