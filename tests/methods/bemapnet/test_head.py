@@ -215,7 +215,7 @@ def test_positions_of_other_images_are_refused(size):
     ):
         built.ground_points(ground_from_img(), (2, 2), size)
     built.ground_points(ground_from_img(), (2, 2), (7, 17))  # two rows are cut off
-    with pytest.raises(ValueError, match="num_layers must be those over the cameras"):
+    with pytest.raises(ValueError, match="num_layers must be two numbers, of pixel layers"):
         encoder(num_layers=(1, 0))
 
 

@@ -74,7 +74,7 @@ def test_the_points_are_found_however_their_class_is_named(kind, head):
 
 
 def test_a_weight_of_points_that_there_are_not_is_refused():
-    with pytest.raises(ValueError, match=r"points_weight is 1.0, and there is no PointsLoss"):
+    with pytest.raises(ValueError, match="no config has the type PointsLoss: add one"):
         build_head(GSMAP, losses=HEAD["losses"][1:], points_weight=1.0)
 
 

@@ -217,5 +217,5 @@ def test_settings_that_do_not_fit_are_refused():
         StreamMemory(build_head(HEAD), elements={})
     with pytest.raises(ValueError, match="gate_m > 0"):
         memory(gate_m=0.0)
-    with pytest.raises(ValueError, match="temporal needs bev"):
+    with pytest.raises(ValueError, match="temporal needs at least one of bev"):
         StreamMemory(build_head(HEAD))

@@ -12,9 +12,9 @@ from torch import Tensor, nn
 from gsmap.structures.tensors import constant
 from gsmap.utils.errors import InputError
 
-PARTS = dict[str, Any]  # config of a part
-WEIGHT = float | Sequence[float]  # one weight, or a weight for each class
-DEFAULTS: Mapping[str, Any] = MappingProxyType({})  # all settings as in the class of the part
+PARTS = dict[str, Any]  # type of the config of one part
+WEIGHT = float | Sequence[float]  # type of a weight: one number, or one for each class
+DEFAULTS: Mapping[str, Any] = MappingProxyType({})  # no settings: the part's class has defaults
 
 
 class AuxHead(Protocol):
@@ -27,11 +27,19 @@ class AuxHead(Protocol):
     name: str
 
     def loss(self, bev_outputs: dict[str, Any], batch_data_samples: Sequence[Any]) -> Tensor:
-        """Weighted loss of the outputs of the BEV encoder. ()"""
+        """Weighted loss of a batch.
+
+        Args:
+            bev_outputs: Outputs of the BEV encoder, by name.
+            batch_data_samples: Samples of the batch, with their annotations.
+
+        Returns:
+            Scalar loss.
+        """
 
 
 def with_defaults(settings: Mapping[str, Any] | None, **defaults: Any) -> PARTS:
-    """Config of a part, in which defaults complete the given settings.
+    """Config of a part: the given settings, and defaults for those that are not given.
 
     Args:
         settings: Given settings, or None.
@@ -51,11 +59,12 @@ def build_part(settings: Mapping[str, Any] | None, **defaults: Any) -> Any:
 
 
 def class_of(part: Mapping[str, Any], registry: Registry = MODELS) -> type | None:
-    """Class of a config, or None if the config has no type or the registry does not know it.
+    """Class that a config builds, or None if it has no type or a name that is not registered.
 
     Args:
-        part: Config, whose type is a class or the name of one, with or without a scope.
-        registry: Registry of the names.
+        part: Config. Its ``type`` is a class, or the name of a class with or without the scope of
+            its registry.
+        registry: Registry in which names are looked up.
     """
     kind = part.get("type")
     return registry.get(kind) if isinstance(kind, str) else kind
@@ -71,20 +80,20 @@ def optional_part(kind: type, settings: Mapping[str, Any] | None, **defaults: An
     """
     if settings is None:
         return []
-    return [with_defaults(settings, **{"type": kind, **defaults})]
+    return [{"type": kind, **defaults, **settings}]
 
 
 def set_points_weight(
     parts: Sequence[PARTS], kind: type, weight: WEIGHT | None, key: str, registry: Registry = MODELS
 ) -> list[PARTS]:
-    """Copy configs of losses or costs, with another weight of the points.
+    """Copy configs of losses or costs, and replace the weight of the points loss or cost.
 
     Args:
         parts: Configs of losses or costs.
-        kind: Class of the loss or cost of the points.
-        weight: Weight of the points. None keeps the configs as they are.
-        key: Name of the setting of the weight.
-        registry: Registry of the classes.
+        kind: Class of the loss or cost of the points. Subclasses do not count.
+        weight: New weight. None keeps the configs as they are.
+        key: Name of the setting that holds the weight.
+        registry: Registry of the classes of the configs.
 
     Raises:
         ValueError: If a weight is given and no config has the class.
@@ -100,8 +109,8 @@ def set_points_weight(
         weighted_parts.append(part)
     if not has_points:
         raise InputError(
-            f"points_weight is {weight}, and there is no {kind.__name__}: add one, or set "
-            "points_weight=None."
+            f"points_weight is {weight}, but no config has the type {kind.__name__}: add one, or "
+            "set points_weight=None."
         )
     return weighted_parts
 
@@ -110,7 +119,7 @@ def modules_by_name(modules: Sequence[Any]) -> nn.ModuleDict:
     """Dictionary of modules by their attribute ``name``.
 
     Raises:
-        ValueError: If two modules have one name.
+        ValueError: If two modules have an equal name.
     """
     names = [module.name for module in modules]
     check_unique_names(names, kind="parts")
@@ -121,8 +130,8 @@ def check_unique_names(names: Sequence[str], kind: str) -> None:
     """Raise ValueError if a name occurs twice.
 
     Args:
-        names: Names.
-        kind: Plural noun for the named things, for the message.
+        names: Names to check.
+        kind: Plural noun for the error message, such as "losses".
     """
     for name in sorted(names):
         if names.count(name) > 1:

@@ -1,4 +1,4 @@
-"""BeMapNet's BEV encoder: global attention of BEV cells to pixels placed on the ground."""
+"""BeMapNet's BEV encoder: BEV cells attend to all pixels, encoded by their ground points."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -19,9 +19,10 @@ from gsmap.utils.errors import InputError
 
 @MODELS.register_module()
 class BezierBEVEncoder(CameraEncoder):
-    """BEV encoder with self-attention over all cameras and attention of BEV cells to all pixels.
+    """BEV encoder with self-attention of all pixels and cross-attention from BEV cells to pixels.
 
-    The positional encoding of a pixel is computed from its point on the ground (IPM-PE, BeMapNet).
+    The pixels are those of the feature maps of all cameras. The positional encoding of a pixel is
+    computed from the point where its viewing ray meets the ground (IPM-PE, BeMapNet).
     Pixels above the horizon are masked. In addition to ``bev_feats``, the encoder returns
     ``bev_levels``, the outputs of all BEV layers.
 
@@ -30,18 +31,18 @@ class BezierBEVEncoder(CameraEncoder):
         in_channels: Channels of the image features.
         bev_pixel_m: Side of a BEV cell in metres.
         embed_dims: Channels C of the BEV features.
-        num_layers: Number of layers over the cameras, and number of BEV layers.
+        num_layers: Number of self-attention layers of the pixels, and number of BEV layers.
         layer_cfg: Settings ``num_heads``, ``ffn_dims`` and ``dropout`` of all layers.
         position_dims: Hidden channels of the network of the positional encoding.
-        position_size: Rows and columns of the image over which pixel positions are spread. By
-            default the size before cropping, as in the released code; None for the size of the
-            images.
-        from_camera: Whether ground points are relative to their camera, as in the released code,
-            instead of to the vehicle.
+        position_size: Rows and columns of the image that the feature maps cover, for the viewing
+            rays. By default the size before cropping, as in the released code; None for the size
+            of the cropped images.
+        from_camera: Whether the origin of ground points is below their camera, as in the released
+            code, instead of the origin of the ground frame.
         init_cfg: Initialisation config of mmengine.
 
     Raises:
-        ValueError: If ``num_layers`` are not two numbers, of which the second is 1 or more.
+        ValueError: If ``num_layers`` has not two entries, or the second is less than 1.
     """
 
     calibration = ("ground_from_img",)
@@ -62,8 +63,8 @@ class BezierBEVEncoder(CameraEncoder):
         super().__init__(init_cfg)
         if len(num_layers) != 2 or num_layers[1] < 1:
             raise InputError(
-                "num_layers must be those over the cameras and those of the BEV cells, of which at "
-                f"least 1, got {tuple(num_layers)}."
+                "num_layers must be two numbers, of pixel layers and of BEV layers (>= 1), got "
+                f"{tuple(num_layers)}."
             )
         self.grid = grid.rasterized(bev_pixel_m)
         self.from_camera = from_camera
@@ -99,7 +100,7 @@ class BezierBEVEncoder(CameraEncoder):
         """Encode image features to BEV features.
 
         Args:
-            feats: Image features, S = V * h * w pixels. (B, V, C', h, w)
+            feats: Image features. (B, V, C', h, w)
             calibration: ``ground_from_img``, transforms from pixels (u * d, v * d, d, 1) to the
                 ground frame, in metres. (B, V, 4, 4)
             img_shape: Rows and columns of the padded images.
@@ -110,16 +111,19 @@ class BezierBEVEncoder(CameraEncoder):
         points, on_ground = self.ground_points(
             calibration["ground_from_img"], size=feats.shape[-2:], img_shape=img_shape
         )
-        sources = self.input_proj(feats.flatten(0, 1)).unflatten(0, feats.shape[:2])
-        sources = sources.permute(0, 1, 3, 4, 2).flatten(1, 3)  # (B, S, C)
+        images = feats.flatten(0, 1)  # (B * V, C', h, w)
+        sources = self.input_proj(images).unflatten(0, feats.shape[:2])  # (B, V, C, h, w)
+        sources = sources.permute(0, 1, 3, 4, 2).flatten(1, 3)  # (B, S, C), S = V * h * w
         source_pos = self.positions(points, on_ground)
-        # Images without any ground pixel are not masked at all.
-        hidden = ~on_ground & on_ground.any(dim=-1, keepdim=True)  # (B, S)
+        # Attention needs a key, so samples without any ground pixel are not masked.
+        ignored = ~on_ground & on_ground.any(dim=-1, keepdim=True)  # (B, S)
         for layer in self.source_layers:
-            sources = layer(sources, source_pos, key_padding_mask=hidden)
+            sources = layer(sources, source_pos, key_padding_mask=ignored)
         shape = front_size(self.grid)
-        cell_centres = self.grid.metres_from_front(centres([shape], feats.device).flip(-1))
-        cell_pos = self.positions(ahead(cell_centres, self.grid)[None])
+        cells_yx = centres([shape], feats.device).flip(-1)  # (H * W, 2), row first, in [0, 1]
+        cell_centres = self.grid.metres_from_front(cells_yx)
+        cell_points = ahead(cell_centres, self.grid)[None]  # (1, H * W, 2)
+        cell_pos = self.positions(cell_points)
         cells = self.bev_embedding.weight.expand(len(feats), -1, -1)  # (B, H * W, C)
         levels = []
         for layer in self.bev_layers:
@@ -128,7 +132,7 @@ class BezierBEVEncoder(CameraEncoder):
                 cell_pos,
                 key=sources + source_pos,
                 memory=sources,
-                key_padding_mask=hidden,
+                key_padding_mask=ignored,
             )
             level = self.norm(cells).transpose(1, 2).unflatten(2, shape)
             levels.append(turn_raster(level, self.grid))
@@ -146,11 +150,11 @@ class BezierBEVEncoder(CameraEncoder):
             img_shape: Rows and columns of the padded images.
 
         Returns:
-            Points (ahead, to the left) in metres (B, S, 2), and True for pixels below the horizon.
-            (B, S)
+            Points as distances ahead and to the left in metres (B, S, 2), and a mask that is True
+            for pixels below the horizon. (B, S)
 
         Raises:
-            ValueError: If ``position_size`` is not the size of these images before cropping rows.
+            ValueError: If ``position_size`` has fewer rows than the images, or other columns.
         """
         matrices = ground_from_img.float()
         image_size = self.position_size or img_shape
@@ -165,9 +169,10 @@ class BezierBEVEncoder(CameraEncoder):
             image_size=(image_size[0], image_size[1]),
             feature_size=(size[0], size[1]),
         )
-        camera = matrices[:, :, None, None, :3, 3]
-        depth = -camera[..., 2:] / rays[..., 2:]
-        points = rays[..., :2] * depth  # Differs from the paper, as in the released code.
+        camera = matrices[:, :, None, None, :3, 3]  # camera centres (B, V, 1, 1, 3)
+        depth = -camera[..., 2:] / rays[..., 2:]  # where the ray has height 0 (B, V, h, w, 1)
+        # Differs from the paper, as in the released code: the camera centre is not added.
+        points = rays[..., :2] * depth
         if not self.from_camera:
             points = points + camera[..., :2]
         on_ground = depth[..., 0] > 0
@@ -177,15 +182,16 @@ class BezierBEVEncoder(CameraEncoder):
         """Compute positional encodings of ground points.
 
         Args:
-            points: Points (ahead, to the left) in metres. (B, Q, 2)
-            on_ground: True for points on the ground; the code of other points is set to 0. None for
-                all points. (B, Q)
+            points: Points as distances ahead and to the left, in metres. (B, Q, 2)
+            on_ground: True for points on the ground. The sine encoding of other points is set to 0.
+                None if all points are on the ground. (B, Q)
 
         Returns:
             Positional encodings. (B, Q, C)
         """
         with torch.autocast(points.device.type, enabled=False):
-            code = coordinate_to_encoding(points, self.embed_dims // 2, scale=1.0)
+            encoding = coordinate_to_encoding(points, self.embed_dims // 2, scale=1.0)  # (B, Q, C)
         if on_ground is not None:
-            code = torch.where(on_ground[..., None], code, 0.0)
-        return self.position(code.transpose(1, 2)[..., None])[..., 0].transpose(1, 2)
+            encoding = torch.where(on_ground[..., None], encoding, 0.0)
+        encoding = encoding.transpose(1, 2)[..., None]  # (B, C, Q, 1), for 1x1 convolutions
+        return self.position(encoding)[..., 0].transpose(1, 2)

@@ -1,4 +1,4 @@
-"""Geometry-guided kernel attention (GKT): fixed kernels around projected cells."""
+"""Geometry-guided kernel attention (GKT): BEV cells attend to a kernel of pixels in each image."""
 
 import torch
 from mmdet3d.registry import MODELS
@@ -19,7 +19,7 @@ def kernel_offsets(kernel_size: tuple[int, int]) -> Tensor:
         kernel_size: Rows and columns of the kernel.
 
     Returns:
-        Offsets (dx, dy) in pixels in the order of the attention weights, dy fastest. (S, 2)
+        Offsets (dx, dy) of the S pixels, in pixels. They are ordered by dx, then by dy. (S, 2)
     """
     rows, cols = kernel_size
     dx = torch.arange(cols) - cols // 2
@@ -31,20 +31,21 @@ def kernel_offsets(kernel_size: tuple[int, int]) -> Tensor:
 class GeometryKernelAttention(nn.Module):
     """Attention from BEV cells to the pixels around their projections, one pillar height per head.
 
-    Only pairs of a cell and a camera in which it is visible are computed. Sums over cameras are
-    divided by the number of cameras in which the cell is visible.
+    A cell attends to the cameras in which it is visible, and the output is the mean over these
+    cameras.
 
     Args:
         embed_dims: Channels C.
         num_heads: Number of heads; head m attends to pillar height m.
-        kernel_size: Rows and columns of the kernel. An even kernel, which needs ``bilinear``, lies
-            half a pixel to the left and up.
-        bilinear: Sample between pixels instead of at the nearest one; zero outside the map.
+        kernel_size: Rows and columns of the kernel. An even size needs ``bilinear``; its kernel is
+            shifted half a pixel to the left or up of the projection.
+        bilinear: Interpolate between pixels, which are zero outside the map, instead of rounding
+            to the nearest pixel.
         released_cells: Use the visible cells of the first sample of the batch for all samples, as
             in the released code. The result of a sample then depends on its batch.
-        equal_weights: Start from equal weights over the kernel, as GKT's code intends. In MapTR and
-            its successors they start from Xavier's distribution, because the transformer around
-            them initialises all matrices later.
+        equal_weights: Initialise to equal weights over the kernel, as GKT's code intends. In MapTR
+            and its successors the weights start from Xavier's distribution, because their
+            transformer initialises all matrices once more, after this module.
 
     Raises:
         ValueError: If a kernel size is even without ``bilinear``, or ``embed_dims`` is not a
@@ -52,7 +53,9 @@ class GeometryKernelAttention(nn.Module):
     """
 
     offsets: Tensor
-    fixed_sizes = False  # whether invisible pairs of cell and camera are computed, with weight 0
+    # Whether tensor sizes are independent of the values, as CUDA graphs need: pairs of a cell and a
+    # camera in which it is invisible are then computed too, with weight 0.
+    fixed_sizes = False
 
     def __init__(
         self,
@@ -65,12 +68,15 @@ class GeometryKernelAttention(nn.Module):
     ) -> None:
         super().__init__()
         if not bilinear and any(size % 2 == 0 for size in kernel_size):
-            raise InputError(f"kernel_size must be odd, got {tuple(kernel_size)}.")
+            raise InputError(
+                f"kernel_size must be odd, got {tuple(kernel_size)}; or set bilinear=True."
+            )
         if embed_dims % num_heads:
             raise InputError(
                 f"embed_dims must be divisible by num_heads, got {embed_dims} and {num_heads}."
             )
-        self.num_heads = self.num_heights = num_heads
+        self.num_heads = num_heads
+        self.num_heights = num_heads  # read by the encoder, which projects one point per height
         self.bilinear = bilinear
         self.released_cells = released_cells
         self.equal_weights = equal_weights
@@ -83,7 +89,7 @@ class GeometryKernelAttention(nn.Module):
     def init_weights(self) -> None:
         """Initialise all matrices from Xavier's uniform distribution.
 
-        With ``equal_weights``, the attention weights start from zero logits.
+        With ``equal_weights``, the matrix of the attention weights is zero instead.
         """
         if self.equal_weights:
             constant_init(self.attention_weights, 0.0)
@@ -93,7 +99,7 @@ class GeometryKernelAttention(nn.Module):
         xavier_init(self.output_proj, distribution="uniform")
 
     def forward(self, query: Tensor, img_feats: Tensor, projection: PillarProjection) -> Tensor:
-        """Attend from the cells to the cameras, without the residual.
+        """Attend from the cells to the cameras. The queries are not added to the output.
 
         Args:
             query: Queries of the cells. (B, Q, C)
@@ -108,13 +114,22 @@ class GeometryKernelAttention(nn.Module):
         logits = self.attention_weights(query).float().unflatten(-1, (self.num_heads, -1))
         weights = logits.softmax(-1)  # (B, Q, heads, S)
         visible = projection.visible
-        pairs = visible[:1].expand_as(visible) if self.released_cells else visible
+        pairs = visible
+        if self.released_cells:
+            pairs = visible[:1].expand_as(visible)
         shape = (height, width)
         if self.fixed_sizes or has_kernel(value):
             maps = value.unflatten(-1, (self.num_heads, -1))
-            summed = sample_kernels(
-                maps, shape, projection.uv, pairs, weights, self.offsets, self.bilinear
-            ).flatten(2)
+            head_sums = sample_kernels(
+                maps,
+                shape,
+                uv=projection.uv,
+                seen=pairs,
+                weights=weights,
+                offsets=self.offsets,
+                bilinear=self.bilinear,
+            )
+            summed = head_sums.flatten(2)
         else:
             summed = self._sum_pairs(
                 value.float(), shape=shape, uv=projection.uv, pairs=pairs, weights=weights
@@ -125,29 +140,36 @@ class GeometryKernelAttention(nn.Module):
     def _sum_pairs(
         self, value: Tensor, shape: tuple[int, int], uv: Tensor, pairs: Tensor, weights: Tensor
     ) -> Tensor:
-        """Sum kernels over cameras as `sample_kernels` does, computing the visible pairs only.
+        """Sum pixels of kernels over cameras, as `sample_kernels`, for the visible pairs only.
 
         Args:
             value: Projected image features. (B, V, h * w, C)
             shape: Rows h and columns w of the feature maps.
-            uv: Projected pillars, [0, 1] over the image. (B, V, Q, heads, 2)
-            pairs: Whether a cell attends to a camera. (B, V, Q)
-            weights: Attention weights over the kernel. (B, Q, heads, S)
+            uv: Projection (x, y) of each cell for each head, [0, 1] over the image.
+                (B, V, Q, heads, 2)
+            pairs: True where a cell attends to a camera. (B, V, Q)
+            weights: Attention weights of the S pixels of the kernel. (B, Q, heads, S)
 
         Returns:
-            The sums. (B, Q, C)
+            Sums over cameras and kernel pixels. (B, Q, C)
         """
         batch, num_queries = weights.shape[:2]
         num_views, num_pixels = value.shape[1:3]
-        sample, view, cell = pairs.nonzero(as_tuple=True)  # T pairs
+        sample, view, cell = pairs.nonzero(as_tuple=True)  # (T,) each, for T visible pairs
         pixels, pair_weights = kernel_pixels(
-            uv[sample, view, cell], self.offsets, weights[sample, cell], shape, self.bilinear
+            uv[sample, view, cell],
+            self.offsets,
+            weights=weights[sample, cell],
+            shape=shape,
+            bilinear=self.bilinear,
         )  # (T, heads, S)
         image = (sample * num_views + view).view(-1, 1, 1)
         head = torch.arange(self.num_heads, device=value.device).view(1, -1, 1)
-        rows = (image * num_pixels + pixels) * self.num_heads + head
-        table = value.reshape(-1, value.shape[-1] // self.num_heads)
-        out = sum_rows(table, rows, pair_weights).flatten(1)  # (T, C)
-        target = sample * num_queries + cell
-        summed = out.new_zeros(batch * num_queries, out.shape[-1]).index_add(0, target, out)
+        # A row holds the channels of one head of one pixel of one image.
+        value_rows = value.reshape(-1, value.shape[-1] // self.num_heads)
+        row_index = (image * num_pixels + pixels) * self.num_heads + head  # (T, heads, S)
+        pair_sums = sum_rows(value_rows, row_index, pair_weights).flatten(1)  # (T, C)
+        cell_index = sample * num_queries + cell
+        summed = pair_sums.new_zeros(batch * num_queries, pair_sums.shape[-1])
+        summed = summed.index_add(0, cell_index, pair_sums)
         return summed.view(batch, num_queries, -1)

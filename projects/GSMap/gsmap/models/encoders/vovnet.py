@@ -1,6 +1,6 @@
-"""VoVNetV2, an image backbone (arXiv 1911.06667): with V2-99 as its largest size.
+"""VoVNetV2, an image backbone (arXiv 1911.06667) in the sizes V2-19 to V2-99.
 
-Module names, including their slashes, equal those of the original, so its checkpoints load.
+Modules are named as in the original code (``stem_1/conv``), so that its checkpoints can be loaded.
 """
 
 from collections import OrderedDict
@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from gsmap.utils.errors import InputError
 
 STEM_CHANNELS = (64, 64, 128)
-STAGE_CHANNELS = ((128, 256), (160, 512), (192, 768), (224, 1024))  # hidden, output
+STAGE_CHANNELS = ((128, 256), (160, 512), (192, 768), (224, 1024))  # (hidden, output) of each stage
 LAYERS_AND_BLOCKS = {  # layers per block, blocks of the four stages
     19: (3, (1, 1, 1, 1)),
     39: (5, (1, 1, 2, 2)),
@@ -27,20 +27,29 @@ def _convolution(
     name: str, in_channels: int, channels: int, size: int, stride: int = 1
 ) -> list[tuple[str, nn.Module]]:
     """Convolution, batch norm and ReLU with their names."""
-    padding = size // 2
+    conv = nn.Conv2d(
+        in_channels,
+        channels,
+        kernel_size=size,
+        stride=stride,
+        padding=size // 2,
+        bias=False,
+    )
     return [
-        (f"{name}/conv", nn.Conv2d(in_channels, channels, size, stride, padding, bias=False)),
+        (f"{name}/conv", conv),
         (f"{name}/norm", nn.BatchNorm2d(channels)),
         (f"{name}/relu", nn.ReLU(inplace=True)),
     ]
 
 
 class OneShotAggregation(nn.Module):
-    """A chain of 3x3 convolutions, aggregated at its end by a 1x1 convolution with gated channels.
+    """Chain of 3x3 convolutions, whose outputs a 1x1 convolution aggregates once, at the end.
+
+    A gate weights the channels of the result (effective squeeze and excitation, eSE).
 
     Args:
         name: Prefix of the names of the modules.
-        channels: Channels of the input, of the 3x3 convolutions and of the output.
+        channels: Number of channels of the input, of each 3x3 convolution and of the output.
         num_layers: Number of 3x3 convolutions.
         residual: Add the input to the output.
     """
@@ -67,8 +76,8 @@ class OneShotAggregation(nn.Module):
             size=1,
         )
         self.concat = nn.Sequential(OrderedDict(concat))
-        gate = OrderedDict(fc=nn.Conv2d(out_channels, out_channels, 1), gate=nn.Hardsigmoid())
-        self.ese = nn.Sequential(gate)  # effective squeeze and excitation
+        fc = nn.Conv2d(out_channels, out_channels, kernel_size=1)
+        self.ese = nn.Sequential(OrderedDict(fc=fc, gate=nn.Hardsigmoid()))
 
     def forward(self, feats: Tensor) -> Tensor:
         """Run the block. (n, C_in, H, W) -> (n, C_out, H, W)"""
@@ -87,9 +96,10 @@ class VoVNet(BaseModule):
     """VoVNetV2 with effective squeeze and excitation.
 
     Args:
-        depth: 19, 39, 57 or 99.
+        depth: Size of the network: 19, 39, 57 or 99.
         out_indices: Stages of the output: 0 to 3, at 1/4, 1/8, 1/16 and 1/32 of the image size.
-        frozen_stages: The stem and this number of stages are not trained; -1 trains all.
+        frozen_stages: Number of stages that are not trained, 0 to 4, in addition to the stem; -1
+            trains the stem, too.
         norm_eval: Keep the running statistics of batch norms in training.
         init_cfg: Initialisation of mmengine.
 
@@ -126,11 +136,12 @@ class VoVNet(BaseModule):
         num_layers, num_blocks = LAYERS_AND_BLOCKS[depth]
         in_channels = third
         for index, (hidden_channels, out_channels) in enumerate(STAGE_CHANNELS):
+            number = index + 2  # the original code counts the stem as stage 1
             stage = nn.Sequential()
             if index:
-                stage.add_module("Pooling", nn.MaxPool2d(3, 2, ceil_mode=True))
+                stage.add_module("Pooling", nn.MaxPool2d(kernel_size=3, stride=2, ceil_mode=True))
             for block_index in range(num_blocks[index]):
-                name = f"OSA{index + 2}_{block_index + 1}"
+                name = f"OSA{number}_{block_index + 1}"
                 block = OneShotAggregation(
                     name,
                     channels=(in_channels, hidden_channels, out_channels),
@@ -139,7 +150,7 @@ class VoVNet(BaseModule):
                 )
                 stage.add_module(name, block)
                 in_channels = out_channels
-            self.add_module(f"stage{index + 2}", stage)
+            self.add_module(f"stage{number}", stage)
 
     @property
     def stages(self) -> tuple[nn.Sequential, ...]:
@@ -159,7 +170,9 @@ class VoVNet(BaseModule):
     def train(self, mode: bool = True) -> "VoVNet":
         """Set the training mode; frozen modules stay in evaluation mode."""
         super().train(mode)
-        for part in (self.stem, *self.stages)[: self.frozen_stages + 1]:
+        parts = (self.stem, *self.stages)
+        num_frozen = self.frozen_stages + 1  # with the stem
+        for part in parts[:num_frozen]:
             part.eval().requires_grad_(False)
         if self.norm_eval:
             for module in self.modules():

@@ -1,4 +1,4 @@
-"""Auxiliary supervision of MapTRv2 (arXiv 2308.05736) by depth."""
+"""Depth targets and depth loss of MapTRv2 (arXiv 2308.05736), from LiDAR returns in the images."""
 
 import torch
 from torch import Tensor
@@ -8,15 +8,15 @@ from gsmap.utils.errors import InputError
 
 
 def depth_bins(depth_m: Tensor, stride: int, depth_range: tuple[float, float, float]) -> Tensor:
-    """Depth bin of each block of pixels.
+    """Depth bin of the nearest LiDAR return in each block of pixels.
 
-    The target of a block is its nearest return. If that is before the first bin or beyond the last
-    one, the block has no target, even if another return is in a bin.
+    If the nearest return of a block is outside the range of the bins, the block has no target, even
+    if another of its returns is in a bin.
 
     Args:
-        depth_m: Depth along the optical axis in metres, 0 without a return. (..., H, W)
+        depth_m: Depth along the optical axis in metres, 0 in pixels without a return. (..., H, W)
         stride: Side of a block in pixels.
-        depth_range: Start of the first bin, end of the last one, and the step, in metres.
+        depth_range: Start of the first bin, end of the last bin, and size of a bin, in metres.
 
     Returns:
         Indices of bins, int64; -1 without a target. (..., H / stride, W / stride)
@@ -32,8 +32,9 @@ def depth_bins(depth_m: Tensor, stride: int, depth_range: tuple[float, float, fl
     low, _, step = depth_range
     blocks = depth_m.unflatten(dim=-1, sizes=(-1, stride))
     blocks = blocks.unflatten(dim=-3, sizes=(-1, stride))  # (..., h, s, w, s)
-    nearest = torch.where(blocks == 0, torch.inf, blocks).amin((-3, -1))  # (..., h, w)
-    position = (nearest - (low - step)) / step
+    returns = torch.where(blocks == 0, torch.inf, blocks)
+    nearest = returns.amin((-3, -1))  # (..., h, w)
+    position = (nearest - (low - step)) / step  # in bins; bin 0 is from 1 to 2
     valid = (position >= 1) & (position < num_depth_bins(depth_range) + 1)
     return torch.where(valid, position, 0).long() - 1
 
@@ -59,6 +60,6 @@ def depth_loss(probs: Tensor, bins: Tensor) -> Tensor:
     valid = bins >= 0
     indices = bins.clamp(min=0).unsqueeze(-3)
     target_probs = probs.float().gather(dim=-3, index=indices).squeeze(-3)  # (..., h, w)
-    least = torch.finfo(target_probs.dtype).tiny
-    target_probs = torch.where(valid, target_probs, 1).clamp(min=least)
+    smallest_prob = torch.finfo(target_probs.dtype).tiny  # avoids log(0)
+    target_probs = torch.where(valid, target_probs, 1).clamp(min=smallest_prob)
     return -target_probs.log().sum() / valid.sum().clamp(min=1)

@@ -1,4 +1,4 @@
-"""MGMap's refinement, which corrects point states by patches of a mask feature."""
+"""MGMap's refinement, which corrects the states of points by features cropped around them."""
 
 import torch
 from mmdet.models.backbones.resnet import BasicBlock
@@ -9,14 +9,14 @@ from gsmap.ops.deformable_sampling import deformable_sample
 from gsmap.structures.tensors import constant
 
 BINS = 5  # bins of a patch along each axis
-SAMPLES = 2  # samples of a bin along each axis
-_BOX = 0.1  # side of a patch, as a share of the map's side
+SAMPLES = 2  # sampling points of a bin along each axis
+_PATCH_SHARE = 0.1  # side of a patch divided by the side of the map
 
 
 def crop_patches(feats: Tensor, centres: Tensor) -> Tensor:
     """Crop patches of a tenth of the map's sides by bilinear sampling (RoIAlign).
 
-    As in RoIAlign without the half-cell shift, values lie at integer positions, and samples more
+    As in RoIAlign with ``aligned=False``, values lie at integer positions, and sampling points more
     than a cell outside the map are 0.
 
     Args:
@@ -28,16 +28,23 @@ def crop_patches(feats: Tensor, centres: Tensor) -> Tensor:
     """
     height, width = feats.shape[2:]
     size = constant(centres, [width, height])
+    # Sampling points in [0, 1] over a patch.
     steps = (torch.arange(BINS * SAMPLES, device=feats.device) + 0.5) / (BINS * SAMPLES)
     grid = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), dim=-1)  # (10, 10, 2)
-    corners = (centres.clamp(max=1.0) - _BOX / 2) * size
-    samples = corners[:, :, None, None] + grid * (_BOX * size).clamp(min=1.0)  # (B, Q, 10, 10, 2)
-    samples = samples.unflatten(3, (BINS, SAMPLES)).unflatten(2, (BINS, SAMPLES))
+    # Sampling points in cells of the map.
+    corners = (centres.clamp(max=1.0) - _PATCH_SHARE / 2) * size
+    patch_size = (_PATCH_SHARE * size).clamp(min=1.0)
+    samples = corners[:, :, None, None] + grid * patch_size  # (B, Q, 10, 10, 2)
+    # Group the sampling points by bin.
+    samples = samples.unflatten(3, (BINS, SAMPLES))  # (B, Q, 10, 5, 2, 2)
+    samples = samples.unflatten(2, (BINS, SAMPLES))  # (B, Q, 5, 2, 5, 2, 2)
     samples = samples.transpose(3, 4).flatten(4, 5)  # (B, Q, 5, 5, 4, 2)
     samples = samples.flatten(1, 3)[:, :, None]  # (B, Q * 25, 1, 4, 2)
     inside = ((samples >= -1) & (samples <= size)).all(dim=-1)
-    locations = (samples.clamp(min=0.0).minimum(size - 1) + 0.5) / size
-    values = feats.float().flatten(2).transpose(1, 2)[:, :, None]  # (B, cells, 1, C)
+    samples_on_map = samples.clamp(min=0.0).minimum(size - 1)
+    locations = (samples_on_map + 0.5) / size
+    values = feats.float().flatten(2).transpose(1, 2)  # (B, H * W, C)
+    values = values[:, :, None]  # (B, H * W, 1, C)
     patches = deformable_sample(
         values, (height, width), locations=locations, weights=inside / SAMPLES**2
     )
@@ -69,8 +76,11 @@ class MaskFeature(nn.Module):
             Fused features. (B, C, H, W)
         """
         height, width = feats.shape[2:]
-        y = ((torch.arange(height, device=feats.device) + 0.5) / height - 0.5).abs()
-        x = ((torch.arange(width, device=feats.device) + 0.5) / width - 0.5).abs()
+        y = (torch.arange(height, device=feats.device) + 0.5) / height
+        x = (torch.arange(width, device=feats.device) + 0.5) / width
+        # The positional encoding is the distance to the centre of the map along each axis.
+        y = (y - 0.5).abs()
+        x = (x - 0.5).abs()
         position = torch.stack(torch.meshgrid(x, y, indexing="xy"))  # (2, H, W)
         position = position.expand(len(feats), -1, -1, -1)
         mask = self.block(self.expand(segmentation.softmax(dim=1)))
@@ -78,7 +88,10 @@ class MaskFeature(nn.Module):
 
 
 class _HalfAttention(nn.TransformerDecoderLayer):
-    """Decoder layer that adds half of the output of both attentions."""
+    """Decoder layer that halves the outputs of both attentions before they are added.
+
+    It overrides private methods of PyTorch, which pass their arguments by position.
+    """
 
     def _sa_block(
         self,
@@ -101,7 +114,7 @@ class _HalfAttention(nn.TransformerDecoderLayer):
 
 
 class PatchRefinement(BaseModule):
-    """Refinement stage (MGMap).
+    """Refinement of point states, which attend to the patches around the points (MGMap).
 
     Args:
         embed_dims: Channels C of the patches and of the corrected states.
@@ -135,7 +148,7 @@ class PatchRefinement(BaseModule):
         )
 
     def init_weights(self) -> None:
-        """Initialise as in the released code: normal (Xavier) matrices around the layer."""
+        """Initialise all matrices but those of the layer by Xavier's normal distribution."""
         for module in (*self.patch_net, *self.memory, *self.fuser):
             if isinstance(module, (nn.Conv2d, nn.Linear)):
                 nn.init.xavier_normal_(module.weight)
@@ -149,13 +162,14 @@ class PatchRefinement(BaseModule):
 
         Args:
             states: States of the points. (B, Q, S)
-            patches: Patches around the points (B, Q, C, 5, 5), or one patch for all points
-                (1, 1, C, 5, 5).
-            mask: True where a point does not attend to another one, or None. (Q, Q)
+            patches: Patches around the points (B, Q, C, 5, 5), or one patch that is used for all
+                points (1, 1, C, 5, 5).
+            mask: True where a point (row) does not attend to another point (column), in
+                self-attention and in cross-attention. None for no mask. (Q, Q)
 
         Returns:
-            Corrected states and glimpses, the features of the patches after attention.
-            (B, Q, C) each
+            Corrected states (B, Q, C), and glimpses: the features of the patches after attention.
+            (B, Q, C)
         """
         glimpses = self.patch_net(patches.flatten(0, 1)).unflatten(0, patches.shape[:2])
         glimpses = glimpses.expand(states.shape[0], states.shape[1], -1)
@@ -166,7 +180,7 @@ class PatchRefinement(BaseModule):
 
 
 def mask_network(embed_dims: int, masks: int, activation: nn.Module) -> nn.Sequential:
-    """Create a network for masks: a 3x3 convolution with BatchNorm, and a 1x1 convolution.
+    """Create a network that predicts masks: a 3x3 convolution with BatchNorm, then a 1x1 one.
 
     Args:
         embed_dims: Channels C of the input. (B, C, H, W)

@@ -22,20 +22,22 @@ from gsmap.structures.streams import Frame, MapStream, Scenes, Slots, StreamStat
 from gsmap.structures.tensors import upload
 from gsmap.utils.errors import InputError
 
-# Prefixes of names in single precision. Half precision has errors of centimetres in points.
-_EXACT = ("references", "targets", PREFIX)
+# Values whose name has one of these prefixes are stored in single precision: they hold coordinates,
+# in which half precision has errors of centimetres.
+_SINGLE_PRECISION_PREFIXES = ("references", "targets", PREFIX)
 
 
 @dataclass
 class BatchMemory:
-    """A batch of a detector with memory, from the encoder to the end of the frame.
+    """Encoder outputs of a batch, the memory recalled for it, and the memory to store after it.
 
     Args:
         outputs: Outputs of the encoder, in which ``bev_feats`` (B, C, H, W) are fused with the
             memory.
-        past: Memory of the streams and the ego motion, or None without memory.
-        propagation: Memory of queries, or None.
-        elements: Memory of the detections for the next frame, by name. (B, ...) each
+        past: Memory of the previous frames and the ego motion since then, or None if nothing was
+            recalled.
+        propagation: Hook that adds the memory of queries to the head, or None.
+        elements: Detections to store for the next frame, by name. (B, ...) each
     """
 
     outputs: dict[str, Any]
@@ -45,19 +47,19 @@ class BatchMemory:
 
     @property
     def hooks(self) -> dict[str, tuple[FlowHook, ...]]:
-        """Keyword argument ``hooks`` of the head; empty without memory of queries."""
+        """Keyword arguments of the head: ``hooks``, or none without memory of queries."""
         return {} if self.propagation is None else {"hooks": (self.propagation,)}
 
 
 class StreamMemory(BaseModule):
     """Memory of a `MapDetector`: one state per stream, transformed by the poses of the samples.
 
-    In training a stream is a position in the batch (`Slots`). In testing it is a scene (`Scenes`);
-    every scene starts with an empty memory. The metainfo of a sample needs ``scene``,
-    ``timestamp_ns`` and ``lidar2global``.
+    In training, a stream consists of the samples at one index of the batch (`Slots`). In testing, it
+    is a scene (`Scenes`), and every scene starts with an empty memory. The metainfo of a sample
+    needs ``scene``, ``timestamp_ns`` and ``lidar2global``.
 
     Args:
-        head: Head of the detector; a memory of queries needs a `MapHead`.
+        head: Head of the detector. It must be a `MapHead` if ``queries`` is given.
         bev: Settings of `BEVMemory`, or None without memory of BEV features.
         queries: Settings of `QueryMemory`, or None without memory of queries.
         elements: Settings of `ElementMemory`, or None without memory of elements.
@@ -67,10 +69,11 @@ class StreamMemory(BaseModule):
         half: Store features in half precision; coordinates keep single precision.
 
     Attributes:
-        name: Name of the model in error messages.
+        name: Description of the model for error messages: "a model with MapHead".
 
     Raises:
-        ValueError: If there is no memory, one does not fit the head, or ``max_gap_s`` is not > 0.
+        ValueError: If ``bev``, ``queries`` and ``elements`` are all None, if one of them does not
+            fit the head, or if ``max_gap_s`` is not > 0.
     """
 
     def __init__(
@@ -86,7 +89,7 @@ class StreamMemory(BaseModule):
         super().__init__()
         if bev is None and queries is None and elements is None:
             raise InputError(
-                "temporal needs bev=dict(...), queries=dict(...), elements=dict(...) or several."
+                "temporal needs at least one of bev, queries and elements, such as bev=dict(...)."
             )
         if not max_gap_s > 0:
             raise InputError(f"temporal.max_gap_s must be seconds > 0, got {max_gap_s}.")
@@ -123,17 +126,17 @@ class StreamMemory(BaseModule):
         return Scenes(self.max_gap_s)
 
     def new_stream(self) -> MapStream:
-        """Create an empty memory of one scene for the caller."""
+        """Create an empty memory of one scene for the caller, bound to this model."""
         stream = MapStream(self.max_gap_s)
-        stream.claim(self)
+        stream.claim(self)  # raises an error if another model uses it later
         return stream
 
     @contextmanager
     def using(self, stream: Scenes) -> Iterator[None]:
-        """Use a stream of the caller in this context.
+        """Use a stream of the caller instead of the model's streams in this context.
 
         Args:
-            stream: Memory of `new_stream` or `new_scenes`.
+            stream: Memory that `new_stream` or `new_scenes` has created.
 
         Raises:
             ValueError: If the stream belongs to another model.
@@ -150,7 +153,9 @@ class StreamMemory(BaseModule):
     def remember_batch(
         self, outputs: dict[str, Any], metas: Sequence[Mapping[str, Any]]
     ) -> Iterator[BatchMemory]:
-        """Recall the memory of a batch, and store the new one when the context ends without error.
+        """Recall the memory of a batch, and store its new memory at the end of the context.
+
+        Nothing is stored if the context ends with an error.
 
         Args:
             outputs: Outputs of the encoder, with ``bev_feats`` (B, C, H, W).
@@ -160,7 +165,8 @@ class StreamMemory(BaseModule):
             The batch with its memory.
         """
         if self.training and self.bev is None and self.queries is None:
-            yield BatchMemory(outputs)  # elements are not part of training, so need no poses
+            # The memory of elements is unused in training: samples need no poses.
+            yield BatchMemory(outputs)
             return
         frames = [Frame.of(meta) for meta in metas]
         states = self.streams.previous(frames)
@@ -179,7 +185,10 @@ class StreamMemory(BaseModule):
 
         Args:
             outputs: Outputs of the encoder, with ``bev_feats`` (B, C, H, W).
-            past: Memory of the streams and the ego motion.
+            past: Memory of the previous frames and the ego motion since then.
+
+        Returns:
+            The batch with fused ``bev_feats``.
         """
         feats = outputs["bev_feats"]
         if self.bev is not None:
@@ -196,8 +205,11 @@ class StreamMemory(BaseModule):
         """Update the detections of a batch by the memory of elements, and remember the result.
 
         Args:
-            batch: The batch; its ``elements`` are set.
+            batch: Batch with its memory. Its ``elements`` are set to the memory of the result.
             results: Detections of each sample.
+
+        Returns:
+            Updated detections of each sample.
         """
         if self.elements is None or batch.past is None:
             return results
@@ -206,7 +218,7 @@ class StreamMemory(BaseModule):
         return results
 
     def collect_memory(self, batch: BatchMemory) -> dict[str, Tensor]:
-        """Memory of a batch for the next frame, by name, without gradient. (B, ...) each"""
+        """Collect the memory to store for the next frame, by name, detached. (B, ...) each"""
         memory = dict(batch.elements)
         if self.bev is not None:
             memory["bev_feats"] = self.bev.remember(batch.outputs["bev_feats"])
@@ -214,7 +226,7 @@ class StreamMemory(BaseModule):
             memory |= batch.propagation.collect_memory()
         if self.half:
             for name, values in memory.items():
-                if not name.startswith(_EXACT):
+                if not name.startswith(_SINGLE_PRECISION_PREFIXES):
                     memory[name] = values.half()
         return memory
 
@@ -222,18 +234,25 @@ class StreamMemory(BaseModule):
 def stack_past(
     frames: Sequence[Frame], states: Sequence[StreamState | None], device: torch.device
 ) -> Past:
-    """Stack the memory of the streams of a batch.
+    """Stack the stream states of a batch, with zeros where a stream starts.
 
     Args:
         frames: The frames of the batch.
         states: State of the stream of each frame, or None where a stream starts.
         device: Device of the result.
+
+    Returns:
+        Memory, ego motion and elapsed time of each frame. A stream that starts has no motion.
     """
     motions = []
     seconds = []
     for frame, state in zip(frames, states, strict=True):
-        motions.append(np.eye(4) if state is None else frame.motion_from(state.frame))
-        seconds.append(0.0 if state is None else frame.seconds_after(state.frame))
+        if state is None:
+            motions.append(np.eye(4))
+            seconds.append(0.0)
+        else:
+            motions.append(frame.motion_from(state.frame))
+            seconds.append(frame.seconds_after(state.frame))
     now_from_then, elapsed, continues = upload(
         [
             torch.from_numpy(np.stack(motions)),
@@ -242,9 +261,10 @@ def stack_past(
         ],
         device,
     )
-    template = next((state.values for state in states if state is not None), {})
+    # All states have values of equal names and shapes, so any one serves as an example.
+    examples = next((state.values for state in states if state is not None), {})
     memory = {}
-    for name, example in template.items():
+    for name, example in examples.items():
         values = []
         for state in states:
             values.append(torch.zeros_like(example) if state is None else state.values[name])

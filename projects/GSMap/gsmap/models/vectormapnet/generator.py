@@ -14,16 +14,16 @@ from gsmap.models.vectormapnet.layers import Cache, GatedLayer, append_cache, ke
 from gsmap.structures.tensors import constant
 from gsmap.utils.errors import InputError
 
-_CONDITION = 5  # tokens of class and box, which precede the tokens of the points
-_FORBIDDEN = -1e9  # logit
-Draw = Callable[[Tensor], Tensor]  # from probabilities (n, t, tokens) to tokens (n, t)
+_CONDITION = 5  # tokens before the points: the class, and x0, y0, x1, y1 of the box
+_FORBIDDEN = -1e9  # logit of a token that must not be sampled
+Draw = Callable[[Tensor], Tensor]  # samples tokens (n, t) from probabilities (n, t, tokens)
 
 
 class Elements(NamedTuple):
-    """Elements of one sample for which lines are generated."""
+    """Classes and boxes of the elements of one sample, one line is generated for each."""
 
     labels: Tensor  # class indices (n,)
-    boxes: Tensor  # x0, y0, x1, y1 in whole pixels of the canvas (n, 4)
+    boxes: Tensor  # x0, y0, x1, y1 in whole pixels of the canvas, used as tokens (n, 4)
 
 
 class PolylineGenerator(BaseModule):
@@ -38,18 +38,18 @@ class PolylineGenerator(BaseModule):
         num_heads: Number of attention heads of a layer.
         ffn_dims: Hidden channels of the layers' feed-forward networks.
         dropout: Probability of setting a value to zero in training, in [0, 1].
-        top_p: Probability mass in [0, 1] that tokens are sampled from; 0 takes the most likely
-            token.
+        top_p: Tokens are sampled from the smallest set of most likely tokens with at least this
+            total probability, in [0, 1]. 0 takes the most likely token.
         max_points: Largest number of points of a generated line, >= 2.
-        redraw: Whether every step samples all earlier tokens again as input of the first layer, as
-            in the released code. The line keeps the tokens that were sampled first.
+        redraw: Whether every step samples all earlier tokens again, as in the released code. The
+            new samples are inputs of the first layer only; the line keeps the first samples.
         noise_share: Share in [0, 1] of the coordinates that receive noise in training.
         noise_px: Standard deviations of the noise along x and y, in pixels.
-        box_noise_by_x: Whether noise sets y of a box corner to its x, an error of the released
-            code.
+        box_noise_by_x: Whether noise replaces the y of a box corner by its x, which is an error of
+            the released code.
         num_positions: Largest number of points of an annotated line.
-        shrunk_results: Whether tokens are converted to metres as if the canvas had no margin, as
-            in the released code, which shrinks the annotated lines of its metric in this way too.
+        shrunk_results: Whether tokens are converted to metres as if the canvas had no margin, which
+            shrinks the lines. The released code shrinks predicted and annotated lines in this way.
         init_cfg: Initialisation config of mmengine.
 
     Raises:
@@ -77,9 +77,10 @@ class PolylineGenerator(BaseModule):
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(init_cfg)
-        for name, share in (("top_p", top_p), ("noise_share", noise_share)):
-            if not 0 <= share <= 1:
-                raise InputError(f"{name} must be in [0, 1], got {share}.")
+        if not 0 <= top_p <= 1:
+            raise InputError(f"top_p must be in [0, 1], got {top_p}.")
+        if not 0 <= noise_share <= 1:
+            raise InputError(f"noise_share must be in [0, 1], got {noise_share}.")
         if not 2 <= max_points <= num_positions:
             raise InputError(
                 f"max_points must be 2 to num_positions = {num_positions}, got {max_points}."
@@ -91,15 +92,15 @@ class PolylineGenerator(BaseModule):
         self.noise_share = noise_share
         self.noise_px = noise_px
         self.box_noise_by_x = box_noise_by_x
-        self.metres: Callable[[Tensor], Tensor] = (
-            canvas.grid.metres_from_norm if shrunk_results else canvas.metres_from_norm
-        )
+        self.metres_from_norm: Callable[[Tensor], Tensor] = canvas.metres_from_norm
+        if shrunk_results:
+            self.metres_from_norm = canvas.grid.metres_from_norm
         self.context = BEVEmbedding(in_channels, embed_dims)
         self.label = nn.Embedding(num_classes, embed_dims)
         self.vertex = nn.Embedding(canvas.num_tokens, embed_dims)
         self.position = nn.Embedding(num_positions, embed_dims)
         self.axis = nn.Embedding(2, embed_dims)
-        self.corner = nn.Embedding(3, embed_dims)  # the third one is unused, as in the release
+        self.corner = nn.Embedding(3, embed_dims)  # two corners; the third row is unused
         self.layers: Any = nn.ModuleList(
             GatedLayer(embed_dims, num_heads, ffn_dims=ffn_dims, dropout=dropout)
             for _ in range(num_layers)
@@ -113,27 +114,44 @@ class PolylineGenerator(BaseModule):
             init_matrices(module)
 
     def memory(self, bev_feats: Tensor) -> list[Cache]:
-        """Compute the keys and values of one sample's map for every layer. (C', H, W)"""
+        """Compute the keys and values of the BEV cells for the cross-attention of every layer.
+
+        Args:
+            bev_feats: BEV features of one sample. (C', H, W)
+        """
         cells = self.context(bev_feats[None]).flatten(2).transpose(1, 2)  # (1, H * W, C)
         return [layer.cross_attn.keys_values(cells) for layer in self.layers]
 
     def embed_condition(self, elements: Elements) -> Tensor:
         """Embed classes and boxes as the first tokens of the lines. (n, 5, C)"""
-        number = torch.arange(4, device=elements.boxes.device)
-        boxes = self.vertex(elements.boxes) + self.corner(number // 2) + self.axis(number % 2)
-        return torch.cat([self.label(elements.labels)[:, None], boxes], dim=1)
+        number = torch.arange(4, device=elements.boxes.device)  # of x0, y0, x1, y1
+        corners = self.corner(number // 2)
+        axes = self.axis(number % 2)
+        boxes = self.vertex(elements.boxes) + corners + axes  # (n, 4, C)
+        labels = self.label(elements.labels)[:, None]  # (n, 1, C)
+        return torch.cat([labels, boxes], dim=1)
 
     def embed_points(self, tokens: Tensor, start: int = 0) -> Tensor:
-        """Embed the tokens of points, from token number ``start`` on. (n, T) -> (n, T, C)"""
+        """Embed the tokens of points.
+
+        Args:
+            tokens: Successive tokens of lines: x, y, x, y, ... (n, T)
+            start: Number of the first token in its line, from 0.
+
+        Returns:
+            Embeddings. (n, T, C)
+        """
         number = torch.arange(start, start + tokens.shape[1], device=tokens.device)
-        return self.vertex(tokens) + self.position(number // 2) + self.axis(number % 2)
+        positions = self.position(number // 2)
+        axes = self.axis(number % 2)
+        return self.vertex(tokens) + positions + axes
 
     def mask_forbidden(self, logits: Tensor, start: int = 0) -> Tensor:
         """Mask coordinates beyond the canvas, and stop tokens between x and y.
 
         Args:
             logits: Logits of T successive tokens. (n, T, tokens)
-            start: Number of the first token in its line.
+            start: Number of the first token in its line, from 0.
 
         Returns:
             Logits with -1e9 for forbidden tokens. (n, T, tokens)
@@ -141,7 +159,7 @@ class PolylineGenerator(BaseModule):
         token = torch.arange(self.canvas.num_tokens, device=logits.device)
         forbidden_x = token > self.canvas.size[0]
         forbidden_y = token > self.canvas.size[1]
-        forbidden_y[0] = True
+        forbidden_y[0] = True  # the stop token
         forbidden = torch.stack([forbidden_x, forbidden_y])
         number = torch.arange(start, start + logits.shape[1], device=logits.device)
         return logits.masked_fill(forbidden[number % 2], _FORBIDDEN)
@@ -166,7 +184,9 @@ class PolylineGenerator(BaseModule):
         return outputs
 
     def log_probs(self, bev_feats: Tensor, elements: Elements, tokens: Tensor) -> Tensor:
-        """Compute the log-probabilities of the first token and of the token after each given one.
+        """Compute the log-probabilities of the tokens at positions 0 to T of each line.
+
+        Those at position t depend on the given tokens before t.
 
         Args:
             bev_feats: BEV features of one sample. (C', H, W)
@@ -177,7 +197,8 @@ class PolylineGenerator(BaseModule):
             Log-probabilities. (n, T + 1, tokens)
         """
         states = self.states(bev_feats, elements, tokens=tokens)[-1]
-        logits = self.logits(states[:, _CONDITION - 1 :]).float()
+        first = _CONDITION - 1  # the last condition token predicts the first token of the line
+        logits = self.logits(states[:, first:]).float()
         return self.mask_forbidden(logits).log_softmax(dim=-1)
 
     def loss(
@@ -203,12 +224,13 @@ class PolylineGenerator(BaseModule):
                 f"PolylineGenerator is {self.position.num_embeddings}: set it higher, or "
                 "tolerance_m of FormatPolylineTargets."
             )
-        if not len(tokens):
-            return torch.stack([parameter.sum() for parameter in self.parameters()]).sum() * 0
+        if not len(tokens):  # a loss of 0 that gives every parameter a gradient of 0
+            sums = [parameter.sum() for parameter in self.parameters()]
+            return torch.stack(sums).sum() * 0
         inputs = tokens[:, :-1]
         boxes = elements.boxes
         if self.training and self.noise_share:
-            inputs = self.add_noise(inputs).where(inputs > 0, 0)
+            inputs = self.add_noise(inputs).where(inputs > 0, 0)  # stop tokens and filling stay 0
             boxes = self.add_noise(boxes, by_x=self.box_noise_by_x)
         log_probs = self.log_probs(bev_feats, Elements(elements.labels, boxes), tokens=inputs)
         target_log_probs = log_probs.gather(-1, tokens[..., None])[..., 0]
@@ -242,9 +264,11 @@ class PolylineGenerator(BaseModule):
             Coordinates in [1, W] and [1, H]. (n, T)
         """
         number = torch.arange(tokens.shape[1], device=tokens.device)
-        source = number // 2 * 2 if by_x else number
+        axis = number % 2
+        source = number - axis if by_x else number  # number - axis: the x of each point
+        largest = constant(tokens, self.canvas.size)[axis]
         shifted_tokens = (tokens + noise)[:, source].clamp(min=1)
-        return shifted_tokens.minimum(constant(tokens, self.canvas.size)[number % 2])
+        return shifted_tokens.minimum(largest)
 
     @torch.no_grad()
     def generate(self, bev_feats: Tensor, elements: Elements, draw: Draw) -> Tensor:
@@ -266,7 +290,7 @@ class PolylineGenerator(BaseModule):
             return tokens
         active = torch.arange(len(tokens), device=tokens.device)  # rows of unfinished lines
         caches: list[Cache | None] = [None] * len(self.layers)
-        laws = condition.new_zeros(len(tokens), 0, self.canvas.num_tokens)
+        all_probs = condition.new_zeros(len(tokens), 0, self.canvas.num_tokens)
         states = condition
         for step in range(num_steps):
             for i, layer in enumerate(self.layers):
@@ -274,22 +298,23 @@ class PolylineGenerator(BaseModule):
                 caches[i] = cache
                 states = layer(states, cache, memory=memory[i])
             logits = self.mask_forbidden(self.logits(states[:, -1:]).float(), start=step)
-            law = keep_most_likely(logits, self.top_p).softmax(dim=-1)  # (n, 1, tokens)
-            laws = torch.cat([laws, law], dim=1) if self.redraw else law
-            samples = draw(laws)
-            tokens[active, step] = samples[:, -1]
-            is_active = samples[:, -1] > 0
+            probs = keep_most_likely(logits, self.top_p).softmax(dim=-1)  # (n, 1, tokens)
+            all_probs = torch.cat([all_probs, probs], dim=1) if self.redraw else probs
+            samples = draw(all_probs)
+            new_tokens = samples[:, -1]
+            tokens[active, step] = new_tokens
+            is_active = new_tokens > 0  # of the rows in active
             if not is_active.any() or step == num_steps - 1:
                 break
             active = active[is_active]
-            laws = laws[is_active]
+            all_probs = all_probs[is_active]
             samples = samples[is_active]
             condition = condition[is_active]
             for i, layer_cache in enumerate(caches):
                 if layer_cache is not None:
                     keys, values = layer_cache
                     caches[i] = (keys[is_active], values[is_active])
-            if self.redraw:
+            if self.redraw:  # the first layer attends to the new samples of earlier tokens
                 inputs = torch.cat([condition, self.embed_points(samples[:, :-1])], dim=1)
                 caches[0] = self.layers[0].keys_values(inputs)
             states = self.embed_points(samples[:, -1:], start=step)
@@ -297,11 +322,11 @@ class PolylineGenerator(BaseModule):
 
     def seeded_draw(self, seed: int) -> Draw:
         """Return a function that samples tokens from probabilities with a seeded generator."""
-        source = torch.Generator(self.vertex.weight.device).manual_seed(seed)
+        generator = torch.Generator(self.vertex.weight.device).manual_seed(seed)
 
-        def draw(laws: Tensor) -> Tensor:
-            samples = laws.flatten(0, 1).multinomial(1, generator=source)
-            return samples.view(laws.shape[:2])
+        def draw(probs: Tensor) -> Tensor:
+            samples = probs.flatten(0, 1).multinomial(1, generator=generator)
+            return samples.view(probs.shape[:2])
 
         return draw
 
@@ -312,30 +337,31 @@ class PolylineGenerator(BaseModule):
             tokens: Tokens, from `generate`. (n, 2 P + 1)
 
         Returns:
-            Points in metres, filled with the last point of a line, (n, P, 2), and the number of
-            points of each line. (n,)
+            Points in metres, where the last point of a line fills its row (n, P, 2), and the number
+            of points of each line. (n,)
         """
         pairs = tokens[:, :-1].unflatten(1, (-1, 2))  # (n, P, 2)
-        number = (pairs > 0).all(dim=-1).sum(dim=-1)
-        last = (number[:, None] - 1).clamp(min=0)
+        num_points = (pairs > 0).all(dim=-1).sum(dim=-1)  # (n,)
+        last = (num_points[:, None] - 1).clamp(min=0)
         index = torch.arange(pairs.shape[1], device=tokens.device).minimum(last)  # (n, P)
-        pixels = pairs.gather(1, index[..., None].expand(-1, -1, 2)) - 1
+        filled_pairs = pairs.gather(1, index[..., None].expand(-1, -1, 2))
+        pixels = filled_pairs - 1  # token 1 is pixel 0
         steps = constant(pairs, self.canvas.steps, torch.float)
-        return self.metres(pixels / steps), number
+        return self.metres_from_norm(pixels / steps), num_points
 
 
-def causal_mask(number: int, device: torch.device) -> Tensor:
+def causal_mask(num_tokens: int, device: torch.device) -> Tensor:
     """Create the attention mask of condition and point tokens.
 
     A token attends to itself and to earlier tokens; condition tokens attend to each other.
 
     Args:
-        number: Number T of tokens, with the condition.
+        num_tokens: Number T of tokens, with the condition.
         device: Device of the mask.
 
     Returns:
         True where a token (row) attends to another one (column). (T, T)
     """
-    mask = torch.ones(number, number, dtype=torch.bool, device=device).tril()
+    mask = torch.ones(num_tokens, num_tokens, dtype=torch.bool, device=device).tril()
     mask[:_CONDITION, :_CONDITION] = True
     return mask
