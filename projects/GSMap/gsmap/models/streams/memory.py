@@ -54,8 +54,8 @@ class BatchMemory:
 class StreamMemory(BaseModule):
     """Memory of a `MapDetector`: one state per stream, transformed by the poses of the samples.
 
-    In training, a stream consists of the samples at one index of the batch (`Slots`). In testing, it
-    is a scene (`Scenes`), and every scene starts with an empty memory. The metainfo of a sample
+    In training, a stream consists of the samples at one index of the batch (`Slots`). In testing,
+    it is a scene (`Scenes`), and every scene starts with an empty memory. The metainfo of a sample
     needs ``scene``, ``timestamp_ns`` and ``lidar2global``.
 
     Args:
