@@ -123,7 +123,7 @@ def test_a_difference_is_paired_scene_by_scene():
     assert 0 < found.low < found.value < found.high
     same = ap_differences(reports_of(good), reports_of(good), resamples)
     assert all((i.value, i.low, i.high) == (0, 0, 0) for i in same.values())
-    with pytest.raises(ValueError, match="on the same samples and metrics only"):
+    with pytest.raises(ValueError, match="only if their samples and metrics are equal"):
         ap_differences(reports_of(good), reports_of(bad[:-1]), resamples)
 
 

@@ -1,8 +1,8 @@
 """Confidence intervals of AP by the bootstrap over scenes.
 
-A resample draws as many scenes with replacement as the data set has. Its AP equals the AP of a file
-with copies of the samples, in which the copies of each prediction have consecutive ranks. Matches
-of samples are computed once.
+A resample draws as many scenes with replacement as the data set has. A scene that is drawn k times
+counts as k copies of its samples; the copies of a prediction have consecutive ranks. Matches do not
+depend on the resample and are computed once.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,16 +18,16 @@ from gsmap.structures.elements import BoolArray, FloatArray, IntArray
 from gsmap.utils.errors import InputError
 
 _RECALL_POINTS = np.linspace(0.0, 1.0, num=101)
-_SPACING = np.spacing(1.0)  # COCO adds it to a denominator
-_PERCENTILES = (2.5, 97.5)  # of an interval of 95 %
+_SPACING = np.spacing(1.0)  # COCO adds it to the denominator of the precision
+_PERCENTILES = (2.5, 97.5)  # ends of the interval of 95 %
 
 
 @dataclass(frozen=True)
 class Interval:
-    """Figure, or difference of two figures, with its interval of 95 %.
+    """Interval of 95 % of a figure, or of the difference of two figures.
 
     Args:
-        value: Figure over all scenes.
+        value: Figure or difference over all scenes.
         low: 2.5th percentile over the resamples.
         high: 97.5th percentile over the resamples.
     """
@@ -38,10 +38,17 @@ class Interval:
 
 
 class Weights(Protocol):
-    """Weights of parts of the samples, in each of B resamples."""
+    """Random weights of parts of the data set (such as its scenes), in each of B resamples."""
 
     def draw(self, tokens: Sequence[str]) -> tuple[IntArray, FloatArray]:
-        """Return the part of each sample (S,), and the number of copies of each part (B, parts)."""
+        """Draw the weights.
+
+        Args:
+            tokens: Tokens of the samples. (S,)
+
+        Returns:
+            Index of the part of each sample (S,), and number of copies of each part. (B, parts)
+        """
 
 
 @dataclass(frozen=True)
@@ -66,7 +73,7 @@ class Resamples:
         if num_scenes < 2 or self.count < 2 or self.seed < 0:
             raise InputError(
                 "intervals need two scenes, two resamples and a seed >= 0 at least, got "
-                f"{num_scenes}, {self.count} and {self.seed}."
+                f"{num_scenes} scenes, {self.count} resamples and seed {self.seed}."
             )
 
     def draw(self, tokens: Sequence[str]) -> tuple[IntArray, FloatArray]:
@@ -96,39 +103,41 @@ class Resamples:
 
 @njit(cache=True)
 def _weighted_ap(
-    hits: IntArray, copies: FloatArray, counted: FloatArray, total: float, interpolated: bool
+    hit_rows: IntArray, copies: FloatArray, ranks: FloatArray, total: float, interpolated: bool
 ) -> float:
     """Compute the AP of predictions with copies.
 
-    The loop starts at the lowest score, where the precision envelope is the largest precision so
-    far.
+    The loop over hits starts at the lowest score. The precision envelope at a hit is then the
+    largest precision of the hits so far.
 
     Args:
-        hits: Indices of the predictions that match, in descending order of score. (H,)
+        hit_rows: Indices of the predictions that match, in descending order of score. (H,)
         copies: Number of copies of each prediction. (N,)
-        counted: Number of copies of all predictions up to each. (N,)
-        total: Number of ground truths, > 0.
+        ranks: Number of copies of each prediction and of those with a higher score. (N,)
+        total: Number of ground truths with their copies, > 0.
         interpolated: Whether AP is the mean at 101 recalls; the area otherwise.
     """
     true_positives = 0.0
-    for i in hits:
+    for i in hit_rows:
         true_positives += copies[i]
+    # Recall points above the recall of all predictions have a precision of 0.
     point = len(_RECALL_POINTS) - 1
     while _RECALL_POINTS[point] > true_positives / total:
         point -= 1
     envelope = 0.0
     ap = 0.0
-    for i in hits[::-1]:
+    for i in hit_rows[::-1]:
         if copies[i] == 0:
             continue
-        denominator = counted[i] + _SPACING if interpolated else counted[i]
+        denominator = ranks[i] + _SPACING if interpolated else ranks[i]
         envelope = max(envelope, true_positives / denominator)
         true_positives -= copies[i]
-        if not interpolated:
+        if interpolated:
+            while _RECALL_POINTS[point] > true_positives / total:
+                ap += envelope
+                point -= 1
+        else:
             ap += envelope * copies[i] / total
-        while interpolated and _RECALL_POINTS[point] > true_positives / total:
-            ap += envelope
-            point -= 1
     if interpolated:
         return (ap + envelope) / len(_RECALL_POINTS)  # the last envelope is at recall 0
     return ap
@@ -136,18 +145,18 @@ def _weighted_ap(
 
 @njit(cache=True)
 def _aps(
-    rows: IntArray,
+    hit_rows: IntArray,
     ends: IntArray,
     scene: IntArray,
     drawn: FloatArray,
     gts: FloatArray,
     interpolated: bool,
 ) -> FloatArray:
-    """Compute ``resampled_aps`` from the indices of the hits.
+    """Compute the AP of each resample at each threshold from the indices of the hits.
 
     Args:
-        rows: Indices of the hits at all thresholds, concatenated. (H,)
-        ends: End of each threshold in ``rows``. (T,)
+        hit_rows: Indices of the predictions that match, for one threshold after the other. (H,)
+        ends: End of each threshold in ``hit_rows``. (T,)
         scene: Scene of each prediction. (N,)
         drawn: Number of copies of each scene. (B, S)
         gts: Number of ground truths of each scene. (S,)
@@ -158,7 +167,7 @@ def _aps(
     """
     aps = np.full((len(drawn), len(ends)), np.nan)
     copies = np.empty(len(scene))
-    counted = np.empty(len(scene))
+    ranks = np.empty(len(scene))
     for b in range(len(drawn)):
         total = (drawn[b] * gts).sum()
         if not total > 0:
@@ -167,13 +176,13 @@ def _aps(
         for i in range(len(scene)):
             copies[i] = drawn[b, scene[i]]
             sum_of_copies += copies[i]
-            counted[i] = sum_of_copies
+            ranks[i] = sum_of_copies
         start = 0
         for t in range(len(ends)):
-            hits = rows[start : ends[t]]
+            threshold_rows = hit_rows[start : ends[t]]
             start = ends[t]
             aps[b, t] = _weighted_ap(
-                hits, copies=copies, counted=counted, total=total, interpolated=interpolated
+                threshold_rows, copies=copies, ranks=ranks, total=total, interpolated=interpolated
             )
     return aps
 
@@ -194,8 +203,8 @@ def resampled_aps(
         AP; NaN without ground truths. (B, T)
     """
     ends = np.cumsum(hits.sum(axis=0))
-    rows = np.nonzero(hits.T)[1]
-    return _aps(rows, ends=ends, scene=scene, drawn=drawn, gts=gts, interpolated=interpolated)
+    hit_rows = np.nonzero(hits.T)[1]  # ordered by threshold, then by score
+    return _aps(hit_rows, ends=ends, scene=scene, drawn=drawn, gts=gts, interpolated=interpolated)
 
 
 def resampled_figures(report: MetricReport, resamples: Weights) -> dict[str, FloatArray]:
@@ -212,7 +221,7 @@ def resampled_figures(report: MetricReport, resamples: Weights) -> dict[str, Flo
     if not report.detections:
         return {}
     scenes, drawn = resamples.draw(report.tokens)
-    interpolated = not report.by_distance
+    interpolated = not report.by_distance  # AP_chamfer is an area, AP_raster a mean at 101 recalls
     class_aps: dict[str, FloatArray] = {}
     figures: dict[str, FloatArray] = {}
     for name, ranked in report.detections.items():
@@ -266,7 +275,10 @@ def _mean_of_samples(aps: FloatArray, scenes: IntArray, drawn: FloatArray) -> Fl
 
 
 def _mean(values: Sequence[FloatArray]) -> FloatArray:
-    """Compute the mean over the first axis of the values that are not NaN; NaN without any."""
+    """Compute the mean of arrays of equal shape, entry by entry, over the values that are not NaN.
+
+    An entry that is NaN in all arrays is NaN.
+    """
     is_known = ~np.isnan(values)
     counts = is_known.sum(axis=0)
     total = np.where(is_known, values, 0.0).sum(axis=0)
@@ -274,7 +286,7 @@ def _mean(values: Sequence[FloatArray]) -> FloatArray:
 
 
 def _interval(value: float, values: FloatArray) -> Interval:
-    """Create the interval of a figure from its values in the resamples, NaN where undefined."""
+    """Create the interval of a figure from its values in the resamples, without those of NaN."""
     known = values[~np.isnan(values)]
     if not len(known):
         return Interval(value, low=UNDEFINED, high=UNDEFINED)
@@ -318,7 +330,7 @@ def ap_differences(
         ValueError: If metrics or samples of the results differ.
     """
     if _samples_of_metrics(first) != _samples_of_metrics(second):
-        raise InputError("two results can be compared on the same samples and metrics only.")
+        raise InputError("two results can be compared only if their samples and metrics are equal.")
     intervals = {}
     for first_report, second_report in zip(first, second, strict=True):
         first_figures = resampled_figures(first_report, resamples)
@@ -345,7 +357,7 @@ def format_intervals(intervals: Mapping[str, Interval], title: str, signed: bool
         title: First line of the table.
         signed: Whether values above 0 have a plus sign, for differences.
     """
-    width = max(map(len, intervals), default=0)
+    width = max((len(key) for key in intervals), default=0)  # of the column of keys
     form = "+.4f" if signed else ".4f"
     rows = [title]
     for key, interval in intervals.items():

@@ -1,4 +1,4 @@
-"""Base class of the metrics of ``--eval``, their settings, their registry and their tables."""
+"""Base class, settings, registry and records of the metrics of ``--eval``."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -19,32 +19,33 @@ from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.errors import InputError
 
-PACKAGE = Path(gsmap.__file__).parent
-_CORE = {
+PACKAGE = Path(gsmap.__file__).parent  # folder of GSMap's code
+_CORE_MODULES = {  # modules in evaluation/core, by the first word of their metrics
     "chamfer": "gsmap.evaluation.core.chamfer_ap",
     "raster": "gsmap.evaluation.core.raster_ap",
 }
+# Arrays of FrameMatches with one row per prediction.
 _PER_PREDICTION = ("labels", "pred_index", "scores", "matched_gt", "quality")
 
 
-class _Sides(NamedTuple):
+class _SampleFields(NamedTuple):
     token: str
     predictions: MapElements
     ground_truth: MapElements
 
 
-class Sample(_Sides):
+class Sample(_SampleFields):
     """Predictions and ground truth of one sample, in metres in the annotation frame.
 
     Attributes:
         token: Name of the sample.
-        predictions: Predicted elements, with scores. N in number.
-        ground_truth: Annotated elements. K in number.
+        predictions: The N predicted elements, with scores.
+        ground_truth: The K annotated elements.
     """
 
     @cached_property
     def cache(self) -> dict[Any, Any]:
-        """Intermediate results that several metrics need, by the rules behind them."""
+        """Intermediate results that several metrics share, by the rules that they depend on."""
         return {}
 
 
@@ -54,20 +55,21 @@ class SampleValues:
 
     Args:
         token: Name of the sample.
-        values: Arrays by name. The shape of an array is equal in all samples, or its first axis
-            varies and is 0 in an empty sample.
+        values: Arrays by name. An array has an equal shape in all samples, or only the length of
+            its first axis varies; that length is 0 in a sample without elements.
     """
 
     token: str
     values: Mapping[str, npt.NDArray[Any]]
 
 
+_Shape = tuple[int, ...]
 Matches = FrameMatches | SampleValues
 """Record of one sample that a metric keeps."""
 
 
 class ValueTable:
-    """Arrays of many samples, in the order of their tokens; a token counts once."""
+    """Arrays of many samples, in the order of their tokens."""
 
     def __init__(self) -> None:
         self._records: dict[str, SampleValues] = {}
@@ -76,7 +78,7 @@ class ValueTable:
         return len(self._records)
 
     def add(self, record: SampleValues) -> None:
-        """Add the arrays of a sample; a token that the table already has is ignored."""
+        """Add the arrays of a sample, unless the table already has its token."""
         self._records.setdefault(record.token, record)
 
     @property
@@ -85,7 +87,7 @@ class ValueTable:
         return sorted(self._records)
 
     def column(self, name: str) -> list[npt.NDArray[Any]]:
-        """Return the array of one name of each sample. (S,)"""
+        """Return the array ``name`` of each sample, in the order of the tokens. (S,)"""
         return [self._records[token].values[name] for token in self.tokens]
 
 
@@ -95,8 +97,9 @@ class MetricSettings:
 
     Args:
         classes: Names of the classes; a label is an index into them.
-        thresholds: Thresholds of metrics by distance, in metres; None for each metric's default.
-        dim: Number of coordinates that distances count: 2 or 3.
+        thresholds: Distances up to which a prediction matches, in metres; None for the default of
+            each metric. Metrics without distances ignore them.
+        dim: Number of coordinates in distances: 2 (x, y) or 3 (x, y, z).
         resample_predictions: Whether predictions are resampled.
         resample_ground_truth: Whether ground truth is resampled.
         grid: Extent of the map in metres; None if unknown.
@@ -127,7 +130,7 @@ class MetricSettings:
             ValueError: If it is unknown.
         """
         if self.grid is None:
-            raise InputError("metrics of masks or of shrunk maps need the range of the map.")
+            raise InputError("metrics that draw masks or shrink maps need the range of the map.")
         return self.grid
 
     @property
@@ -143,11 +146,11 @@ class MetricSettings:
 class Metric(ABC):
     """Base class of a metric, which ``register_metric`` makes available by its name.
 
-    Rules of a metric are attributes of its class. Objects can be pickled.
+    Subclasses set the rules of a metric as class attributes. Their objects can be pickled.
 
     Attributes:
         name: Name of the metric in ``--eval`` and prefix of the keys of its figures.
-        beside: Names of metrics that are reported together with this one.
+        beside: Names of metrics that are also reported, before this one.
         ranks: Whether the metric ranks predictions over all samples. If so, `match` returns
             `FrameMatches` and reports have ``detections``, for intervals, groups and curves.
         has_curves: Whether precision-recall curves describe the metric.
@@ -169,7 +172,7 @@ class Metric(ABC):
 
     @abstractmethod
     def match(self, sample: Sample) -> Matches:
-        """Compare both sides of a sample and return a small record, without masks or points."""
+        """Compare predictions and ground truth, and return a record without masks or points."""
 
     @abstractmethod
     def reports(self, table: Any) -> list[MetricReport]:
@@ -203,15 +206,15 @@ def register_metric(metric: MetricClass) -> MetricClass:
         raise InputError(
             f"{registered.__module__} has a metric {metric.name!r}: choose another name."
         )
-    _REGISTERED[metric.name] = metric
+    _REGISTERED[metric.name] = metric  # a reloaded module replaces its class
     return metric
 
 
 def metric_class(name: str) -> type[Metric]:
     """Return the class of a metric by its name.
 
-    If no module has registered the name yet, the file is imported whose name equals the first words
-    of it: ``chamfer_hard`` is in the file of ``chamfer``.
+    A name that is not registered yet is looked for in the module of its first words: the name
+    ``chamfer_hard`` imports the module of ``chamfer``.
 
     Raises:
         ValueError: If there is no metric of this name.
@@ -230,7 +233,7 @@ def metric_files() -> dict[str, str]:
 
     The metrics of a method are in ``models/<method>/metric.py``, under the name of the method.
     """
-    modules = dict(_CORE)
+    modules = dict(_CORE_MODULES)
     for path in sorted((PACKAGE / "evaluation/metrics").glob("[a-z]*.py")):
         modules[path.stem] = f"gsmap.evaluation.metrics.{path.stem}"
     for path in sorted((PACKAGE / "models").glob("*/metric.py")):
@@ -247,7 +250,7 @@ def metric_names() -> tuple[str, ...]:
 
 
 def new_table(matches: Matches) -> MatchTable | ValueTable:
-    """Create an empty table for records like ``matches``."""
+    """Create an empty table for records of the type of ``matches``."""
     return MatchTable() if isinstance(matches, FrameMatches) else ValueTable()
 
 
@@ -275,21 +278,26 @@ def matches_of(token: str, arrays: Mapping[str, npt.NDArray[Any]], like: Matches
     """
     expected = {name: values.shape for name, values in arrays_of(like).items()}
     shapes = {name: values.shape for name, values in arrays.items()}
-    fits = shapes.keys() == expected.keys()
-    for name in expected if fits else ():
-        fits = fits and _fits_shape(shapes[name], empty_shape=expected[name])
-    if isinstance(like, SampleValues) and fits:
+    if not _fits_record(shapes, expected):
+        raise InputError(f"shapes {shapes} where an empty sample has {expected}")
+    if isinstance(like, SampleValues):
         return SampleValues(token, arrays)
-    if fits:
-        lengths = {shapes[name][0] for name in _PER_PREDICTION}
-        fits = len(lengths) == 1
-    if not fits:
+    lengths = {shapes[name][0] for name in _PER_PREDICTION}
+    if len(lengths) > 1:
         raise InputError(f"shapes {shapes} where an empty sample has {expected}")
     return FrameMatches(token, **arrays)
 
 
-def _fits_shape(shape: tuple[int, ...], empty_shape: tuple[int, ...]) -> bool:
-    """Whether an array may have this shape; the first axis varies if an empty sample has none."""
-    if len(shape) != len(empty_shape) or shape[1:] != empty_shape[1:]:
+def _fits_record(shapes: Mapping[str, _Shape], expected: Mapping[str, _Shape]) -> bool:
+    """Whether names and shapes of arrays fit those of an empty sample."""
+    if shapes.keys() != expected.keys():
         return False
-    return empty_shape[:1] in ((), (0,)) or shape == empty_shape
+    return all(_fits_shape(shapes[name], empty_shape=expected[name]) for name in expected)
+
+
+def _fits_shape(shape: _Shape, empty_shape: _Shape) -> bool:
+    """Whether a shape differs from that of an empty sample at most in a first axis of length 0."""
+    if shape == empty_shape:
+        return True
+    varies = len(empty_shape) > 0 and empty_shape[0] == 0
+    return varies and len(shape) == len(empty_shape) and shape[1:] == empty_shape[1:]
