@@ -46,7 +46,7 @@ def project_segments(
     first_outside = first_values < 0
     last_outside = last_values < 0
     crosses = first_outside != last_outside
-    change = np.where(crosses, first_values - last_values, 1.0)
+    change = np.where(crosses, first_values - last_values, 1.0)  # 1 avoids a division by 0
     fraction = np.where(crosses, first_values / change, 0.0)
     enter = np.where(crosses & first_outside, fraction, 0.0).max(axis=0)  # (n,)
     leave = np.where(crosses & last_outside, fraction, 1.0).min(axis=0)  # (n,)
@@ -56,7 +56,8 @@ def project_segments(
     fractions = np.stack([enter, leave], axis=1)[index, :, None]  # (m, 2, 1)
     visible = first[index, None] + fractions * direction[:, None]  # (m, 2, 3)
     depth_m = visible[..., 2].mean(axis=1)
-    return visible[..., :2] / visible[..., 2:], depth_m, index
+    pixels = visible[..., :2] / visible[..., 2:]  # (m, 2, 2)
+    return pixels, depth_m, index
 
 
 def project_polygon(
@@ -100,12 +101,13 @@ def subdivide(points: np.ndarray, step_m: float) -> np.ndarray:
         step_m: Largest length of a segment in metres.
 
     Returns:
-        Vertices, among them the given ones. (m, D)
+        The given vertices and the inserted ones, in order. (m, D)
     """
     lengths_m = np.linalg.norm(np.diff(points, axis=0), axis=1)
     counts = np.maximum(np.ceil(lengths_m / step_m).astype(int), 1)
     parts = [index + np.arange(count) / count for index, count in enumerate(counts)]
-    positions = np.concatenate([*parts, [len(points) - 1.0]])  # in vertices
+    last_position = len(points) - 1.0
+    positions = np.concatenate([*parts, [last_position]])  # fractional vertex indices (m,)
     vertices = np.arange(len(points))
     columns = [np.interp(positions, vertices, column) for column in points.T]
     return np.stack(columns, axis=1)

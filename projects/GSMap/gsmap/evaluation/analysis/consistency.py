@@ -1,8 +1,8 @@
 """Consistency over the frames of a drive: tracks, C-mAP of MapTracker, jitter of vertices.
 
-Rules are equal to MapTracker's released tools and differ from AP_chamfer: predictions with a score
-of 0.4 or less are left out, a frame without ground truth of a class does not count for the class,
-lines have 200 points, and strips need not touch.
+The rules are the rules of MapTracker's released tools. They differ from AP_chamfer in four ways:
+predictions with a score of 0.4 or less are left out, a frame without ground truth of a class does
+not count for the class, lines have 200 points, and strips need not touch.
 """
 
 from collections.abc import Iterable, Sequence
@@ -24,11 +24,11 @@ from gsmap.utils.errors import InputError
 
 TRACK_POINTS = 20
 CHAMFER_POINTS = 200
-_LONG_PX = 200
-_SHORT_PX = 100
-_LINE_PX = 3
-_SMALL_PX = 20
-_SIMPLIFY_M = 0.2
+_LONG_PX = 200  # longer side of a mask
+_SHORT_PX = 100  # shorter side of a mask
+_LINE_PX = 3  # width of a line
+_SMALL_PX = 20  # masks with fewer pixels are dilated
+_SIMPLIFY_M = 0.2  # tolerance of the simplification of ground truth
 
 
 @dataclass(frozen=True)
@@ -275,7 +275,7 @@ def track_drive(frames: Sequence[DriveFrame], config: ConsistencyConfig) -> list
 
 
 def tracks_of(frames: Sequence[DriveFrame], config: ConsistencyConfig) -> list[IntArray]:
-    """Return the tracks of the predictions of one scene, which are created where a frame has none.
+    """Return the tracks of the predictions of one scene, or create them in frames without tracks.
 
     Args:
         frames: Frames of the scene.
@@ -334,8 +334,9 @@ class FrameHits:
 
         Args:
             threshold: Largest Chamfer distance of a match, in metres.
-            owners: Predicted track by track of the ground truth, from earlier frames; updated. A
-                match must have the predicted track of the ground truth. None for plain AP.
+            owners: Predicted track of each ground-truth track, from earlier frames. Updated in
+                place. A match must continue the predicted track of its ground truth. None for plain
+                AP, which ignores tracks.
 
         Returns:
             Whether each prediction matches. (N,)
@@ -400,7 +401,8 @@ def score_scene(
             is_class = frame.predictions.labels == label
             preds = np.flatnonzero(is_class & (scores > config.min_score))
             preds = preds[np.argsort(-scores[preds], kind="stable")]
-            nearest = gts[distances[preds][:, gts].argmin(axis=1)]
+            class_distances = distances[preds][:, gts]  # (predictions, ground truths)
+            nearest = gts[class_distances.argmin(axis=1)]
             hits = FrameHits(
                 scores=scores[preds],
                 tracks=tracks[preds],

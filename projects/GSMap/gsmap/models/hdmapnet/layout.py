@@ -27,9 +27,9 @@ def orient_forward(feats: Tensor, grid: BEVGrid) -> Tensor:
 
 
 def pixels_from_metres(points: NDArray[Any], grid: BEVGrid) -> NDArray[np.float64]:
-    """Convert points (x, y) in metres to continuous pixels (column, row), centres at + 0.5.
+    """Convert points (x, y) in metres to continuous pixels (column, row). (..., 2) -> (..., 2)
 
-    (..., 2) -> (..., 2)
+    The centre of pixel (0, 0) is at (0.5, 0.5).
     """
     low = np.array([grid.x_range[0], grid.y_range[0]])
     scale = np.array([grid.width, grid.height]) / np.array(grid.extent_m)

@@ -14,12 +14,12 @@ from gsmap.utils.errors import InputError
 class Canvas:
     """Raster of W x H pixels over the map and a margin at its upper edges.
 
-    A coordinate is the token of its pixel number plus one; token 0 ends a sequence.
+    The token of a coordinate is its pixel number plus one. Token 0 ends a sequence.
 
     Args:
         grid: Extent of the map, in metres.
-        pixel_m: Side of a pixel in metres, > 0. The number of pixels is that of the extent without
-            the margin.
+        pixel_m: Side of a pixel in metres, > 0, which gives W and H for the map without the margin.
+            With the margin, the pixels are larger.
         margin_m: Width in metres, >= 0, of the margin beyond the upper edges of the map.
 
     Raises:
@@ -76,7 +76,7 @@ class Canvas:
 
 
 def tokenize_points(points: np.ndarray, steps: Sequence[int]) -> np.ndarray:
-    """Turn points into the tokens x, y, x, y, ... and a stop token.
+    """Convert points to the tokens x, y, x, y, ... and a stop token.
 
     Args:
         points: Points in [0, 1] over the canvas. (n, 2)
