@@ -167,7 +167,7 @@ def _group_lines(report: MetricReport, group: str) -> list[str]:
         rows[name] = [_cell(report, f"{name}/{key}") for key in class_keys]
     rows["mean"] = [_cell(report, key) for key in mean_keys]
 
-    name_width = max(map(len, rows))
+    name_width = max(len(name) for name in rows)
     lines = []
     for name, cells in rows.items():
         line = name.ljust(name_width)

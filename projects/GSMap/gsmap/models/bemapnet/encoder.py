@@ -21,7 +21,7 @@ from gsmap.utils.errors import InputError
 class BezierBEVEncoder(CameraEncoder):
     """BEV encoder with self-attention of all pixels and cross-attention from BEV cells to pixels.
 
-    The pixels are those of the feature maps of all cameras. The positional encoding of a pixel is
+    Pixels are the cells of the feature maps of all cameras. The positional encoding of a pixel is
     computed from the point where its viewing ray meets the ground (IPM-PE, BeMapNet).
     Pixels above the horizon are masked. In addition to ``bev_feats``, the encoder returns
     ``bev_levels``, the outputs of all BEV layers.

@@ -1,4 +1,4 @@
-"""BeMapNet's metric: AP per sample of lines of one pixel, at two sets of thresholds."""
+"""BeMapNet's metric: AP per sample of lines drawn one pixel wide, at two sets of thresholds."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

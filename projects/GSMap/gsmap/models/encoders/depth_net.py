@@ -55,8 +55,8 @@ class SEGate(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.conv_reduce = nn.Conv2d(channels, channels, 1)
-        self.conv_expand = nn.Conv2d(channels, channels, 1)
+        self.conv_reduce = nn.Conv2d(channels, channels, kernel_size=1)
+        self.conv_expand = nn.Conv2d(channels, channels, kernel_size=1)
 
     def forward(self, feats: Tensor, embedding: Tensor) -> Tensor:
         """Scale features by their gate.
@@ -91,11 +91,11 @@ class ASPP(nn.Module):
         self.aspp4 = _conv_bn_relu(channels, mid_channels, kernel_size=3, dilation=18)
         self.global_avg_pool = nn.Sequential(
             nn.AdaptiveAvgPool2d(1),
-            nn.Conv2d(channels, mid_channels, 1, bias=False),
+            nn.Conv2d(channels, mid_channels, kernel_size=1, bias=False),
             nn.BatchNorm2d(mid_channels),
             nn.ReLU(),
         )
-        self.conv1 = nn.Conv2d(5 * mid_channels, channels, 1, bias=False)
+        self.conv1 = nn.Conv2d(5 * mid_channels, channels, kernel_size=1, bias=False)
         self.bn1 = nn.BatchNorm2d(channels)
         self.dropout = nn.Dropout(0.5)
 
@@ -124,20 +124,20 @@ class CameraAwareDepthNet(nn.Module):
     ) -> None:
         super().__init__()
         self.reduce_conv = nn.Sequential(
-            nn.Conv2d(in_channels, in_channels, 3, padding=1),
+            nn.Conv2d(in_channels, in_channels, kernel_size=3, padding=1),
             nn.BatchNorm2d(in_channels),
             nn.ReLU(inplace=True),
         )
         self.bn = nn.BatchNorm1d(CAMERA_VECTOR_SIZE)
         self.context_mlp = _camera_mlp(in_channels)
         self.context_se = SEGate(in_channels)
-        self.context_conv = nn.Conv2d(in_channels, context_channels, 1)
+        self.context_conv = nn.Conv2d(in_channels, context_channels, kernel_size=1)
         self.depth_mlp = _camera_mlp(in_channels)
         self.depth_se = SEGate(in_channels)
         self.depth_conv = nn.Sequential(
             *(BasicBlock(in_channels, in_channels) for _ in range(3)),
             ASPP(in_channels, aspp_channels),
-            nn.Conv2d(in_channels, depth_channels, 1),
+            nn.Conv2d(in_channels, depth_channels, kernel_size=1),
         )
 
     def forward(self, feats: Tensor, camera_vectors: Tensor) -> tuple[Tensor, Tensor]:
@@ -169,7 +169,7 @@ class PlainDepthNet(nn.Module):
     def __init__(self, in_channels: int, context_channels: int, depth_channels: int) -> None:
         super().__init__()
         self.depth_channels = depth_channels
-        self.conv = nn.Conv2d(in_channels, depth_channels + context_channels, 1)
+        self.conv = nn.Conv2d(in_channels, depth_channels + context_channels, kernel_size=1)
 
     def forward(self, feats: Tensor, camera_vectors: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Predict depth and context.

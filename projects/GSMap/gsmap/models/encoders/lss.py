@@ -74,7 +74,9 @@ class LSSEncoder(CameraEncoder):
         blocks = nn.Sequential()
         for stride in (1, 2, 1):
             blocks.append(
-                nn.Conv2d(embed_dims, embed_dims, 3, stride=stride, padding=1, bias=False)
+                nn.Conv2d(
+                    embed_dims, embed_dims, kernel_size=3, stride=stride, padding=1, bias=False
+                )
             )
             blocks.append(nn.BatchNorm2d(embed_dims))
             blocks.append(nn.ReLU(inplace=True))

@@ -20,7 +20,7 @@ Draw = Callable[[Tensor], Tensor]  # samples tokens (n, t) from probabilities (n
 
 
 class Elements(NamedTuple):
-    """Classes and boxes of the elements of one sample, one line is generated for each."""
+    """Classes and boxes of one sample, for each of which a line is generated."""
 
     labels: Tensor  # class indices (n,)
     boxes: Tensor  # x0, y0, x1, y1 in whole pixels of the canvas, used as tokens (n, 4)

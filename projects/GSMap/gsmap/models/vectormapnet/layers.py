@@ -123,8 +123,8 @@ def keep_most_likely(logits: Tensor, share: float) -> Tensor:
         Logits with -1e9 for masked tokens. (..., tokens)
     """
     sorted_logits, index = logits.sort(dim=-1, descending=True)
-    law = sorted_logits.softmax(dim=-1)
-    is_tail = law.cumsum(dim=-1) - law > share
+    probs = sorted_logits.softmax(dim=-1)
+    is_tail = probs.cumsum(dim=-1) - probs > share
     is_tail[..., 0] = False
     ranks = index.argsort(dim=-1)
     return logits.masked_fill(is_tail.gather(-1, ranks), -1e9)
