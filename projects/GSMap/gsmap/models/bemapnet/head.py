@@ -233,7 +233,7 @@ class BezierHead(LineHead):
             if ((numbers > largest) | ((numbers - 1) % curve.degree != 0)).any():
                 raise InputError(
                     f"lines of class {label} have {numbers.tolist()} control points, but the head "
-                    f"pieces of degree {curve.degree} and at most {largest} points: set degrees "
+                    f"has pieces of degree {curve.degree} and at most {largest} points: set degrees "
                     "and pieces of FormatBezierTargets to those of the head."
                 )
             pieces = (numbers - 1) // curve.degree - 1
