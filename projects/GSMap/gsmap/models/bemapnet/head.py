@@ -233,8 +233,8 @@ class BezierHead(LineHead):
             if ((numbers > largest) | ((numbers - 1) % curve.degree != 0)).any():
                 raise InputError(
                     f"lines of class {label} have {numbers.tolist()} control points, but the head "
-                    f"has pieces of degree {curve.degree} and at most {largest} points: set degrees "
-                    "and pieces of FormatBezierTargets to those of the head."
+                    f"has pieces of degree {curve.degree} and at most {largest} points: set "
+                    "degrees and pieces of FormatBezierTargets to those of the head."
                 )
             pieces = (numbers - 1) // curve.degree - 1
             num_missing = max(largest - points.shape[1], 0)
