@@ -20,6 +20,7 @@ COMMANDS = {
     "minicity": "minicity",
     "mutations": "mutations",
     "parameters": "parameters",
+    "prior": "prior",
     "profile": "profile",
     "raster": "raster",
     "shape": "shape",

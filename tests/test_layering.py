@@ -26,6 +26,7 @@ ALLOWED = {
     "utils": set(),
     "structures": {"utils"},
     "ops": {"structures", "utils"},
+    "prior": {"ops", "structures", "utils"},
     "models": {"checkpoints", "ops", "structures", "utils"},
     "checkpoints": {"utils"},
     "datasets": {"structures", "utils"},

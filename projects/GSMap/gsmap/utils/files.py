@@ -418,14 +418,33 @@ def lock_folder(folder: Path, name: str, advice: str) -> IO[str]:
             machine and its start.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    raw = open_to_append(folder / name)
+    return lock_file(folder / name, subject=folder, advice=advice)
+
+
+def lock_file(path: Path, subject: Path, advice: str) -> IO[str]:
+    """Reserve a file or folder for this process by a lock file until the returned file is closed.
+
+    Args:
+        path: Lock file, which describes the process that holds it; its folder exists.
+        subject: File or folder that is reserved, for the message.
+        advice: Remedy if another process holds it, for the message.
+
+    Returns:
+        The open lock file.
+
+    Raises:
+        ValueError: If another program has written the lock file.
+        RuntimeError: If another process holds the lock; the message has its process ID, its machine
+            and its start.
+    """
+    raw = open_to_append(path)
     file = io.TextIOWrapper(io.BufferedRandom(raw), encoding="utf-8", errors="replace")
     os.register_at_fork(after_in_child=file.close)  # workers would hold the lock of a killed parent
     file.seek(0)
     holder = file.read(200)
     if not _HOLDER.fullmatch(holder):
-        raise InputError(f"{folder / name} is another program's file: write elsewhere.")
-    lock(file, message=f"{folder} is in use by {holder or 'another process'}: {advice}.")
+        raise InputError(f"{path} is another program's file: write elsewhere.")
+    lock(file, message=f"{subject} is in use by {holder or 'another process'}: {advice}.")
     file.truncate(0)
     file.write(f"process {os.getpid()} on {platform.node()} since {time.strftime('%F %T')}")
     file.flush()

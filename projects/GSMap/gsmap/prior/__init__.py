@@ -1,0 +1,14 @@
+"""Map priors: rasters of the map at places that a vehicle has passed before."""
+
+from gsmap.utils.lazy import lazy_names
+
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__,
+    {
+        "HitMissCounts": "rules",
+        "KeepMaximum": "rules",
+        "LastSeen": "rules",
+        "MapPrior": "map_prior",
+        "PriorSettings": "settings",
+    },
+)

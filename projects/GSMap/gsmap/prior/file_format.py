@@ -1,0 +1,169 @@
+"""File of a map prior: a header, compressed tiles and an index.
+
+The file begins with the magic number, the version and the length of the header, all little-endian.
+The header is JSON in UTF-8. Compressed tiles (zlib) follow, then the index with the place, offset,
+length and checksum of each tile. A footer of fixed size ends the file.
+"""
+
+import json
+import mmap
+import struct
+import zlib
+from collections.abc import Iterable
+from dataclasses import asdict
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from gsmap.prior.rules import WriteRule, rule_from_settings, rule_settings
+from gsmap.prior.settings import PriorSettings
+from gsmap.utils.errors import InputError
+from gsmap.utils.files import fetch_advice
+
+VERSION = 1
+TileKey = tuple[int, int]
+"""Column and row of a tile in the global frame."""
+TilePlace = tuple[int, int, int]
+"""Offset and length of a compressed tile in bytes, and its checksum."""
+FARTHEST_TILE = 2**30
+"""Largest column or row of a tile."""
+_MAGIC = b"\x89GSPRIOR"
+_START = struct.Struct("<8sII")  # magic, version, length of the header
+_FOOTER = struct.Struct("<QIII8s")  # offset, number and checksum of the index, of the header, magic
+_INDEX = np.dtype(
+    [("column", "<i4"), ("row", "<i4"), ("offset", "<u8"), ("length", "<u4"), ("crc", "<u4")]
+)
+_LONGEST_HEADER = 1 << 16
+
+
+def write_tiles(
+    file: IO[bytes],
+    settings: PriorSettings,
+    rule: WriteRule,
+    tiles: Iterable[tuple[TileKey, bytes]],
+) -> None:
+    """Write the content of a file.
+
+    Args:
+        file: Empty file.
+        settings: Classes, place and cells.
+        rule: Rule of the stored states.
+        tiles: Place and compressed states of each tile.
+    """
+    header = json.dumps(asdict(settings) | {"rule": rule_settings(rule)}).encode()
+    file.write(_START.pack(_MAGIC, VERSION, len(header)))
+    file.write(header)
+    offset = _START.size + len(header)
+    rows = []
+    for (column, row), content in tiles:
+        file.write(content)
+        rows.append((column, row, offset, len(content), zlib.crc32(content)))
+        offset += len(content)
+    index = np.array(rows, dtype=_INDEX).tobytes()
+    file.write(index)
+    file.write(_FOOTER.pack(offset, len(rows), zlib.crc32(index), zlib.crc32(header), _MAGIC))
+
+
+def read_header(
+    content: mmap.mmap | bytes, path: Path
+) -> tuple[PriorSettings, WriteRule, dict[TileKey, TilePlace]]:
+    """Read and check everything but the tiles of an untrusted file.
+
+    Args:
+        content: Content of the file.
+        path: Name of the file, for messages.
+
+    Returns:
+        Settings, rule and the place of each tile in the file.
+
+    Raises:
+        ValueError: If the file is no valid prior.
+    """
+    size = len(content)
+    start = bytes(content[: max(_START.size, 200)])
+    if not start.startswith(_MAGIC):
+        advice = fetch_advice(start, otherwise="give a file that MapPrior.save has written")
+        raise InputError(f"{path} is no map prior: {advice}.")
+    if size < _START.size + _FOOTER.size:
+        raise _cut(path)
+    _, version, length = _START.unpack_from(start)
+    if version != VERSION:
+        raise InputError(
+            f"{path} has version {version} of map priors, and version {VERSION} is read: build "
+            "the prior with this version of the program."
+        )
+    offset, count, index_crc, header_crc, magic = _FOOTER.unpack_from(content, size - _FOOTER.size)
+    index_size = count * _INDEX.itemsize
+    if magic != _MAGIC or offset + index_size + _FOOTER.size != size:
+        raise _cut(path)
+    header_end = _START.size + length
+    if length > _LONGEST_HEADER or header_end > offset:
+        raise InputError(f"{path} is damaged: its header has {length} bytes; build it again.")
+    header = bytes(content[_START.size : header_end])
+    index = bytes(content[offset : offset + index_size])
+    if zlib.crc32(header) != header_crc or zlib.crc32(index) != index_crc:
+        raise InputError(f"{path} is damaged: a checksum is wrong; copy or build it again.")
+    settings, rule = _parse_header(header, path)
+    places = _parse_index(index, path, start=header_end, end=offset)
+    return settings, rule, places
+
+
+def _cut(path: Path) -> InputError:
+    return InputError(f"{path} is cut off: its end is missing; copy or build it again.")
+
+
+def _parse_header(header: bytes, path: Path) -> tuple[PriorSettings, WriteRule]:
+    """Check the settings of a header."""
+    fields = ["cell_m", "classes", "place", "rule", "tile_m"]
+    try:
+        values: Any = json.loads(header)
+        if not isinstance(values, dict) or sorted(values) != fields:
+            raise InputError(f"the header must have the fields {fields}.")
+        if not isinstance(values["classes"], list):
+            raise InputError("classes must be a list.")
+        rule = rule_from_settings(values.pop("rule"))
+        return PriorSettings(**values), rule
+    except (ValueError, TypeError, RecursionError) as error:  # TypeError: names that are lists
+        text = str(error).rstrip(".")
+        raise InputError(f"{path} is damaged: {text}; build it again.") from error
+
+
+def _parse_index(index: bytes, path: Path, start: int, end: int) -> dict[TileKey, TilePlace]:
+    """Check the index; tiles lie between the bytes ``start`` and ``end``."""
+    rows = np.frombuffer(index, dtype=_INDEX)
+    first = rows["offset"]
+    inside = (first >= start) & (first <= end) & (rows["length"] <= end - np.minimum(first, end))
+    columns = np.abs(rows["column"].astype(np.int64))
+    inside &= (columns <= FARTHEST_TILE) & (np.abs(rows["row"].astype(np.int64)) <= FARTHEST_TILE)
+    places = {}
+    for column, row, offset, length, crc in rows.tolist():
+        places[column, row] = (offset, length, crc)
+    if not inside.all() or len(places) != len(rows):
+        raise InputError(
+            f"{path} is damaged: its index names tiles outside of the file or twice; build it "
+            "again."
+        )
+    return places
+
+
+def unpack_tile(content: bytes, crc: int, num_bytes: int, path: Path | str) -> bytearray:
+    """Decompress a tile, in bounded memory.
+
+    Args:
+        content: Compressed tile.
+        crc: Expected checksum of ``content``.
+        num_bytes: Size of the states in bytes.
+        path: Name of the file, for messages.
+
+    Raises:
+        ValueError: If the tile is damaged.
+    """
+    unpacker = zlib.decompressobj()
+    try:
+        states = unpacker.decompress(content, num_bytes + 1)
+    except zlib.error:
+        states = b""
+    if zlib.crc32(content) != crc or len(states) != num_bytes or not unpacker.eof:
+        raise InputError(f"{path} is damaged: a tile cannot be read; copy or build it again.")
+    return bytearray(states)

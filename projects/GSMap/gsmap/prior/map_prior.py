@@ -1,0 +1,409 @@
+"""Map prior: a raster of the map in the global frame, in tiles."""
+
+import mmap
+import os
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gsmap.prior.file_format import FARTHEST_TILE, read_header, write_tiles
+from gsmap.prior.rules import HitMissCounts, States, WriteRule
+from gsmap.prior.settings import PriorSettings
+from gsmap.prior.tiles import TileStore
+from gsmap.structures.grid import BEVGrid
+from gsmap.structures.rigid import is_rigid
+from gsmap.utils.errors import InputError
+from gsmap.utils.files import atomic_write, lock_file
+
+Pose = Tensor | NDArray[np.floating[Any]]
+Raster = Tensor | NDArray[Any]
+MEMORY_BYTES = 100 << 20
+"""Default of the largest size of the tiles in memory."""
+_FARTHEST_M = 1e7  # largest coordinate of a pose, in metres
+_MOST_CELLS = 1 << 24  # in the rectangle around the view of a frame
+
+
+class MapPrior:
+    """Raster of the map at places that a vehicle has passed, with one channel per class.
+
+    Tiles are created when a frame is written to them. Those that are not in use leave memory. All
+    methods may be called from several threads. `read` and `write` take the nearest cell: a cell of
+    the prior has the index floor(x / cell_m) along each axis of the global frame. As in
+    `MapElements.to_frame`, poses are used by position and yaw.
+
+    Args:
+        settings: Classes, place and cells.
+        rule: Rule of writing; `HitMissCounts` by default. `LastSeen` and `KeepMaximum` are those of
+            HRMapNet (arXiv 2409.00620).
+        memory_bytes: Largest size of the tiles in memory; a tile of three classes has 120 kB, with
+            `HitMissCounts` 480 kB.
+    """
+
+    def __init__(
+        self,
+        settings: PriorSettings,
+        rule: WriteRule | None = None,
+        memory_bytes: int = MEMORY_BYTES,
+    ) -> None:
+        self.settings = settings
+        self.rule: WriteRule = HitMissCounts() if rule is None else rule
+        side = settings.tile_cells
+        num_classes = len(settings.classes)
+        self._tiles = TileStore(
+            (self.rule.num_states, num_classes, side, side), self.rule.dtype, memory_bytes
+        )
+        self._lock = threading.RLock()
+        self._owner: IO[str] | None = None
+        self._owned_path: Path | None = None
+
+    @classmethod
+    def load(
+        cls,
+        path: str | Path,
+        settings: PriorSettings | None = None,
+        update: bool = False,
+        memory_bytes: int = MEMORY_BYTES,
+    ) -> "MapPrior":
+        """Open a file that `save` has written; tiles are read when they are needed.
+
+        Args:
+            path: File of the prior. It may be untrusted.
+            settings: Classes, place and cells that the file must have; None to accept any.
+            update: Reserve the file for this process until `close`, to save it later. Another
+                process can still read it.
+            memory_bytes: Largest size of the tiles in memory.
+
+        Returns:
+            Prior.
+
+        Raises:
+            ValueError: If the file is no valid prior, or has other settings.
+            RuntimeError: If the file is reserved by another process, or another prior of this one.
+        """
+        path = Path(path)
+        owner = _reserve(path) if update else None
+        try:
+            mapped = _map_file(path)
+            try:
+                found, rule, places = read_header(mapped, path)
+                if settings is not None:
+                    settings.require_equal(found, str(path))
+            except BaseException:
+                mapped.close()
+                raise
+        except BaseException:
+            if owner is not None:
+                owner.close()
+            raise
+        prior = cls(found, rule, memory_bytes=memory_bytes)
+        prior._tiles.open(mapped, path, places=places)
+        prior._owner = owner
+        prior._owned_path = path.resolve() if update else None
+        return prior
+
+    def save(self, path: str | Path) -> None:
+        """Write the prior to a file, which replaces ``path`` when it is complete.
+
+        Args:
+            path: File to create or replace.
+
+        Raises:
+            RuntimeError: If the file is reserved by another process, or another prior of this one.
+        """
+        path = Path(path)
+        with self._lock:
+            owns_file = self._owned_path == path.resolve()
+            owner = None if owns_file else _reserve(path)
+            try:
+                with atomic_write(path, mode="wb") as file:
+                    write_tiles(
+                        file,
+                        self.settings,
+                        rule=self.rule,
+                        tiles=self._tiles.packed_tiles(),
+                    )
+                if path.is_file():  # no device or pipe
+                    mapped = _map_file(path)
+                    _, _, places = read_header(mapped, path)
+                    self._tiles.open(mapped, path, places=places)
+            finally:
+                if owner is not None:
+                    owner.close()
+
+    def close(self) -> None:
+        """Release memory, and the file if it is reserved. Changes since `save` are lost."""
+        with self._lock:
+            self._tiles.close()
+            if self._owner is not None:
+                self._owner.close()
+            self._owner = None
+            self._owned_path = None
+
+    def __enter__(self) -> "MapPrior":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    @property
+    def num_tiles(self) -> int:
+        """Number of tiles, in memory or not."""
+        with self._lock:
+            return len(self._tiles.keys())
+
+    @property
+    def num_tiles_in_memory(self) -> int:
+        """Number of tiles in memory."""
+        return self._tiles.num_in_memory
+
+    def read(self, pose: Pose, grid: BEVGrid) -> Tensor:
+        """Read the prior at the cells of a frame.
+
+        Args:
+            pose: Transform from the frame of ``grid`` to the global frame, in metres. Far from the
+                origin it must be float64. (4, 4)
+            grid: Extent and cells of the frame, H rows and W columns.
+
+        Returns:
+            Values in [0, 1], 0 where nothing has been written, float32 on the device of ``pose``.
+            (C, H, W)
+
+        Raises:
+            ValueError: If ``pose`` is no rigid transform or too far from the origin, or the grid is
+                too large.
+        """
+        window = self._window(pose, grid)
+        with self._lock:
+            canvas = self._load_canvas(window)
+        states = canvas.reshape(*canvas.shape[:2], -1)[..., window.cells]  # (S, C, H * W)
+        values = self.rule.read(states).reshape(-1, grid.height, grid.width)
+        device = pose.device if isinstance(pose, Tensor) else torch.device("cpu")
+        return torch.from_numpy(values).to(device)
+
+    def write(
+        self, pose: Pose, grid: BEVGrid, values: Raster, visible: Raster | None = None
+    ) -> None:
+        """Write the prediction of a frame.
+
+        If several cells of the frame lie in a cell of the prior, the largest prediction counts.
+
+        Args:
+            pose: Transform from the frame of ``grid`` to the global frame, in metres. Far from the
+                origin it must be float64. (4, 4)
+            grid: Extent and cells of the frame, H rows and W columns.
+            values: Prediction in [0, 1]; 0 is a miss. (C, H, W)
+            visible: Whether a cell is in view and not occluded, bool; None if all are. Other cells
+                do not change. (H, W)
+
+        Raises:
+            ValueError: If a shape is wrong, a value is not in [0, 1], ``pose`` is no rigid
+                transform or too far from the origin, or the grid is too large.
+        """
+        size = (grid.height, grid.width)
+        prediction = _numpy(values).astype(np.float32, copy=False)
+        expected = (len(self.settings.classes), *size)
+        if prediction.shape != expected:
+            raise InputError(f"values must have shape {expected}, got {prediction.shape}.")
+        if not (prediction.min() >= 0 and prediction.max() <= 1):  # False for NaN
+            raise InputError("values must be in [0, 1].")
+        in_view = np.ones(size, dtype=np.bool_) if visible is None else _numpy(visible)
+        if in_view.shape != size or in_view.dtype != np.bool_:
+            raise InputError(
+                f"visible must be bool of shape {size}, got {in_view.dtype} of shape "
+                f"{in_view.shape}."
+            )
+        window = self._window(pose, grid)
+        flat_values = prediction.reshape(len(prediction), -1)
+        cells = window.cells
+        if visible is not None:
+            chosen = np.flatnonzero(in_view)
+            cells = cells[chosen]
+            flat_values = flat_values[:, chosen]
+        touched, largest = _largest_per_cell(cells, flat_values, size=window.height * window.width)
+        with self._lock:
+            canvas = self._load_canvas(window)
+            flat_canvas = canvas.reshape(*canvas.shape[:2], -1)
+            flat_canvas[..., touched] = self.rule.update(flat_canvas[..., touched], largest)
+            self._store_canvas(window, canvas=canvas, touched=touched)
+
+    def _window(self, pose: Pose, grid: BEVGrid) -> "_Window":
+        """Place the cells of a frame in the rectangle around them, in cells of the prior."""
+        transform = _numpy(pose).astype(np.float64, copy=False)
+        if transform.shape != (4, 4) or not is_rigid(transform):
+            raise InputError("pose must be a rigid transform of shape (4, 4).")
+        if np.abs(transform[:2, 3]).max() > _FARTHEST_M:
+            raise InputError(
+                f"pose is {np.abs(transform[:2, 3]).max():.3g} m from the origin; at most "
+                f"{_FARTHEST_M:g} m are possible."
+            )
+        axis = transform[:2, 0]
+        length = float(np.hypot(axis[0], axis[1]))
+        if length < 1e-6:
+            raise InputError("pose has no yaw: its x axis is vertical.")
+        cos, sin = axis / length
+        dx, dy = grid.pixel_size_m
+        x = grid.x_range[0] + dx * (np.arange(grid.width) + 0.5)  # (W,)
+        y = grid.y_range[0] + dy * (np.arange(grid.height) + 0.5)  # (H,)
+        corner_m = max(map(abs, (*grid.x_range, *grid.y_range)))
+        num_cells = (2 * corner_m / self.settings.cell_m) ** 2
+        if not num_cells <= 4 * _MOST_CELLS:
+            raise InputError(
+                f"the grid reaches {corner_m:g} m, too far for cells of {self.settings.cell_m:g} m."
+            )
+        global_x = (cos * x + transform[0, 3]) - sin * y[:, None]  # (H, W)
+        global_y = (sin * x + transform[1, 3]) + cos * y[:, None]
+        columns = np.floor(global_x / self.settings.cell_m).astype(np.int64)
+        rows = np.floor(global_y / self.settings.cell_m).astype(np.int64)
+        first_column = int(columns.min())
+        first_row = int(rows.min())
+        width = int(columns.max()) - first_column + 1
+        height = int(rows.max()) - first_row + 1
+        cells = (rows - first_row) * width + (columns - first_column)
+        farthest = max(abs(first_column), abs(first_row)) + max(width, height)
+        assert farthest < FARTHEST_TILE * self.settings.tile_cells
+        return _Window(first_column, first_row, width=width, height=height, cells=cells.ravel())
+
+    def _load_canvas(self, window: "_Window") -> States:
+        """Copy the tiles of a window to one raster. (S, C, height, width)"""
+        num_states, num_classes = self._tiles.shape[:2]
+        shape = (num_states, num_classes, window.height, window.width)
+        canvas = np.full(shape, self.rule.empty, dtype=self.rule.dtype)
+        for part in window.parts(self.settings.tile_cells):
+            tile = self._tiles.get(part.key)
+            if tile is not None:
+                canvas[:, :, part.rows, part.columns] = tile[
+                    :, :, part.tile_rows, part.tile_columns
+                ]
+        return canvas
+
+    def _store_canvas(self, window: "_Window", canvas: States, touched: NDArray[np.int64]) -> None:
+        """Copy a raster back to the tiles in which a cell was touched."""
+        is_touched = np.zeros(window.height * window.width, dtype=np.bool_)
+        is_touched[touched] = True
+        is_touched = is_touched.reshape(window.height, window.width)
+        for part in window.parts(self.settings.tile_cells):
+            if is_touched[part.rows, part.columns].any():
+                tile = self._tiles.get_to_write(part.key, empty=self.rule.empty)
+                tile[:, :, part.tile_rows, part.tile_columns] = canvas[
+                    :, :, part.rows, part.columns
+                ]
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Part of a window in one tile."""
+
+    key: tuple[int, int]
+    columns: slice
+    rows: slice
+    tile_columns: slice
+    tile_rows: slice
+
+
+@dataclass(frozen=True)
+class _Window:
+    """Rectangle of cells around the view of a frame.
+
+    Args:
+        first_column: Smallest column of the cells, in the global frame.
+        first_row: Smallest row.
+        width: Number of columns.
+        height: Number of rows.
+        cells: Index of each cell of the frame in the rectangle, row by row. (H * W,)
+    """
+
+    first_column: int
+    first_row: int
+    width: int
+    height: int
+    cells: NDArray[np.int64]
+
+    def parts(self, side: int) -> list[_Part]:
+        """Cut the rectangle at the borders of tiles of ``side`` cells."""
+        parts = []
+        row_cuts = _cuts(self.first_row, self.height, side=side)
+        column_cuts = _cuts(self.first_column, self.width, side=side)
+        for tile_row, rows, tile_rows in row_cuts:
+            for tile_column, columns, tile_columns in column_cuts:
+                part = _Part(
+                    (tile_column, tile_row),
+                    columns=columns,
+                    rows=rows,
+                    tile_columns=tile_columns,
+                    tile_rows=tile_rows,
+                )
+                parts.append(part)
+        return parts
+
+
+def _cuts(first: int, length: int, side: int) -> list[tuple[int, slice, slice]]:
+    """Cut a range at multiples of ``side``: tile, cells in the range, cells in the tile."""
+    cuts = []
+    end = first + length
+    for tile in range(first // side, (end - 1) // side + 1):
+        start = max(first, tile * side)
+        stop = min(end, (tile + 1) * side)
+        in_range = slice(start - first, stop - first)
+        in_tile = slice(start - tile * side, stop - tile * side)
+        cuts.append((tile, in_range, in_tile))
+    return cuts
+
+
+def _largest_per_cell(
+    cells: NDArray[np.int64], values: NDArray[np.float32], size: int
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Combine cells of a frame that lie in one cell of the prior by their largest values.
+
+    Args:
+        cells: Cell of the prior of each cell of the frame, in [0, size). (n,)
+        values: Prediction. (C, n)
+        size: Number of cells of the prior.
+
+    Returns:
+        Different cells in rising order (m,), and their largest values (C, m).
+    """
+    is_touched = np.zeros(size, dtype=np.bool_)
+    is_touched[cells] = True
+    touched = np.flatnonzero(is_touched)
+    largest = torch.zeros(len(values), size)
+    index = torch.from_numpy(cells)
+    for channel, channel_values in zip(largest, values, strict=True):
+        channel.scatter_reduce_(0, index, torch.from_numpy(channel_values), reduce="amax")
+    return touched, largest.numpy()[:, touched]
+
+
+def _numpy(values: Raster) -> NDArray[Any]:
+    """Convert a tensor on any device, or an array, to an array."""
+    if isinstance(values, Tensor):
+        detached = values.detach()
+        if detached.dtype == torch.bfloat16:
+            detached = detached.float()
+        return detached.cpu().numpy()
+    return np.asarray(values)
+
+
+def _reserve(path: Path) -> IO[str]:
+    """Reserve a file for a writer, by a lock file beside it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lock_path = path.with_name(f".{path.name}.lock")
+    return lock_file(lock_path, subject=path, advice="wait for its end, or write another file")
+
+
+def _map_file(path: Path) -> mmap.mmap:
+    """Map a file that is not empty for reading."""
+    with path.open("rb") as file:
+        if not os.fstat(file.fileno()).st_size:
+            raise InputError(f"{path} is empty: copy or build it again.")
+        return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)

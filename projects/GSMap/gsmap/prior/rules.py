@@ -1,0 +1,192 @@
+"""Rules that update the cells of a map prior with the prediction of a frame."""
+
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsmap.utils.errors import InputError
+
+Floats = NDArray[np.float32]
+States = NDArray[Any]
+
+
+class WriteRule:
+    """Update of the cells in view, and conversion of their states to values in [0, 1].
+
+    A subclass is a dataclass whose fields are numbers, which the file of a prior stores.
+
+    Attributes:
+        num_states: Number S of stored numbers per cell and class.
+        dtype: Type of a stored number.
+        empty: Stored number of a cell that has never been in view.
+    """
+
+    num_states: ClassVar[int] = 1
+    dtype: ClassVar[np.dtype[Any]] = np.dtype(np.uint8)
+    empty: ClassVar[int] = 0
+
+    def update(self, states: States, values: Floats) -> States:
+        """Update cells that are in view.
+
+        Args:
+            states: States before the frame. (S, C, n)
+            values: Prediction in [0, 1]; 0 is a miss. (C, n)
+
+        Returns:
+            States after the frame. (S, C, n)
+        """
+        raise NotImplementedError
+
+    def read(self, states: States) -> Floats:
+        """Convert states to values in [0, 1]. (S, C, ...) -> (C, ...)"""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class KeepMaximum(WriteRule):
+    """Largest prediction so far, in steps of 1 / 255: the rule of HRMapNet's training.
+
+    Cells never decrease. Predictions are rounded down, as in the release.
+    """
+
+    def update(self, states: States, values: Floats) -> States:
+        """Update cells that are in view. (S, C, n), (C, n) -> (S, C, n)"""
+        seen = (values * 255).astype(np.uint8)
+        return np.maximum(states, seen[None])
+
+    def read(self, states: States) -> Floats:
+        """Convert states to values in [0, 1]. (S, C, ...) -> (C, ...)"""
+        return states[0].astype(np.float32) / np.float32(255)
+
+
+@dataclass(frozen=True)
+class LastSeen(WriteRule):
+    """Last prediction with a linear decay by each miss: the rule of HRMapNet's test.
+
+    A cell starts at 100. A hit p > 0 raises it to at least 100 + 30 p, so hits do not add up. A
+    miss subtracts 1 from a cell of at least 100. The value of a cell v is (v - 100) / 30 within
+    [0, 1], so a certain prediction lasts for 30 misses.
+
+    Args:
+        gain: Rise of a cell by a certain prediction, and number of misses that it lasts.
+        lowest: Smallest state.
+        highest: Largest state.
+
+    Raises:
+        ValueError: If a setting is out of range.
+    """
+
+    empty: ClassVar[int] = 100
+    gain: float = 30.0
+    lowest: int = 2
+    highest: int = 240
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.gain <= 140:
+            raise InputError(f"gain must be in [1, 140], got {self.gain}.")
+        if not 0 <= self.lowest < 100 < self.highest <= 255:
+            raise InputError(
+                f"lowest and highest must be in [0, 99] and [101, 255], got {self.lowest} and "
+                f"{self.highest}."
+            )
+
+    def update(self, states: States, values: Floats) -> States:
+        """Update cells that are in view. (S, C, n), (C, n) -> (S, C, n)"""
+        seen = self.empty + np.float32(self.gain) * values
+        new = np.maximum(states, seen[None])
+        # The release compares 100 + 30 p with 100, so a p that rounds to it is a miss.
+        new -= seen[None] <= self.empty
+        return np.clip(new, self.lowest, self.highest).astype(np.uint8)
+
+    def read(self, states: States) -> Floats:
+        """Convert states to values in [0, 1]. (S, C, ...) -> (C, ...)"""
+        values = (states[0].astype(np.float32) - self.empty) / np.float32(self.gain)
+        return np.clip(values, 0, 1)
+
+
+@dataclass(frozen=True)
+class HitMissCounts(WriteRule):
+    """Counts of hits and misses per cell, both with exponential decay.
+
+    A frame with a cell in view multiplies both counts by ``decay`` and adds p to the hits and 1 - p
+    to the misses. The value of a cell is hits / (hits + misses + prior_count). Cells that are out
+    of view or occluded keep their counts.
+
+    Args:
+        decay: Factor of older counts at each view, in [0.5, 0.999]; their sum stays below
+            1 / (1 - decay).
+        prior_count: Pseudo-count of misses, in [0.01, 100]: a single hit has the value
+            1 / (1 + prior_count).
+
+    Raises:
+        ValueError: If a setting is out of range.
+    """
+
+    num_states: ClassVar[int] = 2  # hits, misses
+    dtype: ClassVar[np.dtype[Any]] = np.dtype("<u2")
+    decay: float = 0.95
+    prior_count: float = 0.25
+
+    def __post_init__(self) -> None:
+        if not 0.5 <= self.decay <= 0.999:
+            raise InputError(f"decay must be in [0.5, 0.999], got {self.decay}.")
+        if not 0.01 <= self.prior_count <= 100:
+            raise InputError(f"prior_count must be in [0.01, 100], got {self.prior_count}.")
+
+    @property
+    def _unit(self) -> np.float32:
+        """Stored number of one view; the largest possible sum of both counts is 65535."""
+        return np.float32(65535 * (1 - self.decay))
+
+    def update(self, states: States, values: Floats) -> States:
+        """Update cells that are in view. (S, C, n), (C, n) -> (S, C, n)"""
+        new = states * np.float32(self.decay)
+        new[0] += self._unit * values
+        new[1] += self._unit * (1 - values)
+        np.rint(new, out=new)
+        return np.minimum(new, 65535, out=new).astype(self.dtype)
+
+    def read(self, states: States) -> Floats:
+        """Convert states to values in [0, 1]. (S, C, ...) -> (C, ...)"""
+        hits = states[0].astype(np.float32)
+        total = hits + states[1] + self._unit * np.float32(self.prior_count)
+        return hits / total
+
+
+RULES: dict[str, type[WriteRule]] = {
+    "keep_maximum": KeepMaximum,
+    "last_seen": LastSeen,
+    "hit_miss_counts": HitMissCounts,
+}
+"""Rules by their names in files."""
+
+
+def rule_settings(rule: WriteRule) -> dict[str, Any]:
+    """Convert a rule to the settings that `rule_from_settings` reads."""
+    names = {kind: name for name, kind in RULES.items()}
+    fields: dict[str, Any] = asdict(rule)  # type: ignore[call-overload]
+    return {"name": names[type(rule)]} | fields
+
+
+def rule_from_settings(settings: Any) -> WriteRule:
+    """Create a rule from untrusted settings.
+
+    Args:
+        settings: Name of the rule as ``name``, and its numbers.
+
+    Raises:
+        ValueError: If the rule is unknown or its settings are invalid.
+    """
+    if not isinstance(settings, dict) or settings.get("name") not in list(RULES):
+        raise InputError(f"the rule must have a name of {sorted(RULES)}.")
+    kind = RULES[settings["name"]]
+    numbers = {name: value for name, value in settings.items() if name != "name"}
+    expected = set(rule_settings(kind())) - {"name"}
+    if set(numbers) != expected:
+        raise InputError(f"the rule {settings['name']} must have the settings {sorted(expected)}.")
+    for name, number in numbers.items():
+        if isinstance(number, bool) or not isinstance(number, (int, float)):
+            raise InputError(f"the setting {name} of the rule must be a number.")
+    return kind(**numbers)

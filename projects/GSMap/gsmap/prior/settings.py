@@ -1,0 +1,88 @@
+"""Classes, place and cells of a map prior."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from gsmap.utils.errors import InputError
+
+_MOST_CLASSES = 64
+_MOST_TILE_CELLS = 1024
+_LONGEST_NAME = 200  # letters
+
+
+@dataclass(frozen=True)
+class PriorSettings:
+    """Classes, global frame and cells of a map prior.
+
+    Args:
+        classes: Names of the classes, one channel each.
+        place: Name of the global frame: the city or map in which poses are metres.
+        cell_m: Side of a cell in metres, in [0.01, 10].
+        tile_m: Side of a tile in metres, a multiple of ``cell_m`` of at most 1024 cells.
+
+    Raises:
+        ValueError: If a value is invalid.
+    """
+
+    classes: tuple[str, ...]
+    place: str
+    cell_m: float = 0.3
+    tile_m: float = 60.0
+
+    def __post_init__(self) -> None:
+        classes = tuple(self.classes)
+        object.__setattr__(self, "classes", classes)
+        if not 1 <= len(classes) <= _MOST_CLASSES or len(set(classes)) != len(classes):
+            raise InputError(
+                f"classes must be 1 to {_MOST_CLASSES} different names, got {len(classes)}."
+            )
+        for name in (*classes, self.place):
+            _require_name(name)
+        for name in ("cell_m", "tile_m"):
+            _require_number(name, getattr(self, name))
+        if not 0.01 <= self.cell_m <= 10:
+            raise InputError(f"cell_m must be in [0.01, 10], got {self.cell_m}.")
+        cells = self.tile_m / self.cell_m
+        if not 1 <= cells <= _MOST_TILE_CELLS + 0.5 or abs(cells - round(cells)) > 1e-6:
+            raise InputError(
+                f"tile_m must be 1 to {_MOST_TILE_CELLS} cells of {self.cell_m:g} m, got "
+                f"{self.tile_m:g} m."
+            )
+
+    @property
+    def tile_cells(self) -> int:
+        """Number of cells along a side of a tile."""
+        return round(self.tile_m / self.cell_m)
+
+    def require_equal(self, other: "PriorSettings", where: str) -> None:
+        """Require that the settings of a file are these settings.
+
+        Args:
+            other: Settings of the file.
+            where: Name of the file, for the message.
+
+        Raises:
+            ValueError: If a value differs.
+        """
+        for name in ("classes", "place", "cell_m", "tile_m"):
+            expected = getattr(self, name)
+            found = getattr(other, name)
+            if found != expected:
+                raise InputError(
+                    f"{where} has {name} {found!r}, and {expected!r} is needed: give the prior of "
+                    f"this {name}, or build one."
+                )
+
+
+def _require_name(name: Any) -> None:
+    """Require a printable name of moderate length."""
+    if not isinstance(name, str) or not name.isprintable() or not 1 <= len(name) <= _LONGEST_NAME:
+        raise InputError(
+            f"classes and place must be printable names of 1 to {_LONGEST_NAME} letters."
+        )
+
+
+def _require_number(name: str, value: Any) -> None:
+    """Require a number that is no truth value."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise InputError(f"{name} must be a number.")

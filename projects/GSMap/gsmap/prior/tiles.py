@@ -1,0 +1,212 @@
+"""Tiles of a map prior: a file on disk, a part of it in memory."""
+
+import mmap
+import os
+import tempfile
+import zlib
+from collections import OrderedDict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsmap.prior.file_format import TileKey, TilePlace, unpack_tile
+from gsmap.utils.errors import WorkError
+
+Tile = NDArray[Any]
+_LEVEL = 1  # of zlib; higher levels save little on sparse rasters
+_MAPPED_BYTES = 32 << 20  # read from the mapped file before its pages are released
+_WASTED_BYTES = 64 << 20  # of the temporary file before it is written again
+
+
+class TileStore:
+    """Tiles by their place, of which the least recently used leave memory.
+
+    A changed tile that leaves memory is compressed into a temporary file, so memory is bounded.
+
+    Args:
+        shape: Shape of a tile.
+        dtype: Type of its states.
+        memory_bytes: Largest size of the tiles in memory, at least one tile.
+    """
+
+    def __init__(self, shape: tuple[int, ...], dtype: np.dtype[Any], memory_bytes: int) -> None:
+        self.shape = shape
+        self.dtype = dtype
+        self._tile_bytes = int(np.prod(shape)) * dtype.itemsize
+        self._most_tiles = max(1, memory_bytes // self._tile_bytes)
+        self._tiles: OrderedDict[TileKey, Tile] = OrderedDict()
+        self._changed: set[TileKey] = set()
+        self._file_places: dict[TileKey, TilePlace] = {}
+        self._mapped: mmap.mmap | None = None
+        self._path = Path()
+        self._mapped_bytes = 0
+        self._spill = _SpillFile()
+
+    def open(self, mapped: mmap.mmap, path: Path, places: dict[TileKey, TilePlace]) -> None:
+        """Replace the content by that of a file.
+
+        Args:
+            mapped: Content of the file.
+            path: Name of the file, for messages.
+            places: Place of each tile in the file.
+        """
+        if self._mapped is not None:
+            self._mapped.close()
+        self._mapped = mapped
+        self._path = path
+        self._file_places = places
+        self._changed.clear()
+        self._spill.clear()
+
+    def keys(self) -> set[TileKey]:
+        """Places of all tiles, in memory or not."""
+        return {*self._file_places, *self._spill.places, *self._tiles}
+
+    @property
+    def num_in_memory(self) -> int:
+        """Number of tiles in memory."""
+        return len(self._tiles)
+
+    def get(self, key: TileKey) -> Tile | None:
+        """Return a tile, which the caller must not keep; None for a tile without states."""
+        tile = self._tiles.get(key)
+        if tile is None:
+            tile = self._load(key)
+            if tile is None:
+                return None
+            self._keep(key, tile)
+        self._tiles.move_to_end(key)
+        return tile
+
+    def get_to_write(self, key: TileKey, empty: int) -> Tile:
+        """Return a tile that the caller changes at once; a new one has ``empty`` everywhere."""
+        tile = self.get(key)
+        if tile is None:
+            tile = np.full(self.shape, empty, dtype=self.dtype)
+            self._keep(key, tile)
+        self._changed.add(key)
+        return tile
+
+    def packed_tiles(self) -> Iterator[tuple[TileKey, bytes]]:
+        """Iterate over all tiles, compressed, in the order of their places."""
+        for key in sorted(self.keys()):
+            yield key, self._packed(key)
+
+    def close(self) -> None:
+        """Release all tiles and the file."""
+        self._tiles.clear()
+        self._file_places = {}
+        self._changed.clear()
+        self._spill.clear()
+        if self._mapped is not None:
+            self._mapped.close()
+            self._mapped = None
+
+    def _packed(self, key: TileKey) -> bytes:
+        """Compressed states of a tile; a damaged tile raises an error instead of being copied."""
+        if key in self._changed:
+            return zlib.compress(self._tiles[key].tobytes(), _LEVEL)
+        content, crc = self._stored(key)
+        unpack_tile(content, crc, num_bytes=self._tile_bytes, path=self._path)
+        return content
+
+    def _stored(self, key: TileKey) -> tuple[bytes, int]:
+        """Compressed states and checksum of a tile that has been written or spilled."""
+        if key in self._spill.places:
+            return self._spill.read(key)
+        assert self._mapped is not None
+        offset, length, crc = self._file_places[key]
+        content = self._mapped[offset : offset + length]
+        self._mapped_bytes += length
+        if self._mapped_bytes > _MAPPED_BYTES and hasattr(mmap, "MADV_DONTNEED"):
+            self._mapped.madvise(mmap.MADV_DONTNEED)
+            self._mapped_bytes = 0
+        return content, crc
+
+    def _load(self, key: TileKey) -> Tile | None:
+        """Read a tile that is not in memory."""
+        if key not in self._spill.places and key not in self._file_places:
+            return None
+        content, crc = self._stored(key)
+        states = unpack_tile(content, crc, num_bytes=self._tile_bytes, path=self._path)
+        return np.frombuffer(states, dtype=self.dtype).reshape(self.shape)
+
+    def _keep(self, key: TileKey, tile: Tile) -> None:
+        """Add a tile to those in memory, from which the least recently used one leaves."""
+        while len(self._tiles) >= self._most_tiles:
+            oldest = next(iter(self._tiles))
+            if oldest in self._changed:
+                content = zlib.compress(self._tiles[oldest].tobytes(), _LEVEL)
+                self._spill.write(oldest, content)
+                self._changed.discard(oldest)
+            del self._tiles[oldest]
+        self._tiles[key] = tile
+
+
+class _SpillFile:
+    """Temporary file of compressed tiles, without a name, which the system removes."""
+
+    def __init__(self) -> None:
+        self.places: dict[TileKey, TilePlace] = {}
+        self._file: IO[bytes] | None = None
+        self._end = 0
+        self._used_bytes = 0
+        self._process = os.getpid()
+
+    def write(self, key: TileKey, content: bytes) -> None:
+        """Write a tile; a later one replaces it."""
+        self._require_process()
+        if self._end - self._used_bytes > max(_WASTED_BYTES, self._used_bytes):
+            self._compact()
+        if key in self.places:
+            self._used_bytes -= self.places[key][1]
+        self._append(key, content)
+
+    def read(self, key: TileKey) -> tuple[bytes, int]:
+        """Return a tile and its checksum."""
+        self._require_process()
+        offset, length, crc = self.places[key]
+        assert self._file is not None
+        self._file.seek(offset)
+        return self._file.read(length), crc
+
+    def clear(self) -> None:
+        """Remove all tiles."""
+        if self._file is not None:
+            self._file.close()
+        self._file = None
+        self.places = {}
+        self._end = 0
+        self._used_bytes = 0
+
+    def _require_process(self) -> None:
+        """Require the process that made the prior: a fork shares the position in the file."""
+        if self._process != os.getpid():
+            raise WorkError(
+                "a map prior with changes belongs to the process that made it: save it, and load "
+                "the file in the other process."
+            )
+
+    def _append(self, key: TileKey, content: bytes) -> None:
+        if self._file is None:
+            self._file = tempfile.TemporaryFile()  # noqa: SIM115
+        self._file.seek(self._end)
+        self._file.write(content)
+        self.places[key] = (self._end, len(content), zlib.crc32(content))
+        self._end += len(content)
+        self._used_bytes += len(content)
+
+    def _compact(self) -> None:
+        """Write the current tiles to a new temporary file."""
+        old_file = self._file
+        old_places = self.places
+        assert old_file is not None
+        self._file = None
+        self.clear()
+        for key, (offset, length, _) in old_places.items():
+            old_file.seek(offset)
+            self._append(key, old_file.read(length))
+        old_file.close()
