@@ -43,7 +43,7 @@ class MapPrior:
         rule: Rule of writing; `HitMissCounts` by default. `LastSeen` and `KeepMaximum` are those of
             HRMapNet (arXiv 2409.00620).
         memory_bytes: Largest size of the tiles in memory; a tile of three classes has 120 kB, with
-            `HitMissCounts` 480 kB.
+            `HitMissCounts` 240 kB.
     """
 
     def __init__(
@@ -56,9 +56,7 @@ class MapPrior:
         self.rule: WriteRule = HitMissCounts() if rule is None else rule
         side = settings.tile_cells
         num_classes = len(settings.classes)
-        self._tiles = TileStore(
-            (self.rule.num_states, num_classes, side, side), self.rule.dtype, memory_bytes
-        )
+        self._tiles = TileStore((self.rule.num_states, num_classes, side, side), memory_bytes)
         self._lock = threading.RLock()
         self._owner: IO[str] | None = None
         self._owned_path: Path | None = None
@@ -279,7 +277,7 @@ class MapPrior:
         """Copy the tiles of a window to one raster. (S, C, height, width)"""
         num_states, num_classes = self._tiles.shape[:2]
         shape = (num_states, num_classes, window.height, window.width)
-        canvas = np.full(shape, self.rule.empty, dtype=self.rule.dtype)
+        canvas = np.full(shape, self.rule.empty, dtype=np.uint8)
         for part in window.parts(self.settings.tile_cells):
             tile = self._tiles.get(part.key)
             if tile is not None:

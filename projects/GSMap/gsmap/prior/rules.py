@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from gsmap.utils.errors import InputError
 
 Floats = NDArray[np.float32]
-States = NDArray[Any]
+States = NDArray[np.uint8]
 
 
 class WriteRule:
@@ -18,13 +18,11 @@ class WriteRule:
     A subclass is a dataclass whose fields are numbers, which the file of a prior stores.
 
     Attributes:
-        num_states: Number S of stored numbers per cell and class.
-        dtype: Type of a stored number.
+        num_states: Number S of stored numbers (uint8) per cell and class.
         empty: Stored number of a cell that has never been in view.
     """
 
     num_states: ClassVar[int] = 1
-    dtype: ClassVar[np.dtype[Any]] = np.dtype(np.uint8)
     empty: ClassVar[int] = 0
 
     def update(self, states: States, values: Floats) -> States:
@@ -112,11 +110,11 @@ class HitMissCounts(WriteRule):
 
     A frame with a cell in view multiplies both counts by ``decay`` and adds p to the hits and 1 - p
     to the misses. The value of a cell is hits / (hits + misses + prior_count). Cells that are out
-    of view or occluded keep their counts.
+    of view or occluded keep their counts. Counts are stored in 255ths of 1 / (1 - decay), their
+    upper bound. They are rounded; a count to which nothing is added is rounded down, so it falls.
 
     Args:
-        decay: Factor of older counts at each view, in [0.5, 0.999]; their sum stays below
-            1 / (1 - decay).
+        decay: Factor of older counts at each view, in [0.5, 0.98].
         prior_count: Pseudo-count of misses, in [0.01, 100]: a single hit has the value
             1 / (1 + prior_count).
 
@@ -125,28 +123,27 @@ class HitMissCounts(WriteRule):
     """
 
     num_states: ClassVar[int] = 2  # hits, misses
-    dtype: ClassVar[np.dtype[Any]] = np.dtype("<u2")
     decay: float = 0.95
     prior_count: float = 0.25
 
     def __post_init__(self) -> None:
-        if not 0.5 <= self.decay <= 0.999:
-            raise InputError(f"decay must be in [0.5, 0.999], got {self.decay}.")
+        if not 0.5 <= self.decay <= 0.98:
+            raise InputError(f"decay must be in [0.5, 0.98], got {self.decay}.")
         if not 0.01 <= self.prior_count <= 100:
             raise InputError(f"prior_count must be in [0.01, 100], got {self.prior_count}.")
 
     @property
     def _unit(self) -> np.float32:
-        """Stored number of one view; the largest possible sum of both counts is 65535."""
-        return np.float32(65535 * (1 - self.decay))
+        """Stored number of one view."""
+        return np.float32(255 * (1 - self.decay))
 
     def update(self, states: States, values: Floats) -> States:
         """Update cells that are in view. (S, C, n), (C, n) -> (S, C, n)"""
-        new = states * np.float32(self.decay)
-        new[0] += self._unit * values
-        new[1] += self._unit * (1 - values)
-        np.rint(new, out=new)
-        return np.minimum(new, 65535, out=new).astype(self.dtype)
+        added = np.stack([values, 1 - values])
+        counts = states * np.float32(self.decay)
+        counts += self._unit * added
+        counts += np.float32(0.5) * (added > 0)
+        return counts.astype(np.uint8)
 
     def read(self, states: States) -> Floats:
         """Convert states to values in [0, 1]. (S, C, ...) -> (C, ...)"""

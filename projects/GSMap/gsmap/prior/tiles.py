@@ -7,7 +7,7 @@ import zlib
 from collections import OrderedDict
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gsmap.prior.file_format import TileKey, TilePlace, unpack_tile
 from gsmap.utils.errors import WorkError
 
-Tile = NDArray[Any]
+Tile = NDArray[np.uint8]
 _LEVEL = 1  # of zlib; higher levels save little on sparse rasters
 _MAPPED_BYTES = 32 << 20  # read from the mapped file before its pages are released
 _WASTED_BYTES = 64 << 20  # of the temporary file before it is written again
@@ -28,14 +28,12 @@ class TileStore:
 
     Args:
         shape: Shape of a tile.
-        dtype: Type of its states.
         memory_bytes: Largest size of the tiles in memory, at least one tile.
     """
 
-    def __init__(self, shape: tuple[int, ...], dtype: np.dtype[Any], memory_bytes: int) -> None:
+    def __init__(self, shape: tuple[int, ...], memory_bytes: int) -> None:
         self.shape = shape
-        self.dtype = dtype
-        self._tile_bytes = int(np.prod(shape)) * dtype.itemsize
+        self._tile_bytes = int(np.prod(shape))
         self._most_tiles = max(1, memory_bytes // self._tile_bytes)
         self._tiles: OrderedDict[TileKey, Tile] = OrderedDict()
         self._changed: set[TileKey] = set()
@@ -85,7 +83,7 @@ class TileStore:
         """Return a tile that the caller changes at once; a new one has ``empty`` everywhere."""
         tile = self.get(key)
         if tile is None:
-            tile = np.full(self.shape, empty, dtype=self.dtype)
+            tile = np.full(self.shape, empty, dtype=np.uint8)
             self._keep(key, tile)
         self._changed.add(key)
         return tile
@@ -132,7 +130,7 @@ class TileStore:
             return None
         content, crc = self._stored(key)
         states = unpack_tile(content, crc, num_bytes=self._tile_bytes, path=self._path)
-        return np.frombuffer(states, dtype=self.dtype).reshape(self.shape)
+        return np.frombuffer(states, dtype=np.uint8).reshape(self.shape)
 
     def _keep(self, key: TileKey, tile: Tile) -> None:
         """Add a tile to those in memory, from which the least recently used one leaves."""
