@@ -66,14 +66,11 @@ class Twin:
         if isinstance(self.rule, LastSeen):
             new = max(old, int(100 + 30 * p)) if p > 0 else max(old, 100) - 1
             return min(max(new, 2), 240)
-        new = [
-            round(count * 15 / 16 + 255 / 16 * part)
-            for count, part in zip(old, (p, 1 - p), strict=True)
-        ]
-        return [
-            min(count, max(before - 1, 0)) if part == 0 else count
-            for count, before, part in zip(new, old, (p, 1 - p), strict=True)
-        ]
+        counts = []
+        for count, part in zip(old, (p, 1 - p), strict=True):
+            exact = count * 15 / 16 + 255 / 16 * part
+            counts.append(math.floor(exact + 0.5) if part else math.floor(exact))
+        return tuple(counts)
 
     def value(self, state):
         if isinstance(self.rule, KeepMaximum):
