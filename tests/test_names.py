@@ -82,7 +82,7 @@ def test_a_name_that_is_nowhere_is_an_attribute_error():
 
 
 def test_every_name_of_every_table_exists():
-    for room in ("apis", "datasets", "evaluation", "models", "ops", "structures"):
+    for room in ("apis", "datasets", "evaluation", "models", "ops", "prior", "structures"):
         module = importlib.import_module(f"gsmap.{room}")
         assert all(getattr(module, name) for name in module.__all__)
 
