@@ -218,6 +218,9 @@ def test_meta_refuses_bad_values():
         AnnotationMeta("x", "ego", "val", classes=[f"class {i}" for i in range(1001)])
     with pytest.raises(ValueError, match="dataset must be a text"):
         AnnotationMeta(3, "ego", "val")
+    for dim in (4, 2.0, True, "2"):
+        with pytest.raises(ValueError, match=f"dim must be 2 or 3, got {dim!r}"):
+            AnnotationMeta("x", "ego", "val", dim=dim)
 
 
 def test_a_full_disk_leaves_the_old_file_alone(tmp_path: Path):
