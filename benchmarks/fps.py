@@ -81,7 +81,7 @@ def frame_cost(path: str, args: argparse.Namespace, cuda_graphs: bool = False) -
 def _replayed_frame_cost(
     model: Any, inputs: dict[str, Tensor], samples: list[Any], args: argparse.Namespace
 ) -> Cost:
-    """Measure frames that are replayed, from pixels on the GPU to samples on the host."""
+    """Measure frames replayed as CUDA graphs, from pixels on the GPU to samples on the host."""
     if args.fp16:
         model.halve_backbone()
     device = torch.device(args.device)

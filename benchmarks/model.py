@@ -197,7 +197,7 @@ def model_and_batch(
 
 
 def drive_on(samples: Sequence[Det3DDataSample]) -> None:
-    """Advance samples by half a second and 4 m, in place, so that models with memory use theirs."""
+    """Advance samples by half a second and 4 m, in place, for models with memory."""
     step = rigid(np.eye(3), [0.0, 4.0, 0.0])
     for sample in samples:
         sample.set_metainfo(

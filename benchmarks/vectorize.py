@@ -18,10 +18,12 @@ FULL_SIZE = (200, 400)  # size of nuScenes' maps in the paper
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``benchmarks vectorize`` to a parser."""
-    parser.add_argument("config", help="of a model whose head is HDMapNetHead")
+    parser.add_argument("config", help="config of a model with an HDMapNetHead")
     parser.add_argument("checkpoint")
-    parser.add_argument("truth", type=Path, help="annotation file, of which the images are taken")
-    parser.add_argument("--data-root", help="folder of the images; that of the file by default")
+    parser.add_argument("truth", type=Path, help="annotation file; its images are used")
+    parser.add_argument(
+        "--data-root", help="folder of the images; default: the folder of the annotation file"
+    )
     parser.add_argument("--samples", type=int, default=100)
 
 

@@ -218,7 +218,8 @@ def drive_map(rows: Iterable[tuple[int, FloatArray, float]], scored: bool = True
         polylines.append(line)
         labels.append(label)
         scores.append(score)
-    return MapElements.from_polylines(polylines, labels=labels, scores=scores if scored else None)
+    map_scores = scores if scored else None
+    return MapElements.from_polylines(polylines, labels=labels, scores=map_scores)
 
 
 def _order_in_map(row: tuple[int, FloatArray, float]) -> tuple[float, ...]:

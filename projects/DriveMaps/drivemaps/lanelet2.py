@@ -49,7 +49,8 @@ def write_lanelet2(
     file = _OSMFile(origin)
     for line, label, _ in elements.rows:
         is_ring = len(line) > 3 and bool((line[0] == line[-1]).all())
-        nodes = file.add_nodes(line[:-1] if is_ring else line)
+        vertices = line[:-1] if is_ring else line
+        nodes = file.add_nodes(vertices)
         name = classes[label]
         tags = {"type": TYPES.get(name, name), "class": name}
         if is_ring and name in AREA_CLASSES:

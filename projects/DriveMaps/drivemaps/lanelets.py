@@ -226,7 +226,8 @@ def _orient_lines(lines: Sequence[FloatArray], pieces: Sequence[FloatArray]) -> 
         cosines = (_directions(samples)[rows] * neighbour_directions).sum(axis=1)
         is_parallel = np.abs(cosines) > _MIN_PARALLEL_COSINE
         votes = np.sign(cosines[is_parallel]).sum()
-        oriented.append(line[::-1] if votes < 0 else line)
+        is_opposite = votes < 0
+        oriented.append(line[::-1] if is_opposite else line)
     return oriented
 
 

@@ -100,7 +100,8 @@ def _join_chain(
         entry = following
         visited.add(entry // 2)
         line = lines[entry // 2]
-        parts.append(line if entry % 2 == 0 else line[::-1])
+        starts_at_first = entry % 2 == 0
+        parts.append(line if starts_at_first else line[::-1])
         following = partner_of.get(entry ^ 1)
         if following == start:
             parts.append(parts[0][:1])

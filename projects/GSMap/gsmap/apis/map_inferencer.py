@@ -186,7 +186,7 @@ class MapInferencer:
         source: str | Path | Source | Sequence[MapSample],
         data_root: str | Path | None = None,
     ) -> "VectorizedMapDataset":
-        """Open samples as the test data set of the config, with its pipeline.
+        """Create the test data set of the config, with its pipeline, from other samples.
 
         Samples in another annotation frame are transformed to the config's. If the samples have no
         camera of the config, all of their cameras are used.
@@ -423,8 +423,8 @@ class MapInferencer:
             The sample with ``pred_instances_3d``, in the annotation frame of the config.
 
         Raises:
-            TypeError: As `LiveMap.predict`.
-            ValueError: As `LiveMap.predict`.
+            TypeError: As in `LiveMap.predict`.
+            ValueError: As in `LiveMap.predict`.
         """
         live = self.live(
             intrinsics,

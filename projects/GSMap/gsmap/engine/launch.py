@@ -148,8 +148,8 @@ def load_config(args: argparse.Namespace) -> Config:
         args: Parsed arguments; ``config`` and the options of `add_common_arguments` are used.
 
     Raises:
-        FileNotFoundError: As `read_config`.
-        ValueError: As `read_config` and `check_config`.
+        FileNotFoundError: As in `read_config`.
+        ValueError: As in `read_config` and `check_config`.
     """
     os.environ.setdefault("LOCAL_RANK", str(args.local_rank))
     cfg = read_config(args.config, cfg_options=args.cfg_options)
