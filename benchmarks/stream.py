@@ -44,7 +44,8 @@ def state_bytes(config: str, options: list[str]) -> dict[str, int]:
     Raises:
         ValueError: If the model has no memory.
     """
-    cfg = read_config(config, parse_options(options) if options else None)
+    cfg_options = parse_options(options) if options else None
+    cfg = read_config(config, cfg_options)
     if cfg.model.get("img_backbone"):
         cfg.model.img_backbone.init_cfg = None
     with building(cfg):

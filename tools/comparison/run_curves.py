@@ -278,10 +278,12 @@ def summary_table(runs: Sequence[RunLog]) -> str:
             row += [f"{steps[-1]:g}", f"{loss[0]:.3g}", f"{loss[-1]:.3g}"]
         else:
             row += ["-", "-", "-"]
-        row.append(f"{np.median(seconds):.3g}" if len(seconds) else "-")
+        median = f"{np.median(seconds):.3g}" if len(seconds) else "-"
+        row.append(median)
         for name in names:
             _, values = run.series(name, validation=True)
-            row.append(f"{values[-1]:.4g} / {values.max():.4g}" if len(values) else "-")
+            last_and_best = f"{values[-1]:.4g} / {values.max():.4g}" if len(values) else "-"
+            row.append(last_and_best)
         rows.append(row)
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     rows.insert(1, ["-" * width for width in widths])

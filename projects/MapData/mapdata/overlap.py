@@ -113,8 +113,10 @@ def nearest_by_map(train: _ByMap, val: _ByMap) -> dict[str, tuple[np.ndarray, np
     nearest = {}
     for name, positions in val.items():
         if len(positions):
-            has_training = len(train.get(name, ())) > 0
-            tree = cKDTree(train[name] if has_training else np.empty((0, 2)))
+            train_positions = train.get(name, ())
+            if len(train_positions) == 0:
+                train_positions = np.empty((0, 2))
+            tree = cKDTree(train_positions)
             nearest[name] = tree.query(positions)
     return nearest
 

@@ -274,7 +274,8 @@ def _run_scenes(
     Returns:
         Records of each scene by table, by scene name.
     """
-    workers = min(default_workers() if workers is None else max(workers, 1), len(tasks))
+    wanted_workers = default_workers() if workers is None else max(workers, 1)
+    workers = min(wanted_workers, len(tasks))
     make = partial(_make_scene, root, config, towns)
     results = ordered_map(make, tasks, workers, timeout_s=7200.0)
     images_per_scene = len(CAMERAS) * config.samples_per_scene

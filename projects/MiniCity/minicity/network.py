@@ -61,7 +61,8 @@ def make_nodes(side: int, seed: int, name: str) -> list[Node]:
         for step in STEPS:
             other = cell + step
             inside = bool(np.all(other >= 0) and np.all(other < side))
-            neighbours.append(int(other[0] + side * other[1]) if inside else None)
+            node = int(other[0] + side * other[1])
+            neighbours.append(node if inside else None)
         turn_rad = float(rng.uniform(low=-0.3, high=0.3))
         nodes.append(Node(position, turn_rad, neighbours))
     _remove_streets(nodes, rng)

@@ -143,7 +143,8 @@ def render_camera(
 def _shade_under(image: Image, camera: Camera, vehicles: list[Vehicle], lighting: Lighting) -> None:
     """Darken the ground under vehicles and in their shadows, in place."""
     mask: Image | None = None
-    shade = 255 * (LIGHT_IN_SHADOW if lighting.shadow > 0 else LIGHT_UNDER_VEHICLES)
+    light = LIGHT_IN_SHADOW if lighting.shadow > 0 else LIGHT_UNDER_VEHICLES
+    shade = 255 * light
     forward = camera.cam_from_world[2, :3]
     for vehicle in vehicles:
         sight = vehicle.center - camera.center

@@ -314,8 +314,9 @@ def _draw_building(
     depth = float(rng.uniform(low=8, high=12))
     center = road.point(at_m, front_offset_m + np.sign(front_offset_m) * depth / 2)
     footprint = rectangle(center, road.direction(at_m), length_m=front_m, width_m=depth)
-    low = rng.random() < 0.6
-    height = float(rng.uniform(low=4, high=9) if low else rng.uniform(low=9, high=22))
+    is_low = rng.random() < 0.6
+    lowest, highest = (4, 9) if is_low else (9, 22)
+    height = float(rng.uniform(low=lowest, high=highest))
     shade = float(rng.uniform(low=0.75, high=1.15))
     blue, green, red = WALLS[int(rng.integers(len(WALLS)))]
     return Building(footprint, height, color=(blue * shade, green * shade, red * shade))

@@ -130,13 +130,18 @@ def _add_blank_cameras(item: dict[str, Any], cameras: Sequence[str]) -> dict[str
     all_images: list[torch.Tensor] = []
     all_paths: list[Any] = []
     for index in indices:
-        all_images.append(torch.zeros_like(images[0]) if index is None else images[index])
-        all_paths.append(None if index is None else meta["img_path"][index])
+        if index is None:
+            all_images.append(torch.zeros_like(images[0]))
+            all_paths.append(None)
+        else:
+            all_images.append(images[index])
+            all_paths.append(meta["img_path"][index])
     metainfo: dict[str, Any] = {"img_path": all_paths, "cam_names": list(cameras)}
     for key, blank_matrix in blank_matrices.items():
         matrices: list[np.ndarray] = []
         for index in indices:
-            matrices.append(blank_matrix if index is None else meta[key][index])
+            matrix = blank_matrix if index is None else meta[key][index]
+            matrices.append(matrix)
         metainfo[key] = np.stack(matrices)
     sample.set_metainfo(metainfo)
     inputs = {**item["inputs"], "img": torch.stack(all_images)}

@@ -53,7 +53,8 @@ class MapRunner(Runner):
     def dump_config(self) -> None:
         """Write the complete config to the work folder, unless it would replace its source."""
         source = self.cfg.filename and Path(self.cfg.filename)
-        target = Path(self.work_dir, source.name if source else f"{self.timestamp}.py")
+        name = source.name if source else f"{self.timestamp}.py"
+        target = Path(self.work_dir, name)
         if source and target.exists() and source.exists() and target.samefile(source):
             self.logger.info(f"{target} stays as it is; the whole config is in {self.log_dir}.")
             return

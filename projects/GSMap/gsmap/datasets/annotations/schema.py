@@ -124,7 +124,8 @@ def _flatten(value: Any, name: str, dim: int, where: str) -> np.ndarray:
         raise InputError(
             f"{where}{name} must be numbers {wanted}, got {array.dtype} {array.shape}."
         )
-    return array.astype(np.float64 if name in _SHAPES else np.float32).reshape(-1)
+    dtype = np.float64 if name in _SHAPES else np.float32
+    return array.astype(dtype).reshape(-1)
 
 
 def batch_of(rows: Sequence[dict[str, Any]], schema: pa.Schema) -> pa.RecordBatch:

@@ -70,7 +70,9 @@ class LoadCameraImages(BaseTransform):
         for image in images:
             if image.shape[:2] != shape:
                 image = mmcv.impad(image, shape=shape)
-            results["img"].append(image.astype(np.float32) if converts else image)
+            if converts:
+                image = image.astype(np.float32)
+            results["img"].append(image)
         results["to_float32"] = self.to_float32
         results["raw_shapes"] = raw_shapes
         if self.on_device:
