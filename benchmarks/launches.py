@@ -1,8 +1,9 @@
-"""Launches and waits of a GPU in a frame and in a training step, by part, counted without one.
+"""Launches and waits in a frame and in a training step by part, counted without a GPU.
 
-A launch costs a GPU's host some 20 microseconds for any kernel, and the GPU is idle during a wait.
-Neither depends on the size of images. A step is mmengine's, with optimizer, gradient clipping and
-figures; gradients count for the part that they belong to. See `benchmarks.pretended_gpu`.
+The launch of a kernel takes about 20 microseconds of the host, and the GPU is idle during a wait.
+Their numbers do not depend on the size of images. A step is mmengine's, with optimizer, gradient
+clipping and the collection of figures (losses and statistics) for the log. The backward pass of a
+part counts for this part. See `benchmarks.pretended_gpu`.
 """
 
 import argparse
@@ -44,13 +45,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``benchmarks launches`` to a parser."""
     parser.add_argument("configs", nargs="+")
     parser.add_argument("--size", type=int, nargs=2, metavar=("H", "W"), default=(96, 160))
-    parser.add_argument("--own-size", action="store_true", help="images as large as the config's")
-    parser.add_argument("--batch", type=int, default=4, help="samples of a step")
-    parser.add_argument("--waits", action="store_true", help="list the lines that wait")
+    parser.add_argument("--own-size", action="store_true", help="use the image size of the config")
+    parser.add_argument("--batch", type=int, default=4, help="number of samples of a step")
+    parser.add_argument(
+        "--waits", action="store_true", help="list the lines of code that cause waits"
+    )
 
 
 def run(args: argparse.Namespace) -> None:
-    """Count and print a step and a frame of every config.
+    """Count and print the launches and waits of a step and of a frame of every config.
 
     Args:
         args: Parsed options of ``add_arguments``.
@@ -60,16 +63,18 @@ def run(args: argparse.Namespace) -> None:
     """
     if not available():
         raise WorkError(
-            f"torch {torch.__version__} has no backends in Python: use a newer one, such as 2.13."
+            f"torch {torch.__version__} cannot run backends that are written in Python: use a "
+            "newer version, such as 2.13."
         )
     size = None if args.own_size else tuple(args.size)
     for path in args.configs:
         trial = Trial(path, size, batch=args.batch)
         with trial.gpu:
-            for name, count in ((f"a step of {args.batch}", trial.step), ("a frame", trial.frame)):
-                count()
-                count()  # the first call makes constants and state
-                print(f"{path}, {name}\n\n{_table(trial.gpu, args.waits)}")
+            calls = {f"a step of {args.batch}": trial.step, "a frame": trial.frame}
+            for name, call in calls.items():
+                call()  # also creates constants and states, so its counts are discarded
+                call()
+                print(f"{path}, {name}\n\n{_table(trial.gpu, with_waits=args.waits)}")
 
 
 class Trial:
@@ -77,11 +82,11 @@ class Trial:
 
     Args:
         config: Config file, or a config.
-        size: Rows and columns of the images; None for the config's.
-        batch: Samples of a step.
+        size: Rows and columns of the images; None for the size in the config.
+        batch: Number of samples of a step.
 
     Attributes:
-        gpu: Counts of the last step or frame; to be entered around ``step`` and ``frame``.
+        gpu: Counts of the last step or frame. Call ``step`` and ``frame`` in its context.
         model: The model.
     """
 
@@ -90,17 +95,18 @@ class Trial:
         self.model, inputs, self.samples = models.model_and_batch(config, options, batch=batch)
         self.inputs: dict[str, Any] = {}
         if self.model.bev_encoder is not None:
+            # An approximate inverse of the normalization.
             pixels = (inputs["imgs"] * 50 + 120).clamp(0, 255).to(torch.uint8)
             self.inputs["img"] = list(pixels)
         if self.model.lidar_encoder is not None:
-            scale = torch.tensor([20.0, 40.0, 2.0, 1.0, 0.0])
+            scale = torch.tensor([20.0, 40.0, 2.0, 1.0, 0.0])  # x, y, z in metres, intensity, time
             self.inputs["points"] = [(torch.rand(2000, 5) - 0.5) * scale for _ in range(batch)]
         self.settings = read_config(config).optim_wrapper
         self.gpu = PretendedGPU()
         self.wrapper: Any = None
 
     def step(self) -> dict[str, Any]:
-        """Count a training step; the first one includes the making of constants.
+        """Count the launches of a training step. The first step also creates constants.
 
         Returns:
             Figures of the step.
@@ -121,7 +127,7 @@ class Trial:
 
     @torch.no_grad()
     def frame(self) -> Any:
-        """Count a prediction of one sample; the first one includes the making of constants.
+        """Count the launches of the prediction of one sample. The first also creates constants.
 
         Returns:
             Sample with the prediction.
@@ -130,7 +136,7 @@ class Trial:
         self.model.eval()
         models.drive_on(self.samples)
         sample = self.samples[0].clone()
-        for name in sample.keys():  # noqa: SIM118  as a pipeline for tests packs it
+        for name in sample.keys():  # noqa: SIM118  samples of a test pipeline have no targets
             delattr(sample, name)
         self.gpu.clear()
         with self._count_parts():
@@ -143,12 +149,13 @@ class Trial:
 
     @contextmanager
     def _count_parts(self) -> Iterator[None]:
-        """Count methods of the model and of the optimizer as parts, inside the context."""
+        """Count launches by part: methods of the model and of the optimizer."""
         gpu = self.gpu
         with ExitStack() as stack:
             for attribute, method, part in PARTS:
                 owner: Any = self.model
-                for name in attribute.split(".") if attribute else ():
+                names = attribute.split(".") if attribute else []
+                for name in names:
                     owner = getattr(owner, name, None)
                 if owner is not None and hasattr(owner, method):
                     stack.enter_context(_run_inside(owner, method, partial(gpu.part, part)))
@@ -188,24 +195,24 @@ def _run_inside(
 
 
 def _table(gpu: PretendedGPU, with_waits: bool) -> str:
-    """Format the counts by part, and the lines that wait if ``with_waits``."""
+    """Format the counts by part, and the lines that cause waits if ``with_waits``."""
     launches: Counter[str] = Counter()
     waits: Counter[str] = Counter()
     names_by_part: dict[str, Counter[str]] = {}
-    for (part, name), times in gpu.launches.items():
-        launches[part] += times
-        names_by_part.setdefault(part, Counter())[name] += times
-    for (part, _, _), times in gpu.waits.items():
-        waits[part] += times
+    for (part, name), number in gpu.launches.items():
+        launches[part] += number
+        names_by_part.setdefault(part, Counter())[name] += number
+    for (part, _reason, _line), number in gpu.waits.items():
+        waits[part] += number
     rows = [["all", launches.total(), waits.total(), ""]]
-    for part, times in launches.most_common():
+    for part, num_launches in launches.most_common():
         most_common = names_by_part[part].most_common(4)
         names = ", ".join(f"{name} {number}" for name, number in most_common)
-        rows.append([part or "rest", times, waits[part], names])
+        rows.append([part or "rest", num_launches, waits[part], names])
     text = markdown_table(["part", "launches", "waits", "mostly"], rows)
     if with_waits:
         wait_rows = []
-        for (part, reason, line), times in gpu.waits.most_common():
-            wait_rows.append([times, part or "rest", reason, line])
+        for (part, reason, line), number in gpu.waits.most_common():
+            wait_rows.append([number, part or "rest", reason, line])
         text += "\n" + markdown_table(["waits", "part", "reason", "line"], wait_rows)
     return text

@@ -15,14 +15,18 @@ from gsmap.engine.launch import read_config
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``benchmarks step`` to a parser."""
     models.add_arguments(parser)
-    parser.add_argument("--batch", type=int, default=1)
+    parser.add_argument("--batch", type=int, default=1, help="number of samples of a step")
     parser.add_argument(
-        "--rasters", nargs="+", default=["200x100"], metavar="HxW", help="of GSMap's loss"
+        "--rasters",
+        nargs="+",
+        default=["200x100"],
+        metavar="HxW",
+        help="sizes of the raster of GSMap's loss",
     )
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure and print a step for every config and raster size.
+    """Measure and print the costs of a step for every config and raster size.
 
     Args:
         args: Parsed options of ``add_arguments``.
@@ -30,9 +34,10 @@ def run(args: argparse.Namespace) -> None:
     tasks: list[tuple[str, argparse.Namespace, str]] = []
     for path in args.configs:
         is_gsmap = "GSMap" in read_config(path).model.map_head.type
-        for raster in args.rasters if is_gsmap else [""]:
+        rasters = args.rasters if is_gsmap else [""]
+        for raster in rasters:
             tasks.append((path, args, raster))
-    costs = [cost for _, cost in models.measure_each(step_cost, tasks)]
+    costs = [cost for _path, cost in models.measure_each(step_cost, tasks)]
     device = torch.device(args.device)
     first_seconds = costs[0].time_s(device)
     first_peak = costs[0].peak_bytes
@@ -55,14 +60,14 @@ def run(args: argparse.Namespace) -> None:
 def step_cost(path: str, args: argparse.Namespace, raster: str = "") -> Cost:
     """Measure the training step of a config.
 
-    The step is mmengine's, from pixels on the host to new weights, with the config's optimizer,
-    gradient clipping and figures.
+    The step is mmengine's, from pixels on the host to new weights, with the optimizer and gradient
+    clipping of the config, and the collection of the losses and statistics for the log.
 
     Args:
         path: Config file.
         args: Parsed options of ``add_arguments``.
-        raster: Rows and columns of the raster of GSMap's loss, such as ``200x100``; empty for the
-            config's.
+        raster: Rows and columns of the raster of GSMap's loss, such as ``200x100``; empty for
+            the size in the config.
 
     Returns:
         Time and memory of a step.
@@ -72,12 +77,12 @@ def step_cost(path: str, args: argparse.Namespace, raster: str = "") -> Cost:
     wrapper = build_optim_wrapper(model, read_config(path, args.cfg_options).optim_wrapper)
     images = []
     for normalized in inputs["imgs"]:
-        pixels = (normalized * 50 + 120).clamp(0, 255)
+        pixels = (normalized * 50 + 120).clamp(0, 255)  # an approximate inverse
         images.append(pixels.to("cpu", torch.uint8))
     batch = [sample.cpu() for sample in samples]
 
     def step() -> None:
-        models.drive_on(batch)
+        models.drive_on(batch)  # a model with memory expects the next frame
         data = {
             "inputs": {"img": list(images)},
             "data_samples": [sample.clone() for sample in batch],

@@ -195,12 +195,12 @@ def require_own_samples(path: Path) -> None:
     Raises:
         ValueError: If the file is there and another command wrote it.
     """
-    from gsmap.apis.input_dataset import SAMPLES_BY
+    from gsmap.apis.input_dataset import INFERENCE_COMMAND
 
     if not path.exists():
         return
     with suppress(ValueError):  # not an annotation file
-        if AnnotationFile(path).meta.command == SAMPLES_BY:
+        if AnnotationFile(path).meta.command == INFERENCE_COMMAND:
             return
     raise InputError(
         f"{path} is there, and not from an earlier run of this command, which writes the samples "

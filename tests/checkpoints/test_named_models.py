@@ -106,7 +106,7 @@ def test_a_damaged_file_is_refused(tmp_path, monkeypatch):
     (tmp_path / "models").mkdir()
     (tmp_path / "models/gsmap_r18_minicity.pth").write_bytes(b"half")
     assert list_models() == ["gsmap_r18_minicity"]
-    with pytest.raises(ValueError, match=r"damaged or another file: its sha256"):
+    with pytest.raises(ValueError, match=r"damaged or belongs to another model: its sha256"):
         find_checkpoint("gsmap_r18_minicity")
 
 
@@ -120,8 +120,8 @@ def test_a_file_of_the_working_folder_does_not_stand_for_a_named_model(tmp_path,
         assert checkpoint_for(name, None) == shipped(f"models/{name}.pth")
         assert find_checkpoint(f"./{name}") == Path(name)
     assert said[0] == (
-        "gsmap_r18_minicity is the model of that name; the file of that name in the working "
-        "folder is ./gsmap_r18_minicity."
+        "gsmap_r18_minicity refers to the named model; for the file in the working folder write "
+        "./gsmap_r18_minicity."
     )
 
 
@@ -137,7 +137,7 @@ def test_a_file_without_a_known_digest_is_called_unverified_once(tmp_path, monke
     digest = hashlib.sha256(b"whole").hexdigest()
     assert said == [
         f"{tmp_path}/models/maptr_tiny_r50_24e.pth is not verified: github.com/hustvl/MapTR gives "
-        f"no sha256 for maptr_tiny_r50_24e; that of this file is {digest}."
+        f"no sha256 for maptr_tiny_r50_24e; the sha256 of this file is {digest}."
     ]
 
 

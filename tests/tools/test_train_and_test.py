@@ -234,7 +234,7 @@ def test_a_missing_checkpoint_is_named(tiny_config):
     shipped = [name for name in names if (REPO / f"models/{name}.pth").is_file()]
     assert done.stderr == (
         "error: There is no checkpoint nowhere.pth, and no model of that name "
-        f"({', '.join(shipped)} ship).\n"
+        f"(the shipped models are {', '.join(shipped)}).\n"
     )
 
 

@@ -1,7 +1,7 @@
 """Draw a sample and the map around it with the nuScenes devkit.
 
-The devkit draws polygons with ``descartes``, whose last release is older than shapely 2 and expects
-rings as arrays; `repair_descartes` replaces that part.
+The devkit draws polygons with ``descartes``. Its last release is older than shapely 2 and expects
+rings as arrays, so `repair_descartes` replaces its conversion of polygons.
 """
 
 import argparse
@@ -24,8 +24,10 @@ RADIUS_M = 75.0
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``python -m minicity draw`` to a parser."""
     parser.add_argument("root", help="folder of the data set")
-    parser.add_argument("--out", type=Path, default=Path("work_dirs/minicity"), help="for pictures")
-    parser.add_argument("--sample", type=int, default=0, help="number of the key frame")
+    parser.add_argument(
+        "--out", type=Path, default=Path("work_dirs/minicity"), help="folder of the pictures"
+    )
+    parser.add_argument("--sample", type=int, default=0, help="number of the key frame, from 0")
 
 
 def run(arguments: argparse.Namespace) -> str:
@@ -39,7 +41,7 @@ def run(arguments: argparse.Namespace) -> str:
 
     Raises:
         FileNotFoundError: If there is no data set.
-        ValueError: If there is no such key frame.
+        ValueError: If the number of the key frame is out of range.
     """
     if not Path(arguments.root, VERSION).is_dir():
         raise FileNotFoundError(
@@ -59,7 +61,8 @@ def run(arguments: argparse.Namespace) -> str:
     sample = nusc.sample[arguments.sample]
     nusc.render_sample(sample["token"], out_path=str(out / "sample.png"), verbose=False)
     nusc.render_pointcloud_in_image(sample["token"], out_path=str(out / "lidar.png"), verbose=False)
-    log = nusc.get("log", nusc.get("scene", sample["scene_token"])["log_token"])
+    scene = nusc.get("scene", sample["scene_token"])
+    log = nusc.get("log", scene["log_token"])
     lidar = nusc.get("sample_data", sample["data"]["LIDAR_TOP"])
     x, y, _ = nusc.get("ego_pose", lidar["ego_pose_token"])["translation"]
     patch = (x - RADIUS_M, y - RADIUS_M, x + RADIUS_M, y + RADIUS_M)
@@ -78,12 +81,12 @@ def polygon_path(polygon: Polygon | MultiPolygon) -> Outline:
                 rings.append(np.asarray(ring.coords)[:, :2])
     if not rings:
         return Outline(np.zeros((0, 2)))
-    codes = []
+    codes = []  # how matplotlib reaches each vertex
     for ring in rings:
-        code = np.full(len(ring), Outline.LINETO, dtype=Outline.code_type)
-        code[0] = Outline.MOVETO
-        codes.append(code)
-    return Outline(np.concatenate(rings), np.concatenate(codes))
+        ring_codes = np.full(len(ring), Outline.LINETO, dtype=Outline.code_type)
+        ring_codes[0] = Outline.MOVETO
+        codes.append(ring_codes)
+    return Outline(np.concatenate(rings), codes=np.concatenate(codes))
 
 
 def repair_descartes() -> None:

@@ -34,9 +34,12 @@ from minicity.traffic import Actor, Drive, make_actors, plan_ego
 from minicity.vehicles import Vehicle
 
 SAMPLE_PERIOD_S = 0.5
-GROUND_MARGIN_M = 48.0
-BOX_REACH_M = 55.0
-BOX_SLACK_M = 0.05
+SCENE_PERIOD_US = 60_000_000  # between the starts of two scenes
+GROUND_MARGIN_M = 48.0  # ground beyond the drive
+BUILDING_REACH_M = 130.0  # distance of visible buildings from the drive
+PLANT_REACH_M = 90.0  # distance of visible trees and poles from the drive
+BOX_REACH_M = 55.0  # distance of annotated objects from the LiDAR
+BOX_SLACK_M = 0.05  # added to a box on each side
 JPEG_QUALITY = 90
 FIRST_TIMESTAMP_US = 1_600_000_000_000_000
 Records = dict[str, list[dict[str, Any]]]
@@ -47,7 +50,7 @@ class SceneTask:
     """Description of a scene to make.
 
     Attributes:
-        name: Official nuScenes scene name, which decides the split.
+        name: Official scene name of nuScenes, whose split the scene is in.
         index: Number of the scene in the data set.
         location: Name of the town.
         index_in_town: Number of the scene within its town.
@@ -85,11 +88,11 @@ class SceneMaker:
             town, self.ego, duration_s=self.duration_s, rng=self._rng("traffic")
         )
         self.renderer = self._make_renderer()
-        self.walls = footprint_array(
+        self.building_boxes = footprint_array(
             footprints=[building.footprint for building in town.buildings],
             heights=[building.height_m for building in town.buildings],
         )
-        self.tilt_rad = self._rng("tilt").uniform(low=0, high=2 * np.pi, size=2)
+        self.tilt_phases_rad = self._rng("tilt").uniform(low=0, high=2 * np.pi, size=2)
 
     def _rng(self, *parts: object) -> np.random.Generator:
         """Random generator for a part of the scene."""
@@ -104,17 +107,20 @@ class SceneMaker:
 
     def _make_renderer(self) -> SceneRenderer:
         """Lay out the ground and the objects around the drive."""
+        # The cameras of the first key frame are exposed before time 0.
         times = np.linspace(-0.1, self.duration_s, num=12).tolist()
         track = np.array([self.ego.pose(t)[:2] for t in times])
         xmin, ymin = (track.min(axis=0) - GROUND_MARGIN_M).tolist()
         xmax, ymax = (track.max(axis=0) + GROUND_MARGIN_M).tolist()
         bounds = (xmin, ymin, xmax, ymax)
         mesh, shadows = _make_surroundings(self.town, track, lighting=self.lighting)
+        # Small pictures need no fine ground: 6.25 cm for 800 columns.
+        resolution_m = np.clip(0.0625 * 800 / self.config.image_width, 0.05, 0.09)
         return SceneRenderer(
             make_scene_map(self.town, bounds),
             bounds=bounds,
             lighting=self.lighting,
-            resolution_m=float(np.clip(0.0625 * 800 / self.config.image_width, 0.05, 0.09)),
+            resolution_m=float(resolution_m),
             rng=self._rng("ground"),
             static=mesh,
             shadows=shadows,
@@ -123,8 +129,9 @@ class SceneMaker:
     def ego_pose(self, time_s: float) -> Array:
         """Pose of the car at a time in seconds, with slight pitch and roll. (4, 4)"""
         x, y, yaw = self.ego.pose(time_s)
-        pitch = 0.004 * np.sin(2.1 * time_s + self.tilt_rad[0])
-        roll = 0.003 * np.sin(1.3 * time_s + self.tilt_rad[1])
+        # Amplitudes in radians, frequencies in radians per second.
+        pitch = 0.004 * np.sin(2.1 * time_s + self.tilt_phases_rad[0])
+        roll = 0.003 * np.sin(1.3 * time_s + self.tilt_phases_rad[1])
         return world_from_ego(x, y, yaw=yaw, pitch=float(pitch), roll=float(roll))
 
     def make(self) -> Records:
@@ -150,7 +157,7 @@ class SceneMaker:
             )
             for mount in CAMERAS:
                 self._take_picture(k, mount)
-            cloud = self._sweep(k, 0)
+            cloud = self._sweep(k, j=0)
             self._annotate(k, cloud)
             if k < last:
                 for j in range(1, self.config.sweeps_per_sample + 1):
@@ -165,7 +172,7 @@ class SceneMaker:
 
     def timestamp_us(self, time_s: float) -> int:
         """Timestamp of nuScenes, in microseconds, of a time in seconds since the scene's start."""
-        return FIRST_TIMESTAMP_US + self.task.index * 60_000_000 + round(time_s * 1e6)
+        return FIRST_TIMESTAMP_US + self.task.index * SCENE_PERIOD_US + round(time_s * 1e6)
 
     def _add_scene(self) -> None:
         """Add the log and scene records."""
@@ -189,7 +196,7 @@ class SceneMaker:
         )
 
     def _add_data(self, channel: str, time_s: float, **data: Any) -> None:
-        """Add a ``sample_data`` record and the ego pose at its time, under one token."""
+        """Add a ``sample_data`` record and an ``ego_pose`` record with its token and time."""
         pose = self.ego_pose(time_s)
         token = data["token"]
         timestamp = self.timestamp_us(time_s)
@@ -242,24 +249,33 @@ class SceneMaker:
         return f"minicity-{self.task.name}__{channel}__{self.timestamp_us(time_s)}"
 
     def _sweep(self, k: int, j: int) -> NDArray[np.float32]:
-        """Simulate and write sweep ``j`` after key frame ``k``; sweep 0 is the key frame. (N, 5)"""
+        """Simulate and write a sweep.
+
+        Args:
+            k: Number of the last key frame up to the sweep.
+            j: Number of the sweep since the key frame; 0 for the sweep of the key frame.
+
+        Returns:
+            Points in the LiDAR frame, as in the files of nuScenes. (N, 5)
+        """
         time_s = (k + j / (self.config.sweeps_per_sample + 1)) * SAMPLE_PERIOD_S
         vehicles = vehicle_footprints([actor.at(time_s) for actor in self.actors])
         cloud = scan(
             world_from_lidar=self.ego_pose(time_s) @ ego_from_lidar(),
             texture=self.renderer.texture,
-            boxes=np.concatenate([vehicles, self.walls]),
+            boxes=np.concatenate([vehicles, self.building_boxes]),
             rng=self._rng("sweep", k, j),
         )
         is_key_frame = j == 0
         folder = "samples" if is_key_frame else "sweeps"
         name = f"{folder}/LIDAR_TOP/{self._stem('LIDAR_TOP', time_s)}.pcd.bin"
         cloud.tofile(self.root / name)
+        next_key_frame = k if is_key_frame else k + 1  # nuScenes assigns sweeps to this one
         self._add_data(
             "LIDAR_TOP",
             time_s,
             token=self._token("data", "LIDAR_TOP", k, j),
-            sample_token=self.samples[k if is_key_frame else k + 1],
+            sample_token=self.samples[next_key_frame],
             fileformat="pcd",
             is_key_frame=is_key_frame,
             height=0,
@@ -277,7 +293,12 @@ class SceneMaker:
         _chain(sweeps)
 
     def _annotate(self, k: int, cloud: NDArray[np.float32]) -> None:
-        """Add a box for each vehicle and person with LiDAR points in key frame ``k``. (N, 5)"""
+        """Add a box for each vehicle and person that has LiDAR points in key frame ``k``.
+
+        Args:
+            k: Number of the key frame.
+            cloud: Its sweep, with (x, y, z) in metres in the LiDAR frame first. (N, 5)
+        """
         time_s = k * SAMPLE_PERIOD_S
         pose = self.ego_pose(time_s) @ ego_from_lidar()
         points = cloud[:, :3] @ pose[:3, :3].T + pose[:3, 3]
@@ -298,13 +319,13 @@ class SceneMaker:
                 visibility_token="4",
                 attribute_tokens=[make_token("attribute", _attribute(vehicle))],
                 translation=vehicle.center.tolist(),
-                size=[width, length, height],
+                size=[width, length, height],  # the order of nuScenes
                 rotation=[math.cos(half_turn), 0.0, 0.0, math.sin(half_turn)],
                 prev="",
                 next="",
                 num_lidar_pts=num_points,
                 num_radar_pts=0,
-                category=vehicle.category,
+                category=vehicle.category,  # only for the instance record
             )
 
     def _link_annotations(self) -> None:
@@ -322,7 +343,7 @@ class SceneMaker:
                 first_annotation_token=boxes[0]["token"],
                 last_annotation_token=boxes[-1]["token"],
             )
-        for box in self.records["sample_annotation"]:
+        for box in self.records["sample_annotation"]:  # the tables of nuScenes have no such field
             del box["category"]
 
 
@@ -345,6 +366,7 @@ def _points_in_box(points: Array, vehicle: Vehicle) -> int:
     dx = points[:, 0] - vehicle.center[0]
     dy = points[:, 1] - vehicle.center[1]
     dz = points[:, 2] - vehicle.center[2]
+    # Only points near the box are rotated. Half of its diagonal is shorter than its length.
     near = (np.abs(dx) < vehicle.size[0]) & (np.abs(dy) < vehicle.size[0])
     dx = dx[near]
     dy = dy[near]
@@ -366,11 +388,13 @@ def _make_surroundings(
         lighting: Direction of the sun, strength of shadows and weather.
 
     Returns:
-        The mesh, and the outlines of shadows on the ground in metres, none without sun. Each (n, 2)
+        The mesh, and the outlines of shadows on the ground in metres. Each outline is (n, 2). There
+        are no outlines if the lighting has no shadows.
     """
     mesh = Mesh()
     shadows = []
-    cast = -lighting.sun[:2] / max(float(lighting.sun[2]), 0.2)
+    # Shift of the shadow of a point per metre of its height. A low sun counts as a higher one.
+    shadow_shift = -lighting.sun[:2] / max(float(lighting.sun[2]), 0.2)
 
     def track_distance(points: Array) -> Array:
         """Distance of points (n, 2) from the track in metres. (n,)"""
@@ -378,17 +402,22 @@ def _make_surroundings(
 
     if town.buildings:
         centers = np.array([b.footprint.mean(axis=0) for b in town.buildings])
-        for i in np.flatnonzero(track_distance(centers) < 130):
+        for i in np.flatnonzero(track_distance(centers) < BUILDING_REACH_M):
             building = town.buildings[i]
             add_building(mesh, building, lit_windows=lighting.weather == "dusk")
-            roof_shadow = building.footprint + cast * building.height_m
+            roof_shadow = building.footprint + shadow_shift * building.height_m
             corners = shapely.MultiPoint(np.concatenate([building.footprint, roof_shadow]))
             shadows.append(np.array(corners.convex_hull.exterior.coords))
-    turn = np.linspace(0, 2 * np.pi, num=12, endpoint=False)
-    ring = np.column_stack([np.cos(turn), np.sin(turn)])
-    for tree in town.trees[track_distance(town.trees[:, :2]) < 90]:
+    angles = np.linspace(0, 2 * np.pi, num=12, endpoint=False)
+    circle = np.column_stack([np.cos(angles), np.sin(angles)])
+    for tree in town.trees[track_distance(town.trees[:, :2]) < PLANT_REACH_M]:
         add_tree(mesh, tree)
-        shadows.append(tree[:2] + cast * 0.68 * tree[2] + 0.26 * tree[2] * ring)
-    for pole in town.poles[track_distance(town.poles[:, :2]) < 90]:
+        height = tree[2]
+        # The crown is at 0.68 of the height of a tree.
+        crown_shadow = tree[:2] + shadow_shift * 0.68 * height + 0.26 * height * circle
+        shadows.append(crown_shadow)
+    for pole in town.poles[track_distance(town.poles[:, :2]) < PLANT_REACH_M]:
         add_pole(mesh, pole)
-    return mesh.freeze(), shadows if lighting.shadow > 0 else []
+    if lighting.shadow <= 0:
+        shadows = []
+    return mesh.freeze(), shadows

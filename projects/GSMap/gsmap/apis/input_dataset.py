@@ -1,4 +1,4 @@
-"""Samples of any source as the test data set of a config."""
+"""Test data sets of a config with samples from any source."""
 
 from collections.abc import Sequence
 from itertools import islice
@@ -16,7 +16,7 @@ from gsmap.datasets.source import Mount, Source, change_frame
 if TYPE_CHECKING:
     from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
 
-SAMPLES_BY = "tools/infer.py"  # command in the metadata of annotation files for inference
+INFERENCE_COMMAND = "tools/infer.py"  # in the metadata of annotation files for inference
 _MAX_SAMPLES = 100  # number of samples that are searched for the names of cameras
 
 
@@ -25,15 +25,15 @@ def open_dataset(
 ) -> "VectorizedMapDataset":
     """Open samples as the test data set of a config, with its pipeline.
 
-    Samples in another annotation frame are transformed to the model's. If the samples have no
-    camera of the config, all of their cameras are used.
+    Samples in another annotation frame are transformed to the annotation frame of the model, if
+    the config names it. If the samples have no camera of the config, all of their cameras are used.
 
     Args:
         cfg: Config of the model.
         source: The samples.
-        mount: Annotation frame of the model.
-        ann_file: File to which samples are written, unless ``source`` is a suitable annotation
-            file itself.
+        mount: Annotation frame of the model; not used if the config names no frame.
+        ann_file: File to which samples are written. Nothing is written if ``source`` is an
+            annotation file in the annotation frame of the model.
 
     Raises:
         FileNotFoundError: If a file does not exist.
@@ -43,22 +43,23 @@ def open_dataset(
     if not settings.get("frame"):
         mount = Mount(source.frame, ground_z_m=source.ground_z_m)
     samples = source.samples
-    if isinstance(samples, AnnotationFile) and mount.suits(source.frame, source.ground_z_m):
+    in_model_frame = mount.suits(source.frame, ground_z_m=source.ground_z_m)
+    if isinstance(samples, AnnotationFile) and in_model_frame:
         ann_file = samples.path
     else:
         samples = [
-            change_frame(sample, source.frame, wanted=mount, ground_z_m=source.ground_z_m)
+            change_frame(sample, frame=source.frame, wanted=mount, ground_z_m=source.ground_z_m)
             for sample in samples
         ]
         meta = _annotation_meta(cfg, samples=samples, mount=mount, has_poses=source.has_poses)
         write_annotations(ann_file, meta, samples)
-        settings["ground_z_m"] = None
+        settings["ground_z_m"] = None  # the written file contains the height
     settings["ann_file"] = str(ann_file.resolve())
     settings["test_mode"] = True
     settings["split"] = None
     settings["dim"] = None
     settings["cameras"] = _select_cameras(cfg, samples)
-    settings["serialize_data"] = len(samples) > 1  # it runs a garbage collection
+    settings["serialize_data"] = len(samples) > 1  # slow: collects garbage
     if source.data_root is not None:
         settings["data_root"] = str(source.data_root.resolve())
     with building(cfg):
@@ -91,22 +92,22 @@ def _annotation_meta(
         y_range=tuple(grid["y_range"]),
         dim=dim,
         options={} if has_poses else {"poses": False},
-        command=SAMPLES_BY,
+        command=INFERENCE_COMMAND,
         ground_z_m=mount.ground_z_m,
     )
 
 
 def _select_cameras(cfg: Config, samples: Sequence[MapSample]) -> Sequence[str] | None:
-    """Select the cameras of the config, or all of the samples' if none of them is the config's.
+    """Select the cameras of the config, or all cameras of samples that have none of these.
 
     Returns:
         Names of the cameras; None if the config uses all.
     """
     configured = cfg.test_dataloader.dataset.get("cameras")
-    available: dict[str, None] = {}  # names in order
+    available: dict[str, None] = {}  # a set that keeps the order of the names
     for sample in islice(samples, _MAX_SAMPLES):
         for camera in sample.cameras:
             available[camera.name] = None
-    if configured is None or not available or not available.keys().isdisjoint(configured):
-        return configured
-    return list(available)
+    if configured is not None and available and available.keys().isdisjoint(configured):
+        return list(available)
+    return configured

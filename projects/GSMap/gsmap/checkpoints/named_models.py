@@ -1,7 +1,7 @@
 """Trained models by name: models that ship in ``models/``, and official models of other systems.
 
 ``models/registry.json`` lists them. The weights of a model are in ``models/NAME.pth``. Weights of
-official models do not ship; once saved under this name, they load like the others.
+official models do not ship: users fetch them and save them there.
 """
 
 import difflib
@@ -25,9 +25,9 @@ class NamedModel:
 
     Attributes:
         name: Name of the model.
-        config: Config of this project, as `shipped` takes it.
+        config: Path of the config in the repository.
         sha256: Digest of the weights' file; None if it is unknown.
-        source: Authors of the training.
+        source: Authors of the weights, or address of their project.
         licence: Licence of the weights.
         address: Download address of the weights; None for models that ship.
         figures: Published results on the model's validation split, in percent, by the names of
@@ -68,7 +68,7 @@ def list_models() -> list[str]:
 
 @cache
 def named_configs() -> dict[str, Path]:
-    """Files of the shipped configs by stem, without base configs."""
+    """Files of the shipped configs by name (the file name without suffix); no base configs."""
     configs: dict[str, Path] = {}
     for pattern in ("configs/*.py", "configs/[!_]*/*.py", "projects/GSMap/configs/*.py"):
         for path in sorted(shipped().glob(pattern)):
@@ -85,11 +85,15 @@ def find_config(config: str | Path) -> Path:
     Raises:
         FileNotFoundError: If there is no such config; the message contains the nearest name.
     """
-    for path in (Path(config), shipped(str(config)), named_configs().get(str(config))):
-        if path is not None and path.is_file():
+    name = str(config)
+    for path in (Path(config), shipped(name)):
+        if path.is_file():
             return path
-    remedy = f"; configs are in configs/ and projects/GSMap/configs/ of {shipped()}"
-    model = _find_model(config, kind="config file", remedy=remedy, other_names=named_configs())
+    configs = named_configs()
+    if name in configs and configs[name].is_file():
+        return configs[name]
+    places = f"; configs are in configs/ and projects/GSMap/configs/ of {shipped()}"
+    model = _find_model(config, kind="config file", message_end=places, other_names=configs)
     return shipped(model.config)
 
 
@@ -110,22 +114,22 @@ def find_checkpoint(checkpoint: str | Path) -> Path:
         if str(checkpoint) not in named_models():
             return Path(checkpoint)
         print_log(
-            f"{checkpoint} is the model of that name; the file of that name in the working folder "
-            f"is ./{checkpoint}.",
+            f"{checkpoint} refers to the named model; for the file in the working folder write "
+            f"./{checkpoint}.",
             level=logging.WARNING,
         )
     model = _find_model(checkpoint, kind="checkpoint")
     if not model.file.is_file():
-        remedy = f"fetch it from {model.address}" if model.address else "check it out again"
-        raise FileNotFoundError(
-            f"There is no {model.file}, the weights of {model.name}: {remedy} and save it there."
-        )
+        remedy = "check it out again"
+        if model.address:
+            remedy = f"fetch it from {model.address} and save it there"
+        raise FileNotFoundError(f"There is no {model.file}, the weights of {model.name}: {remedy}.")
     if not model.sha256:
         _warn_unverified(model.name)
     elif digest(model.file) != model.sha256:
         raise InputError(
-            f"{model.file} is damaged or another file: its sha256 is not that of {model.name} in "
-            "registry.json; fetch it again, or give another file by its path."
+            f"{model.file} is damaged or belongs to another model: its sha256 differs from the one "
+            f"of {model.name} in registry.json; fetch it again, or give another file by its path."
         )
     return model.file
 
@@ -135,8 +139,8 @@ def _warn_unverified(name: str) -> None:
     """Warn once that a model's file cannot be verified without a digest."""
     model = named_models()[name]
     print_log(
-        f"{model.file} is not verified: {model.source} gives no sha256 for {model.name}; that of "
-        f"this file is {digest(model.file)}.",
+        f"{model.file} is not verified: {model.source} gives no sha256 for {model.name}; the "
+        f"sha256 of this file is {digest(model.file)}.",
         level=logging.WARNING,
     )
 
@@ -153,21 +157,25 @@ def checkpoint_for(config: str | Path, checkpoint: str | Path | None) -> Path:
         FileNotFoundError: If the checkpoint does not exist.
         ValueError: If ``checkpoint`` is None and ``config`` is not the name of a model.
     """
+    if checkpoint is not None:
+        return find_checkpoint(checkpoint)
     is_config = str(config) in named_configs() or Path(config).is_file()
-    if checkpoint is None and is_config and str(config) not in named_models():
-        raise InputError(f"give a checkpoint after {config}: only a model's name stands for both.")
-    return find_checkpoint(config if checkpoint is None else checkpoint)
+    if is_config and str(config) not in named_models():
+        raise InputError(
+            f"give a checkpoint after {config}: only a model's name selects config and checkpoint."
+        )
+    return find_checkpoint(config)
 
 
 def _find_model(
-    name: str | Path, kind: str, remedy: str = "", other_names: Iterable[str] = ()
+    name: str | Path, kind: str, message_end: str = "", other_names: Iterable[str] = ()
 ) -> NamedModel:
     """Find a model by its name.
 
     Args:
         name: Name of the model.
         kind: Kind of file that ``name`` may also refer to, for the message of an error.
-        remedy: End of the message.
+        message_end: Further text at the end of the message.
         other_names: Further valid names, which the message may suggest.
 
     Raises:
@@ -179,8 +187,8 @@ def _find_model(
         candidates = [*models, *other_names]
         close = difflib.get_close_matches(Path(name).stem, candidates, n=1, cutoff=0.7)
         shipped_names = ", ".join(model.name for model in models.values() if not model.address)
-        hint = f"did you mean {close[0]}?" if close else f"{shipped_names} ship"
+        hint = f"did you mean {close[0]}?" if close else f"the shipped models are {shipped_names}"
         raise FileNotFoundError(
-            f"There is no {kind} {name}, and no model of that name ({hint}){remedy}."
+            f"There is no {kind} {name}, and no model of that name ({hint}){message_end}."
         )
     return models[str(name)]

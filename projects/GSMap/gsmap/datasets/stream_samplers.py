@@ -14,7 +14,7 @@ from gsmap.utils.errors import InputError, InputTypeError
 
 
 def scenes_of(dataset: VectorizedMapDataset) -> list[list[int]]:
-    """Return the indices of the samples of each scene in the order of their times.
+    """Return the indices of the samples of each scene in temporal order.
 
     Args:
         dataset: Data set without a wrapper.
@@ -36,28 +36,32 @@ class _Scene:
     Args:
         samples: Indices of the samples in temporal order.
         rng: Generator for the order of the frames and pieces and for the cuts between pieces.
-        pieces: Number of pieces that the scene is cut into at random places.
-        finish_singles: Whether all single frames come before the first piece, as in the release.
+        num_pieces: Number of pieces that the scene is cut into at random places.
+        finish_singles: Whether all single frames come before the first piece, as in StreamMapNet's
+            released code.
     """
 
     def __init__(
-        self, samples: Sequence[int], rng: np.random.Generator, pieces: int, finish_singles: bool
+        self,
+        samples: Sequence[int],
+        rng: np.random.Generator,
+        num_pieces: int,
+        finish_singles: bool,
     ) -> None:
         self.samples = list(samples)
         self.rng = rng
-        self.pieces = pieces
+        self.num_pieces = num_pieces
         self.finish_singles = finish_singles
         self.waiting: deque[list[int]] = deque()
-        self.has_singles = True  # whether ``waiting`` has single frames
+        self.has_singles = False  # whether ``waiting`` has single frames
 
-    def visit(self, in_order: bool) -> list[int]:
-        """Return the next piece if ``in_order``, else the next single frame."""
-        drops_singles = in_order and self.has_singles and not self.finish_singles
-        if drops_singles:
+    def next_frames(self, in_pieces: bool) -> list[int]:
+        """Return the next piece if ``in_pieces``, else the next single frame."""
+        if in_pieces and self.has_singles and not self.finish_singles:
             self.waiting.clear()
         if not self.waiting:
-            self.waiting = self._draw_pieces() if in_order else self._draw_single_frames()
-            self.has_singles = not in_order
+            self.waiting = self._draw_pieces() if in_pieces else self._draw_single_frames()
+            self.has_singles = not in_pieces
         return self.waiting.popleft()
 
     def _draw_single_frames(self) -> deque[list[int]]:
@@ -67,7 +71,7 @@ class _Scene:
 
     def _draw_pieces(self) -> deque[list[int]]:
         """Cut the scene at random places and draw a random order of the pieces."""
-        num_pieces = min(self.pieces, len(self.samples))
+        num_pieces = min(self.num_pieces, len(self.samples))
         places = np.arange(1, len(self.samples))
         cuts = self.rng.choice(places, size=num_pieces - 1, replace=False)
         pieces = np.split(np.array(self.samples), np.sort(cuts))
@@ -77,23 +81,24 @@ class _Scene:
 
 @DATA_SAMPLERS.register_module()
 class StreamTrainSampler(Sampler[int]):
-    """Sampler for streaming training: each place of the batch receives scenes in temporal order.
+    """Sampler for streaming training: each place of the batch is a stream of consecutive samples.
 
-    There are ``slots`` x ranks streams, one for each place of the batch on each rank. An endless
-    sequence of random permutations of the scenes is dealt to the streams in turn: stream j takes
-    entries j, j + streams, j + 2 streams and so on. A stream goes to the next scene at the end of a
-    piece, so the streams change scenes at different times. The first iterations have single random
-    frames. The samples depend only on the seed, the ranks and the epoch, so a resumed run continues
-    with the samples of an uninterrupted run.
+    There are N = ``slots`` x ranks streams, one for each place of the batch on each rank. Random
+    permutations of the scenes form an endless sequence, and stream j takes its entries j, j + N,
+    j + 2 N and so on. A scene is cut into pieces at random places, and a stream takes one piece of
+    each of its scenes in turn. In the first iterations it takes one random frame of each. The
+    samples depend only on the seed, the ranks and the epoch, so a resumed run continues with the
+    samples of an uninterrupted run.
 
     Args:
         dataset: Data set without a wrapper.
         slots: ``batch_size`` of the data loader.
         single_frame_iters: Number of iterations with single frames.
         pieces: Number of pieces that a scene is cut into.
-        late_switch: Whether a scene switches to pieces only after all single frames, as in the
-            release. Half of the samples continue a stream after 1.6 x ``single_frame_iters``.
-        seed: Seed of the random numbers, equal on all ranks.
+        late_switch: Whether a scene switches to pieces only after all of its single frames, as in
+            StreamMapNet's released code. Pieces then have half of the samples of a batch at
+            iteration 1.6 x ``single_frame_iters``.
+        seed: Seed of the random numbers, equal on all ranks; None for 0.
 
     Raises:
         TypeError: If the data set is not a `VectorizedMapDataset`.
@@ -115,35 +120,38 @@ class StreamTrainSampler(Sampler[int]):
                 f"{slots}, {pieces}, {single_frame_iters}."
             )
         self.scenes = scenes_of(dataset)
-        self.rank, self.ranks = get_dist_info()
+        self.rank, self.num_ranks = get_dist_info()
         self.slots = slots
         self.pieces = pieces
         self.late_switch = late_switch
         self.single_frame_iters = single_frame_iters
         self.seed = seed or 0
         self.epoch = 0
-        self.iterations = max(1, len(dataset) // (slots * self.ranks))
+        self.iters_per_epoch = max(1, len(dataset) // (slots * self.num_ranks))
 
     def __len__(self) -> int:
         """Return the number of samples of one epoch on this rank."""
-        return self.iterations * self.slots
+        return self.iters_per_epoch * self.slots
 
     def set_epoch(self, epoch: int) -> None:
-        """Set the epoch, which continues the streams of the previous epoch."""
+        """Set the epoch. Its samples continue the streams of the previous epoch."""
         self.epoch = epoch
 
     def __iter__(self) -> Iterator[int]:
-        start = self.epoch * self.iterations
-        for batch in islice(self.batches(), start, start + self.iterations):
+        start = self.epoch * self.iters_per_epoch
+        # The streams are replayed from the first epoch, so that no state has to be saved.
+        for batch in islice(self.batches(), start, start + self.iters_per_epoch):
             yield from batch
 
     def batches(self) -> Iterator[list[int]]:
-        """Yield the batches of this rank without end, from the first iteration on."""
-        scenes = []
+        """Yield the batches of this rank from the first iteration of training, without end."""
+        iterators = []
         for number, samples in enumerate(self.scenes):
             rng = np.random.default_rng([self.seed, self.rank, number])
-            scene = _Scene(samples, rng=rng, pieces=self.pieces, finish_singles=self.late_switch)
-            scenes.append(scene)
+            iterator = _Scene(
+                samples, rng=rng, num_pieces=self.pieces, finish_singles=self.late_switch
+            )
+            iterators.append(iterator)
         first_stream = self.rank * self.slots
         orders = []
         queues: list[deque[int]] = []
@@ -151,23 +159,23 @@ class StreamTrainSampler(Sampler[int]):
             orders.append(self._scene_order(first_stream + slot))
             queues.append(deque())
         for iteration in count():
-            in_order = iteration >= self.single_frame_iters
+            in_pieces = iteration >= self.single_frame_iters
             for queue, order in zip(queues, orders, strict=True):
                 if not queue:
-                    scene = scenes[next(order)]
-                    queue.extend(scene.visit(in_order))
+                    number = next(order)
+                    queue.extend(iterators[number].next_frames(in_pieces))
             yield [queue.popleft() for queue in queues]
 
     def _scene_order(self, stream: int) -> Iterator[int]:
-        """Yield the numbers of the scenes of a stream, not twice in a row if there are several."""
+        """Yield the numbers of the scenes of a stream; a number that repeats is skipped once."""
         previous = -1
-        num_streams = self.slots * self.ranks
+        num_streams = self.slots * self.num_ranks
         for number in islice(self._permutations(), stream, None, num_streams):
             if number != previous or len(self.scenes) == 1:
                 yield number
                 previous = number
             else:
-                previous = -1  # a further repetition is not skipped
+                previous = -1  # the next number is not skipped
 
     def _permutations(self) -> Iterator[int]:
         """Yield the numbers of all scenes in random order, without end."""
@@ -180,8 +188,8 @@ class StreamTrainSampler(Sampler[int]):
 class StreamTestSampler(Sampler[int]):
     """Sampler for streaming tests: whole scenes one after another, in temporal order.
 
-    Each scene is on one rank. The scenes are distributed so that ranks have similar numbers of
-    samples.
+    All samples of a scene go to one rank. The scenes are distributed so that the ranks have similar
+    numbers of samples.
 
     Args:
         dataset: Data set without a wrapper.
@@ -192,8 +200,8 @@ class StreamTestSampler(Sampler[int]):
     """
 
     def __init__(self, dataset: VectorizedMapDataset, seed: int | None = None) -> None:
-        rank, ranks = get_dist_info()
-        num_samples = [0] * ranks
+        rank, num_ranks = get_dist_info()
+        num_samples = [0] * num_ranks
         self.scenes: list[list[int]] = []
         longest_first = sorted(scenes_of(dataset), key=len, reverse=True)
         for scene in longest_first:
@@ -214,7 +222,7 @@ class StreamBatches(Sampler[list[int]]):
     """Batch sampler for streaming tests with one sample of each of ``batch_size`` scenes.
 
     A scene that ends is replaced by the next one. No batch has two samples of one scene, so the
-    last batches are smaller. The sampler is for the ``batch_sampler`` of a data loader.
+    last batches are smaller. Pass this sampler to a data loader as ``batch_sampler``.
 
     Args:
         sampler: Sampler of whole scenes.

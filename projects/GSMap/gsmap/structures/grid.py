@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from gsmap.utils.errors import InputError
 
-if TYPE_CHECKING:  # evaluation of result files imports no torch
+if TYPE_CHECKING:  # result files can be evaluated without the time to import torch
     import torch
     from torch import Tensor
 
@@ -42,10 +42,13 @@ class BEVGrid:
 
     def __post_init__(self) -> None:
         for name in ("x_range", "y_range"):
-            low, high = (float(v) for v in getattr(self, name))
+            low, high = getattr(self, name)
+            low = float(low)
+            high = float(high)
             if not low < high:
                 raise InputError(f"{name} must be (low, high) with low < high, got {(low, high)}.")
-            object.__setattr__(self, name, (low, high))  # hashable, also from lists of a config
+            # Configs have lists here; tuples make the grid hashable.
+            object.__setattr__(self, name, (low, high))
         if self.height < 1 or self.width < 1:
             raise InputError(f"height and width must be >= 1, got {self.height} x {self.width}.")
         if self.forward is None:
@@ -68,11 +71,11 @@ class BEVGrid:
         return length_x / self.width, length_y / self.height
 
     def with_size(self, height: int, width: int) -> "BEVGrid":
-        """Create a grid with equal extent and another number of rows and columns."""
+        """Create a grid of this extent with another number of rows and columns."""
         return replace(self, height=height, width=width)
 
     def rasterized(self, pixel_m: float | Sequence[float]) -> "BEVGrid":
-        """Create a grid with equal extent and another size of pixels.
+        """Create a grid of this extent with another size of pixels.
 
         Args:
             pixel_m: Side of a pixel in metres, or its sizes along x and y.
@@ -88,7 +91,9 @@ class BEVGrid:
         rows = length_y / size_y
         width = round(columns)
         height = round(rows)
-        if min(width, height) < 1 or max(abs(columns - width), abs(rows - height)) > 1e-3:
+        is_empty = width < 1 or height < 1
+        rounding = max(abs(columns - width), abs(rows - height))
+        if is_empty or rounding > 1e-3:
             raise InputError(
                 f"pixels of {size_x:g} x {size_y:g} m do not divide the map of "
                 f"{length_x:g} x {length_y:g} m."
@@ -97,11 +102,11 @@ class BEVGrid:
 
     def norm_from_metres(self, points: Array) -> Array:
         """Convert metres to [0, 1] over the extent. (..., 2) -> (..., 2)"""
-        return self._in_units(points, self.extent_m)
+        return self._count_from_corner(points, self.extent_m)
 
     def px_from_metres(self, points: Array) -> Array:
         """Convert metres to continuous pixels (u along x, v along y). (..., 2) -> (..., 2)"""
-        return self._in_units(points, self.pixel_size_m)
+        return self._count_from_corner(points, self.pixel_size_m)
 
     def metres_from_norm(self, points: Array) -> Array:
         """Convert [0, 1] over the extent to metres. (..., 2) -> (..., 2)"""
@@ -109,40 +114,45 @@ class BEVGrid:
         return _affine(points, scale=self.extent_m, shift=lower_corner)
 
     def front_from_metres(self, points: Array) -> Array:
-        """Convert metres to [0, 1] from front to rear and from left to right.
+        """Convert metres to relative distances from the front and from the left edge.
 
         Args:
             points: Points (x, y) in metres. (..., 2)
 
         Returns:
-            Share of the way from the front edge, then from the left edge. (..., 2)
+            Distance from the front edge, 1 at the rear edge, and distance from the left
+            edge, 1 at the right edge. (..., 2)
         """
-        order, scale, shift = self._front
+        order, scale, shift = self._front_axes
         coordinates = _reorder(self.norm_from_metres(points), order)
         return _affine(coordinates, scale=scale, shift=shift)
 
     def metres_from_front(self, points: Array) -> Array:
-        """Convert [0, 1] from front to rear and from left to right to metres.
+        """Convert relative distances from the front and from the left edge to metres.
 
         Args:
-            points: Share of the way from the front edge, then from the left edge. (..., 2)
+            points: Distance from the front edge, 1 at the rear edge, and distance from the left
+                edge, 1 at the right edge. (..., 2)
 
         Returns:
             Points (x, y) in metres. (..., 2)
         """
-        order, scale, shift = self._front
+        order, scale, shift = self._front_axes
         coordinates = _affine(points, scale=scale, shift=shift)
         return self.metres_from_norm(_reorder(coordinates, order))
 
     @property
-    def _front(self) -> tuple[list[int], tuple[float, float], tuple[float, float]]:
-        """Order of the axes, scale and shift between [0, 1] over the map and from the front."""
+    def _front_axes(self) -> tuple[list[int], tuple[float, float], tuple[float, float]]:
+        """Order of the axes, scale and shift that `front_from_metres` applies to [0, 1].
+
+        Order, scale and shift are their own inverses, so `metres_from_front` applies them too.
+        """
         if self.forward == "x":
             return [0, 1], (-1, -1), (1, 1)
         return [1, 0], (-1, 1), (1, 0)
 
-    def _in_units(self, points: Array, sizes_m: tuple[float, float]) -> Array:
-        """Convert metres to units of given sizes, from the lower corner. (..., 2) -> (..., 2)"""
+    def _count_from_corner(self, points: Array, sizes_m: tuple[float, float]) -> Array:
+        """Convert metres to multiples of ``sizes_m`` from the lower corner. (..., 2) -> (..., 2)"""
         size_x, size_y = sizes_m
         scale = (1 / size_x, 1 / size_y)
         shift = (-self.x_range[0] / size_x, -self.y_range[0] / size_y)
@@ -170,11 +180,12 @@ class BEVGrid:
 
 
 def _reorder(points: Array, order: list[int]) -> Array:
-    """Reorder coordinates, without uploading a list of indices to a GPU. (..., 2) -> (..., 2)"""
+    """Reorder coordinates. (..., 2) -> (..., 2)"""
     if isinstance(points, np.ndarray):
         return points[..., order]
     import torch
 
+    # Indexing by ``order`` would copy it to the GPU and wait.
     return torch.stack([points[..., axis] for axis in order], dim=-1)
 
 
@@ -194,6 +205,8 @@ def _affine(points: Array, scale: tuple[float, float], shift: tuple[float, float
 
 def padded_size(size: tuple[int, int], divisor: int) -> tuple[int, int]:
     """Round a height and width up to multiples of ``divisor``."""
-    height = -(-size[0] // divisor) * divisor
-    width = -(-size[1] // divisor) * divisor
+    rows, columns = size
+    # -(-a // b) is a / b rounded up, in integers.
+    height = -(-rows // divisor) * divisor
+    width = -(-columns // divisor) * divisor
     return height, width

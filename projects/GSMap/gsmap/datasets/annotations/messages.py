@@ -15,10 +15,13 @@ from gsmap.utils.errors import InputError
 
 _START = b"ARROW1\0\0"
 _END = b"ARROW1"
+_SIZE_BYTES = 4  # size of the footer as an integer, between the footer and ``_END``
+_TAIL_BYTES = _SIZE_BYTES + len(_END)
 SEAL_KEY = b"gsmap_seal"
 """Key of the seal in the metadata of a message.
 
-The seal is JSON with the number of rows, and the number and the checksum of all bytes before it.
+The seal is JSON with the number of rows of the file, and the size in bytes and the checksum of the
+part of the file before the seal.
 """
 
 
@@ -31,34 +34,36 @@ def read_messages(
         content: Content of the file.
 
     Returns:
-        Schema; batches; seal, None for a file without it; and end of each part of the file in
-        bytes: 0, the end of the schema and the end of each batch.
+        Four values: the schema, the batches, the seal or None for a file without one, and the
+        positions in bytes at which parts of the file end. The positions are 0, the end of the
+        schema and the end of each batch.
 
     Raises:
         ValueError: If the content does not begin or end like an Arrow file, or has a batch without
             rows that is not a seal.
     """
     size = content.size
-    if size < len(_START) + 10 or content[: len(_START)].to_pybytes() != _START:
+    if size < len(_START) + _TAIL_BYTES or content[: len(_START)].to_pybytes() != _START:
         raise InputError("it does not begin as an Arrow file")
     source = pa.BufferReader(content)
     source.seek(len(_START))
     reader = pa.ipc.open_stream(source)
     ends = [0, source.tell()]
     batches = []
-    seal = None  # only the metadata of the last message count
+    seal = None  # stays None unless the last message has one
     for message in reader.iter_batches_with_custom_metadata():
         ends.append(source.tell())
         batches.append(message.batch)
         seal = (message.custom_metadata or {}).get(SEAL_KEY)
-    footer = content[source.tell() :].to_pybytes()
-    footer_size = int.from_bytes(footer[-10:-6], byteorder="little")
-    if footer[-6:] != _END or footer_size != len(footer) - 10:
+    ending = content[source.tell() :].to_pybytes()
+    size_field = ending[-_TAIL_BYTES : -len(_END)]
+    footer_size = int.from_bytes(size_field, byteorder="little")
+    if not ending.endswith(_END) or footer_size != len(ending) - _TAIL_BYTES:
         raise InputError("it ends too early")
-    if seal is not None:
+    if seal is not None:  # its message has no rows of the file
         batches.pop()
         ends.pop()
-    if not all(map(len, batches)):
+    if any(len(batch) == 0 for batch in batches):
         raise InputError("it has an empty part")  # for example a seal with a damaged key
     return reader.schema, batches, seal, ends
 
@@ -68,7 +73,7 @@ def checksums(content: pa.Buffer, ends: Sequence[int]) -> list[tuple[int, int]]:
 
     Args:
         content: Content of the file.
-        ends: Positions in bytes in ascending order, from 0.
+        ends: Positions in bytes in ascending order; the first is 0.
 
     Returns:
         Position and CRC-32 of all bytes before it, for each position.

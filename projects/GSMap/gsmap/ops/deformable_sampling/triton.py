@@ -1,10 +1,10 @@
-# Triton infers the types of its kernels:
+# Functions of Triton have no types, since Triton infers them.
 # mypy: disable-error-code="no-untyped-def"
 """Triton kernels: deformable sampling of a map, forward and backward in one launch each.
 
 A row is the output of one head of one query, with all channels of the head. A program computes as
-many rows as fill ``BLOCK`` values. Sums are float32 for every type of the map. Cells outside of the
-map count as zero, and a NaN location makes only its row NaN.
+many rows as fill ``BLOCK`` values. Sums are float32 for every dtype of the map. Cells outside of
+the map count as zero, and a NaN location makes only its row NaN.
 
 The gradient of the map is added by atomics in any order, so repeated runs differ in the last bits.
 No launch waits for the device, and nothing is autotuned.
@@ -19,45 +19,61 @@ OPTIONS = {"num_warps": 4, "enable_fp_fusion": True}
 
 
 @triton.jit
-def _locate(locations, weights, sample, ok, height, width):
-    """Upper left cell of a sample (col, row), its distances from that cell, its weight. (ROWS,)"""
-    x = tl.load(locations + sample * 2, mask=ok, other=0.0) * width - 0.5
-    y = tl.load(locations + sample * 2 + 1, mask=ok, other=0.0) * height - 0.5
+def _locate_sample(locations, weights, sample, valid, height, width):
+    """Column and row of a sample's upper left cell, x and y distance from it, weight. (ROWS,)"""
+    x = tl.load(locations + sample * 2, mask=valid, other=0.0) * width - 0.5
+    y = tl.load(locations + sample * 2 + 1, mask=valid, other=0.0) * height - 0.5
     col = tl.floor(x)
     row = tl.floor(y)
-    weight = tl.load(weights + sample, mask=ok, other=0.0)
+    weight = tl.load(weights + sample, mask=valid, other=0.0)
     return col, row, x - col, y - row, weight
 
 
 @triton.jit
-def find_corner(col, row, ok, height, width):
+def find_corner(col, row, valid, height, width):
     """Find the flat index of a cell of a map.
 
     Args:
         col: Column of the cell, a whole number, also outside of the map. (ROWS,)
         row: Row of the cell. (ROWS,)
-        ok: Whether the sample exists. (ROWS,)
+        valid: Whether the sample exists. (ROWS,)
         height: Number of rows of the map.
         width: Number of columns of the map.
 
     Returns:
         Index of the cell, zero outside of the map, and whether it lies on the map. (ROWS,)
     """
-    inside = (col >= 0) & (col < width) & (row >= 0) & (row < height) & ok
+    inside = (col >= 0) & (col < width) & (row >= 0) & (row < height) & valid
     cell_row = tl.where(inside, row, 0.0).to(tl.int32)
     cell_col = tl.where(inside, col, 0.0).to(tl.int32)
     return cell_row * width + cell_col, inside
 
 
 @triton.jit
-def _rows(rows, queries, heads, cells, C: tl.constexpr, CP: tl.constexpr, ROWS: tl.constexpr):
-    """Rows of a program and their validity, start of their maps, channels and their validity."""
+def _locate_rows(
+    rows, queries, heads, cells, C: tl.constexpr, CP: tl.constexpr, ROWS: tl.constexpr
+):
+    """Locate the rows of a program.
+
+    Args:
+        rows: Number of rows, B * Q * heads.
+        queries: Number Q of queries.
+        heads: Number of heads.
+        cells: Number of cells of a map.
+        C: Number of channels of a head.
+        CP: C rounded up to a power of two.
+        ROWS: Number of rows of a program.
+
+    Returns:
+        Index of each row, whether it exists, and offset of its head's first value in the maps, all
+        (ROWS,); indices of the channels, and whether they exist, both (CP,).
+    """
     row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
     batch = row // (queries * heads)
     head = row % heads
-    start = (batch * cells * heads + head) * C
+    head_offset = (batch * cells * heads + head) * C
     channel = tl.arange(0, CP)
-    return row, row < rows, start, channel, channel < C
+    return row, row < rows, head_offset, channel, channel < C
 
 
 @triton.jit
@@ -93,28 +109,29 @@ def forward_kernel(
         CP: C rounded up to a power of two.
         ROWS: Number of rows of a program.
     """
-    row, ok, start, channel, exists = _rows(
+    row, valid, head_offset, channel, is_channel = _locate_rows(
         rows, queries, heads=heads, cells=height * width, C=C, CP=CP, ROWS=ROWS
     )
     total = tl.zeros((ROWS, CP), dtype=tl.float32)
     for s in range(S):
-        left, top, dx, dy, weight = _locate(
-            locations, weights, sample=row * S + s, ok=ok, height=height, width=width
+        left, top, dx, dy, weight = _locate_sample(
+            locations, weights, sample=row * S + s, valid=valid, height=height, width=width
         )
         for corner in tl.static_range(4):
-            cell, inside = find_corner(
-                left + corner % 2, top + corner // 2, ok=ok, height=height, width=width
+            pixel_index, inside = find_corner(
+                left + corner % 2, top + corner // 2, valid=valid, height=height, width=width
             )
-            across = dx if corner % 2 else 1 - dx
-            down = dy if corner // 2 else 1 - dy
-            share = weight * across * down
-            at = (start + cell * (heads * C))[:, None] + channel[None, :]
-            mask = inside[:, None] & exists[None, :]
-            pixel = tl.load(value + at, mask=mask, other=0.0).to(tl.float32)
-            # A product instead of tl.where keeps a NaN share outside of the map.
-            total += pixel * (share * inside.to(tl.float32))[:, None]
-    output = out + row[:, None] * C + channel[None, :]
-    tl.store(output, total, mask=ok[:, None] & exists[None, :])
+            weight_x = dx if corner % 2 else 1 - dx
+            weight_y = dy if corner // 2 else 1 - dy
+            corner_weight = weight * weight_x * weight_y
+            pixel_offset = head_offset + pixel_index * (heads * C)
+            channel_offsets = pixel_offset[:, None] + channel[None, :]
+            mask = inside[:, None] & is_channel[None, :]
+            pixel = tl.load(value + channel_offsets, mask=mask, other=0.0).to(tl.float32)
+            # A product instead of tl.where keeps a NaN weight outside of the map.
+            total += pixel * (corner_weight * inside.to(tl.float32))[:, None]
+    out_pointers = out + row[:, None] * C + channel[None, :]
+    tl.store(out_pointers, total, mask=valid[:, None] & is_channel[None, :])
 
 
 @triton.jit
@@ -157,47 +174,55 @@ def backward_kernel(
         CP: C rounded up to a power of two.
         ROWS: Number of rows of a program.
     """
-    row, ok, start, channel, exists = _rows(
+    row, valid, head_offset, channel, is_channel = _locate_rows(
         rows, queries, heads=heads, cells=height * width, C=C, CP=CP, ROWS=ROWS
     )
-    output = grads + row[:, None] * C + channel[None, :]
-    grad = tl.load(output, mask=ok[:, None] & exists[None, :], other=0.0)
+    grad_pointers = grads + row[:, None] * C + channel[None, :]
+    grad = tl.load(grad_pointers, mask=valid[:, None] & is_channel[None, :], other=0.0)
     for s in range(S):
         sample = row * S + s
-        left, top, dx, dy, weight = _locate(
-            locations, weights, sample=sample, ok=ok, height=height, width=width
+        left, top, dx, dy, weight = _locate_sample(
+            locations, weights, sample=sample, valid=valid, height=height, width=width
         )
         grad_weight = tl.zeros((ROWS,), dtype=tl.float32)
         grad_x = tl.zeros((ROWS,), dtype=tl.float32)
         grad_y = tl.zeros((ROWS,), dtype=tl.float32)
         for corner in tl.static_range(4):
-            cell, inside = find_corner(
-                left + corner % 2, top + corner // 2, ok=ok, height=height, width=width
+            pixel_index, inside = find_corner(
+                left + corner % 2, top + corner // 2, valid=valid, height=height, width=width
             )
-            across = dx if corner % 2 else 1 - dx
-            down = dy if corner // 2 else 1 - dy
-            at = (start + cell * (heads * C))[:, None] + channel[None, :]
-            mask = inside[:, None] & exists[None, :]
-            pixel = tl.load(value + at, mask=mask, other=0.0).to(tl.float32)
-            share = weight * across * down
-            tl.atomic_add(grad_value + at, grad * share[:, None], mask=mask, sem="relaxed")
+            weight_x = dx if corner % 2 else 1 - dx
+            weight_y = dy if corner // 2 else 1 - dy
+            pixel_offset = head_offset + pixel_index * (heads * C)
+            channel_offsets = pixel_offset[:, None] + channel[None, :]
+            mask = inside[:, None] & is_channel[None, :]
+            pixel = tl.load(value + channel_offsets, mask=mask, other=0.0).to(tl.float32)
+            corner_weight = weight * weight_x * weight_y
+            tl.atomic_add(
+                grad_value + channel_offsets,
+                grad * corner_weight[:, None],
+                mask=mask,
+                sem="relaxed",
+            )
             product = tl.sum(grad * pixel, axis=1)
-            grad_weight += product * across * down
-            grad_x += product * down * (1 if corner % 2 else -1)
-            grad_y += product * across * (1 if corner // 2 else -1)
-        tl.store(grad_weights + sample, grad_weight, mask=ok)
-        tl.store(grad_locations + sample * 2, grad_x * weight * width, mask=ok)
-        tl.store(grad_locations + sample * 2 + 1, grad_y * weight * height, mask=ok)
+            grad_weight += product * weight_x * weight_y
+            slope_x = 1 if corner % 2 else -1  # derivative of weight_x
+            slope_y = 1 if corner // 2 else -1
+            grad_x += product * weight_y * slope_x
+            grad_y += product * weight_x * slope_y
+        tl.store(grad_weights + sample, grad_weight, mask=valid)
+        tl.store(grad_locations + sample * 2, grad_x * weight * width, mask=valid)
+        tl.store(grad_locations + sample * 2 + 1, grad_y * weight * height, mask=valid)
 
 
-def _layout(value, weights):
-    """Number of rows, sizes that are compiled in, and grid of the programs."""
+def _plan_launch(value, weights):
+    """Number of rows, sizes that are constants of the compiled kernel, and grid of the programs."""
     channels = value.shape[3]
     padded_channels = max(16, triton.next_power_of_2(channels))
-    rows_each = max(1, BLOCK // padded_channels)
+    rows_per_program = max(1, BLOCK // padded_channels)
     rows = weights.shape[:3].numel()
-    sizes = {"S": weights.shape[3], "C": channels, "CP": padded_channels, "ROWS": rows_each}
-    return rows, sizes, (triton.cdiv(rows, rows_each),)
+    sizes = {"S": weights.shape[3], "C": channels, "CP": padded_channels, "ROWS": rows_per_program}
+    return rows, sizes, (triton.cdiv(rows, rows_per_program),)
 
 
 def deformable_sample(value, locations, weights, height, width):
@@ -217,7 +242,7 @@ def deformable_sample(value, locations, weights, height, width):
     shape = (batch, queries, heads, value.shape[3])
     out = torch.empty(shape, dtype=torch.float32, device=value.device)
     if out.numel():
-        rows, sizes, grid = _layout(value, weights)
+        rows, sizes, grid = _plan_launch(value, weights)
         with torch.cuda.device_of(value):
             forward_kernel[grid](
                 value.contiguous(),
@@ -247,7 +272,8 @@ def deformable_sample_backward(grads, value, locations, weights, height, width):
         width: Columns W of the map.
 
     Returns:
-        Gradients of the maps, the locations and the weights.
+        Gradients of the maps, in the dtype of ``value`` (B, H * W, heads, C); of the locations
+        (B, Q, heads, S, 2); and of the weights (B, Q, heads, S).
     """
     locations = locations.contiguous()
     weights = weights.contiguous()
@@ -256,7 +282,7 @@ def deformable_sample_backward(grads, value, locations, weights, height, width):
         return grad_value.to(value.dtype), torch.zeros_like(locations), torch.zeros_like(weights)
     grad_locations = torch.empty_like(locations)
     grad_weights = torch.empty_like(weights)
-    rows, sizes, grid = _layout(value, weights)
+    rows, sizes, grid = _plan_launch(value, weights)
     with torch.cuda.device_of(value):
         backward_kernel[grid](
             grads.contiguous(),

@@ -1,4 +1,4 @@
-# Triton infers the types of its kernels:
+# Functions of Triton have no types, since Triton infers them.
 # mypy: disable-error-code="no-untyped-def"
 r"""Triton kernels: masks of 2D Gaussians, one program per tile of an instance.
 

@@ -1,14 +1,15 @@
-# Triton infers the types of its kernels:
+# Functions of Triton have no types, since Triton infers them.
 # mypy: disable-error-code="no-untyped-def"
 """Triton kernels: fixed kernels around projected points, forward and backward in one launch each.
 
 A row is the output of one head of one BEV cell, with all channels of the head. A program computes
-several rows, neighbours on the map, and loops over the cameras. A camera to which none of its cells
-is visible is skipped by a scalar branch. Sums are float32 for every type of the maps.
+several neighbouring rows and loops over the cameras. A camera to which none of its cells is visible
+is skipped by a scalar branch. Sums are float32 for every dtype of the maps.
 
-Products and sums are not fused, so that rounding a sum gives the pixel of plain torch. The gradient
-of the maps is added by atomics, in any order. The gradient of the weights is accumulated in
-registers, and each entry of the gradient of the points is written by one program.
+Multiplications and additions are not fused: coordinates then have the rounding errors of plain
+torch, and are rounded to the same pixel. The gradient of the maps is added by atomics in any order,
+so repeated runs differ in the last bits. The gradient of the weights is accumulated in registers,
+and each entry of the gradient of the points is written by one program.
 """
 
 import torch
@@ -18,27 +19,42 @@ import triton.language as tl
 from gsmap.ops.deformable_sampling.triton import BLOCK, find_corner
 
 OPTIONS = {"num_warps": 4, "enable_fp_fusion": False}
-ROUNDING = tl.constexpr(12582912.0)  # 1.5 * 2^23, whose float32 neighbours are whole numbers
+# 1.5 * 2^23: float32 has no fractions at this size, so adding and subtracting it rounds a number.
+ROUNDING = tl.constexpr(12582912.0)
 
 
 @triton.jit
 def _nearest(position, size):
-    """Nearest row or column of the map, rounded half to even."""
+    """Clamp coordinates in pixels to the map, and round them half to even. (ROWS,)"""
     position = tl.minimum(tl.maximum(position, 0.0), size - 1.0)
     return ((position + ROUNDING) - ROUNDING).to(tl.int32)
 
 
 @triton.jit
-def _rows(rows, queries, heads, views, C: tl.constexpr, CP: tl.constexpr, ROWS: tl.constexpr):
-    """Rows of a program and their validity, image of the first camera, cell, head, channels."""
+def _locate_rows(rows, queries, heads, views, CP: tl.constexpr, ROWS: tl.constexpr):
+    """Locate the rows of a program.
+
+    Args:
+        rows: Number of rows, B * Q * heads.
+        queries: Number Q of BEV cells.
+        heads: Number of heads.
+        views: Number V of cameras.
+        CP: Number of channels of a head, rounded up to a power of two.
+        ROWS: Number of rows of a program.
+
+    Returns:
+        Index of each row, whether it exists, index of the first camera's image among B * V images,
+        index of the BEV cell in its sample, and index of the head, all (ROWS,); indices of the
+        channels. (CP,)
+    """
     row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
     cell = row // heads
     head = row % heads
     batch = cell // queries
     query = cell % queries
-    image = batch * views
+    first_image = batch * views
     channel = tl.arange(0, CP)
-    return row, row < rows, image, query, head, channel
+    return row, row < rows, first_image, query, head, channel
 
 
 @triton.jit
@@ -83,19 +99,19 @@ def forward_kernel(
         CP: C rounded up to a power of two.
         ROWS: Number of rows of a program.
     """
-    row, ok, image, query, head, channel = _rows(
-        rows, queries, heads=heads, views=views, C=C, CP=CP, ROWS=ROWS
+    row, valid, first_image, query, head, channel = _locate_rows(
+        rows, queries, heads=heads, views=views, CP=CP, ROWS=ROWS
     )
-    exists = channel < C
+    is_channel = channel < C
     total = tl.zeros((ROWS, CP), dtype=tl.float32)
     for view in range(views):
-        projection = (image + view) * queries + query
-        visible = tl.load(seen + projection, mask=ok, other=0) != 0
+        projection_index = (first_image + view) * queries + query
+        visible = tl.load(seen + projection_index, mask=valid, other=0) != 0
         if tl.max(visible.to(tl.int32), axis=0) != 0:
-            point = (projection * heads + head) * 2
-            x = tl.load(uv + point, mask=visible, other=0.0) * width
-            y = tl.load(uv + point + 1, mask=visible, other=0.0) * height
-            start = ((image + view) * height * width * heads + head) * C
+            uv_offset = (projection_index * heads + head) * 2
+            x = tl.load(uv + uv_offset, mask=visible, other=0.0) * width
+            y = tl.load(uv + uv_offset + 1, mask=visible, other=0.0) * height
+            head_offset = ((first_image + view) * height * width * heads + head) * C
             for s in range(S):
                 weight = tl.load(weights + row * S + s, mask=visible, other=0.0)
                 at_x = x + tl.load(offsets + 2 * s).to(tl.float32)
@@ -108,28 +124,32 @@ def forward_kernel(
                     dx = at_x - left
                     dy = at_y - top
                     for corner in tl.static_range(4):
-                        cell, inside = find_corner(
+                        pixel_index, inside = find_corner(
                             left + corner % 2,
                             top + corner // 2,
-                            ok=visible,
+                            valid=visible,
                             height=height,
                             width=width,
                         )
-                        across = dx if corner % 2 else 1 - dx
-                        down = dy if corner // 2 else 1 - dy
-                        share = weight * across * down
-                        at = (start + cell * (heads * C))[:, None] + channel[None, :]
-                        mask = inside[:, None] & exists[None, :]
-                        pixel = tl.load(value + at, mask=mask, other=0.0).to(tl.float32)
-                        total += pixel * (share * inside.to(tl.float32))[:, None]
+                        weight_x = dx if corner % 2 else 1 - dx
+                        weight_y = dy if corner // 2 else 1 - dy
+                        corner_weight = weight * weight_x * weight_y
+                        pixel_offset = head_offset + pixel_index * (heads * C)
+                        channel_offsets = pixel_offset[:, None] + channel[None, :]
+                        mask = inside[:, None] & is_channel[None, :]
+                        pixel = tl.load(value + channel_offsets, mask=mask, other=0.0).to(
+                            tl.float32
+                        )
+                        total += pixel * (corner_weight * inside.to(tl.float32))[:, None]
                 else:
-                    cell = _nearest(at_y, height) * width + _nearest(at_x, width)
-                    at = (start + cell * (heads * C))[:, None] + channel[None, :]
-                    mask = visible[:, None] & exists[None, :]
-                    pixel = tl.load(value + at, mask=mask, other=0.0).to(tl.float32)
+                    pixel_index = _nearest(at_y, height) * width + _nearest(at_x, width)
+                    pixel_offset = head_offset + pixel_index * (heads * C)
+                    channel_offsets = pixel_offset[:, None] + channel[None, :]
+                    mask = visible[:, None] & is_channel[None, :]
+                    pixel = tl.load(value + channel_offsets, mask=mask, other=0.0).to(tl.float32)
                     total += pixel * weight[:, None]
-    output = out + row[:, None] * C + channel[None, :]
-    tl.store(output, total, mask=ok[:, None] & exists[None, :])
+    out_pointers = out + row[:, None] * C + channel[None, :]
+    tl.store(out_pointers, total, mask=valid[:, None] & is_channel[None, :])
 
 
 @triton.jit
@@ -183,22 +203,22 @@ def backward_kernel(
         CP: C rounded up to a power of two.
         ROWS: Number of rows of a program.
     """
-    row, ok, image, query, head, channel = _rows(
-        rows, queries, heads=heads, views=views, C=C, CP=CP, ROWS=ROWS
+    row, valid, first_image, query, head, channel = _locate_rows(
+        rows, queries, heads=heads, views=views, CP=CP, ROWS=ROWS
     )
-    exists = channel < C
-    output = grads + row[:, None] * C + channel[None, :]
-    grad = tl.load(output, mask=ok[:, None] & exists[None, :], other=0.0)
-    index = tl.arange(0, SP)
-    row_grads = tl.zeros((ROWS, SP), dtype=tl.float32)
+    is_channel = channel < C
+    grad_pointers = grads + row[:, None] * C + channel[None, :]
+    grad = tl.load(grad_pointers, mask=valid[:, None] & is_channel[None, :], other=0.0)
+    samples = tl.arange(0, SP)
+    weight_grads = tl.zeros((ROWS, SP), dtype=tl.float32)
     for view in range(views):
-        projection = (image + view) * queries + query
-        visible = tl.load(seen + projection, mask=ok, other=0) != 0
+        projection_index = (first_image + view) * queries + query
+        visible = tl.load(seen + projection_index, mask=valid, other=0) != 0
         if tl.max(visible.to(tl.int32), axis=0) != 0:
-            point = (projection * heads + head) * 2
-            x = tl.load(uv + point, mask=visible, other=0.0) * width
-            y = tl.load(uv + point + 1, mask=visible, other=0.0) * height
-            start = ((image + view) * height * width * heads + head) * C
+            uv_offset = (projection_index * heads + head) * 2
+            x = tl.load(uv + uv_offset, mask=visible, other=0.0) * width
+            y = tl.load(uv + uv_offset + 1, mask=visible, other=0.0) * height
+            head_offset = ((first_image + view) * height * width * heads + head) * C
             grad_x = tl.zeros((ROWS,), dtype=tl.float32)
             grad_y = tl.zeros((ROWS,), dtype=tl.float32)
             for s in range(S):
@@ -214,49 +234,59 @@ def backward_kernel(
                     dx = at_x - left
                     dy = at_y - top
                     for corner in tl.static_range(4):
-                        cell, inside = find_corner(
+                        pixel_index, inside = find_corner(
                             left + corner % 2,
                             top + corner // 2,
-                            ok=visible,
+                            valid=visible,
                             height=height,
                             width=width,
                         )
-                        across = dx if corner % 2 else 1 - dx
-                        down = dy if corner // 2 else 1 - dy
-                        at = (start + cell * (heads * C))[:, None] + channel[None, :]
-                        mask = inside[:, None] & exists[None, :]
-                        pixel = tl.load(value + at, mask=mask, other=0.0).to(tl.float32)
-                        share = grad * (weight * across * down)[:, None]
-                        tl.atomic_add(grad_value + at, share, mask=mask, sem="relaxed")
+                        weight_x = dx if corner % 2 else 1 - dx
+                        weight_y = dy if corner // 2 else 1 - dy
+                        pixel_offset = head_offset + pixel_index * (heads * C)
+                        channel_offsets = pixel_offset[:, None] + channel[None, :]
+                        mask = inside[:, None] & is_channel[None, :]
+                        pixel = tl.load(value + channel_offsets, mask=mask, other=0.0).to(
+                            tl.float32
+                        )
+                        pixel_grad = grad * (weight * weight_x * weight_y)[:, None]
+                        tl.atomic_add(
+                            grad_value + channel_offsets, pixel_grad, mask=mask, sem="relaxed"
+                        )
                         product = tl.sum(grad * pixel, axis=1)
-                        grad_weight += product * across * down
-                        grad_x += product * weight * down * (1 if corner % 2 else -1)
-                        grad_y += product * weight * across * (1 if corner // 2 else -1)
+                        grad_weight += product * weight_x * weight_y
+                        slope_x = 1 if corner % 2 else -1  # derivative of weight_x
+                        slope_y = 1 if corner // 2 else -1
+                        grad_x += product * weight * weight_y * slope_x
+                        grad_y += product * weight * weight_x * slope_y
                 else:
-                    cell = _nearest(at_y, height) * width + _nearest(at_x, width)
-                    at = (start + cell * (heads * C))[:, None] + channel[None, :]
-                    mask = visible[:, None] & exists[None, :]
-                    pixel = tl.load(value + at, mask=mask, other=0.0).to(tl.float32)
-                    share = grad * weight[:, None]
-                    tl.atomic_add(grad_value + at, share, mask=mask, sem="relaxed")
+                    pixel_index = _nearest(at_y, height) * width + _nearest(at_x, width)
+                    pixel_offset = head_offset + pixel_index * (heads * C)
+                    channel_offsets = pixel_offset[:, None] + channel[None, :]
+                    mask = visible[:, None] & is_channel[None, :]
+                    pixel = tl.load(value + channel_offsets, mask=mask, other=0.0).to(tl.float32)
+                    pixel_grad = grad * weight[:, None]
+                    tl.atomic_add(
+                        grad_value + channel_offsets, pixel_grad, mask=mask, sem="relaxed"
+                    )
                     grad_weight += tl.sum(grad * pixel, axis=1)
-                row_grads += tl.where(index[None, :] == s, grad_weight[:, None], 0.0)
-            if BILINEAR:
-                tl.store(grad_uv + point, grad_x * width, mask=visible)
-                tl.store(grad_uv + point + 1, grad_y * height, mask=visible)
-    sums = grad_weights + row[:, None] * S + index[None, :]
-    tl.store(sums, row_grads, mask=ok[:, None] & (index < S)[None, :])
+                weight_grads += tl.where(samples[None, :] == s, grad_weight[:, None], 0.0)
+            if BILINEAR:  # a rounded position has no gradient
+                tl.store(grad_uv + uv_offset, grad_x * width, mask=visible)
+                tl.store(grad_uv + uv_offset + 1, grad_y * height, mask=visible)
+    weight_pointers = grad_weights + row[:, None] * S + samples[None, :]
+    tl.store(weight_pointers, weight_grads, mask=valid[:, None] & (samples < S)[None, :])
 
 
-def _layout(value, weights):
-    """Number of rows, sizes that are compiled in, and grid of the programs."""
+def _plan_launch(value, weights):
+    """Number of rows, sizes that are constants of the compiled kernel, and grid of the programs."""
     batch, queries, heads, samples = weights.shape
     channels = value.shape[4]
     padded_channels = max(16, triton.next_power_of_2(channels))
-    rows_each = max(1, BLOCK // padded_channels)
+    rows_per_program = max(1, BLOCK // padded_channels)
     rows = batch * queries * heads
-    sizes = {"S": samples, "C": channels, "CP": padded_channels, "ROWS": rows_each}
-    return rows, sizes, (triton.cdiv(rows, rows_each),)
+    sizes = {"S": samples, "C": channels, "CP": padded_channels, "ROWS": rows_per_program}
+    return rows, sizes, (triton.cdiv(rows, rows_per_program),)
 
 
 def sample_kernels(value, uv, weights, seen, offsets, height, width, bilinear):
@@ -280,7 +310,7 @@ def sample_kernels(value, uv, weights, seen, offsets, height, width, bilinear):
     shape = (batch, queries, heads, value.shape[4])
     out = torch.empty(shape, dtype=torch.float32, device=value.device)
     if out.numel():
-        rows, sizes, grid = _layout(value, weights)
+        rows, sizes, grid = _plan_launch(value, weights)
         with torch.cuda.device_of(value):
             forward_kernel[grid](
                 value.contiguous(),
@@ -318,13 +348,14 @@ def sample_kernels_backward(grads, value, uv, weights, seen, offsets, height, wi
         bilinear: Interpolate between pixels instead of rounding to one.
 
     Returns:
-        Gradients of the maps, the points and the weights.
+        Gradients of the maps, in the dtype of ``value`` (B, V, h * w, heads, C); of the points,
+        float32 (B, V, Q, heads, 2); and of the weights, float32 (B, Q, heads, S).
     """
     grad_value = torch.zeros(value.shape, dtype=torch.float32, device=value.device)
     grad_uv = torch.zeros(uv.shape, dtype=torch.float32, device=value.device)
     grad_weights = torch.zeros(weights.shape, dtype=torch.float32, device=value.device)
     if grads.numel():
-        rows, sizes, grid = _layout(value, weights)
+        rows, sizes, grid = _plan_launch(value, weights)
         with torch.cuda.device_of(value):
             backward_kernel[grid](
                 grads.contiguous(),

@@ -1,4 +1,4 @@
-# Triton infers the types of its kernels:
+# Functions of Triton have no types, since Triton infers them.
 # mypy: disable-error-code="no-untyped-def"
 """Triton kernels: the raster loss by separable blurs, in float32.
 

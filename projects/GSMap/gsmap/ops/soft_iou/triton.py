@@ -1,4 +1,4 @@
-# Triton infers the types of its kernels:
+# Functions of Triton have no types, since Triton infers them.
 # mypy: disable-error-code="no-untyped-def"
 """Triton kernel: sum of minima of each pair of masks.
 
