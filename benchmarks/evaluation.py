@@ -73,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def generated_frames(
     count: int, seed: int = 0, size_m: Sequence[float] = (30.0, 60.0)
 ) -> list[Record]:
-    """Frames like a validation set's: lines across the range and crossings, with noise.
+    """Frames like the ones of a validation set: lines across the range and crossings, with noise.
 
     Args:
         count: Number of frames.
@@ -118,9 +118,9 @@ def _random_element(rng: np.random.Generator, label: int) -> np.ndarray:
 def _add_noise(line: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Resample a polyline to 20 points and shift it, in metres. (P, 2) -> (20, 2)"""
     vertices = np.arange(len(line))
-    at = np.linspace(0, len(line) - 1, num=20)
-    x = np.interp(at, vertices, line[:, 0])
-    y = np.interp(at, vertices, line[:, 1])
+    positions = np.linspace(0, len(line) - 1, num=20)
+    x = np.interp(positions, vertices, line[:, 0])
+    y = np.interp(positions, vertices, line[:, 1])
     shift_m = rng.normal(scale=rng.uniform(low=0, high=1.0), size=2)
     return np.stack([x, y], axis=1) + shift_m
 

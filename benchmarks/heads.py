@@ -57,7 +57,7 @@ class Task:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``benchmarks heads`` to a parser."""
     parser.add_argument("config", type=Path, help="config of backbone, encoder and data")
-    parser.add_argument("checkpoint", help="of that config, or the name of a model")
+    parser.add_argument("checkpoint", help="checkpoint of the config, or name of a model")
     parser.add_argument(
         "variants", type=Path, help='JSON file, {"name": "CONFIG KEY=VALUE ...", ...}'
     )

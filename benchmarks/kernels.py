@@ -300,7 +300,7 @@ def random_locations(shape: tuple[int, ...], size: tuple[int, int]) -> Tensor:
 
 
 def kernel_sampling_cases(reduced: bool) -> Iterator[Case]:
-    """GKT as in MapTR's encoder, and with points between pixels as in MapQR's."""
+    """GKT as in the encoder of MapTR, and with points between pixels as in the one of MapQR."""
     shape = (15, 25)
     rows, columns = (6, 4) if reduced else (200, 100)
     y, x = torch.meshgrid(
@@ -362,7 +362,8 @@ def raster_cases(reduced: bool) -> Iterator[Case]:
     def loss(backend: str, preds: Tensor, targets: Tensor) -> Tensor:
         return raster_loss(preds, targets.detach(), backend=backend)
 
-    for count in (2,) if reduced else (90, 360):
+    counts = (2,) if reduced else (90, 360)
+    for count in counts:
         lines = random_polylines(count, grid)
         means, scales, rotations = gaussians_along(lines, (1.0, 0.4))
         for kernel in ("render_gaussians", "render_gaussians_in_warps"):

@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=int,
         nargs=2,
         metavar=("H", "W"),
-        help="image size (default: that of the config)",
+        help="image size (default: the size in the config)",
     )
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--threads", type=int, default=2)
@@ -77,7 +77,7 @@ def build(path: str, args: argparse.Namespace, raster: str = "") -> Any:
         path: Config file.
         args: Parsed options of ``add_arguments``.
         raster: Rows and columns of the raster of the head's masks, such as ``200x100``; empty for
-            the config's.
+            the size in the config.
 
     Returns:
         The model on the device of the options.
@@ -150,7 +150,7 @@ def model_and_batch(
         args: Parsed options of ``add_arguments``.
         batch: Number of samples, >= 1.
         raster: Rows and columns of the raster of the head's masks, such as ``200x100``; empty for
-            the config's.
+            the size in the config.
         num_elements: Number of elements in each sample's ground truth.
 
     Returns:

@@ -45,7 +45,9 @@ NAMES |= {"argmax": "argmin", "minimum": "maximum", "maximum": "minimum"}
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``benchmarks mutations`` to a parser."""
-    parser.add_argument("--rooms", nargs="+", choices=ROOMS, default=list(ROOMS), help="of code")
+    parser.add_argument(
+        "--rooms", nargs="+", choices=ROOMS, default=list(ROOMS), help="folders of code to change"
+    )
     parser.add_argument("--modules", nargs="+", help="only these, such as gsmap.structures.grid")
     parser.add_argument("--number", type=int, default=60, help="mutants, spread over the rooms")
     parser.add_argument("--seed", type=int, default=0, help="which places are drawn")

@@ -35,13 +35,13 @@ def pose_messages(
     velocity = (after[:, :3, 3] - before[:, :3, 3]) / (2 * STEP_S)
     motion = (after[:, :3, 3] - 2 * now[:, :3, 3] + before[:, :3, 3]) / STEP_S**2
     acceleration = motion + np.array([0.0, 0.0, GRAVITY])
-    turn = Rotation.from_matrix(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
+    rotation = Rotation.from_matrix(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
     fields = {
         "pos": now[:, :3, 3],
         "orientation": Rotation.from_matrix(now[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]],
         "vel": np.einsum("nij,nj->ni", car_from_world, velocity),
         "accel": np.einsum("nij,nj->ni", car_from_world, acceleration),
-        "rotation_rate": turn.as_rotvec() / (2 * STEP_S),
+        "rotation_rate": rotation.as_rotvec() / (2 * STEP_S),
     }
     messages = []
     for i, time_s in enumerate(times):

@@ -81,14 +81,14 @@ def make_junction(node: int, arms: list[tuple[int, bool]], roads: list[Road]) ->
     ring = []
     for i in range(len(arms)):
         j = (i + 1) % len(arms)
-        turn = float(np.arccos(np.clip(-outward[i] @ outward[j], -1, 1)))
+        turn_rad = float(np.arccos(np.clip(-outward[i] @ outward[j], -1, 1)))
         corner = hermite(
             start=mouths[i][-1],
             start_dir=-outward[i],
             end=mouths[j][0],
             end_dir=outward[j],
             count=12,
-            pull=1.0 + 0.25 * turn,
+            pull=1.0 + 0.25 * turn_rad,
         )
         corners.append(corner)
         ring += [mouths[i], corner[1:-1]]

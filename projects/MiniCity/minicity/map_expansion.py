@@ -207,9 +207,9 @@ class MapWriter:
         """
         lengths = arc_lengths(center)
         count = max(1, round(lengths[-1] / PIECE_M))
-        at = np.linspace(0.0, lengths[-1], num=count + 1)
-        x = np.interp(at, lengths, center[:, 0])
-        y = np.interp(at, lengths, center[:, 1])
+        arc_m = np.linspace(0.0, lengths[-1], num=count + 1)
+        x = np.interp(arc_m, lengths, center[:, 0])
+        y = np.interp(arc_m, lengths, center[:, 1])
         points = np.stack([x, y], axis=1)
         pieces = []
         for a, b in pairwise(points):

@@ -203,10 +203,10 @@ def _arrows(road: Road) -> list[Array]:
     ):
         if stop is None or len(edges) < 3 or road.length_m < 40:
             continue
-        at = stop[0] - 7.0 if sign > 0 else stop[1] + 7.0
-        forward = unit(road.direction(at)) * sign
+        arc_m = stop[0] - 7.0 if sign > 0 else stop[1] + 7.0
+        forward = unit(road.direction(arc_m)) * sign
         side = np.array([-forward[1], forward[0]])
         for inner, outer in pairwise(edges):
-            base = road.point(at, 0.5 * (inner + outer))
+            base = road.point(arc_m, 0.5 * (inner + outer))
             arrows.append(base + _ARROW[:, :1] * forward + _ARROW[:, 1:] * side)
     return arrows

@@ -186,8 +186,9 @@ def vehicle_shadow(vehicle: Vehicle, lighting: Lighting) -> Array:
     base = half @ np.array([[c, s], [-s, c]]) + vehicle.center[:2]
     if lighting.shadow <= 0:
         return base
-    cast = -lighting.sun[:2] / max(float(lighting.sun[2]), LOWEST_SUN) * vehicle.size[2]
-    hull = cv2.convexHull(np.concatenate([base, base + cast]).astype(np.float32))
+    height = vehicle.size[2]
+    shadow_shift = -lighting.sun[:2] / max(float(lighting.sun[2]), LOWEST_SUN) * height
+    hull = cv2.convexHull(np.concatenate([base, base + shadow_shift]).astype(np.float32))
     return hull[:, 0].astype(float)
 
 

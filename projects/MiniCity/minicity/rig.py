@@ -50,9 +50,9 @@ class CameraMount:
     @property
     def ego_from_cam(self) -> Array:
         """Pose of the camera in the ego frame, in metres. (4, 4)"""
-        turn = Rotation.from_euler("z", self.yaw_deg, degrees=True)
+        rotation = Rotation.from_euler("z", self.yaw_deg, degrees=True)
         pose = np.eye(4)
-        pose[:3, :3] = turn.as_matrix() @ _CAMERA_AXES
+        pose[:3, :3] = rotation.as_matrix() @ _CAMERA_AXES
         pose[:3, 3] = self.position
         return pose
 

@@ -168,9 +168,9 @@ class Road:
         """
         end_m = self.length_m if end_m is None else end_m
         inner = self._lengths[(self._lengths > start_m + 0.05) & (self._lengths < end_m - 0.05)]
-        at = np.concatenate([[start_m], inner, [end_m]])
-        points = interpolate(self.center, self._lengths, at=at)
-        return points + offset_m * interpolate(self._normals, self._lengths, at=at)
+        arc_m = np.concatenate([[start_m], inner, [end_m]])
+        points = interpolate(self.center, self._lengths, at=arc_m)
+        return points + offset_m * interpolate(self._normals, self._lengths, at=arc_m)
 
     def band(
         self, right_m: float, left_m: float, start_m: float = 0.0, end_m: float | None = None
@@ -213,9 +213,9 @@ class Road:
 
     def point(self, at_m: float, offset_m: float) -> Array:
         """Point at an arc length and an offset, in metres. (2,)"""
-        at = np.array([at_m])
-        normal = interpolate(self._normals, self._lengths, at=at)[0]
-        return interpolate(self.center, self._lengths, at=at)[0] + offset_m * normal
+        arc_m = np.array([at_m])
+        normal = interpolate(self._normals, self._lengths, at=arc_m)[0]
+        return interpolate(self.center, self._lengths, at=arc_m)[0] + offset_m * normal
 
     def carriageways(self) -> list[tuple[float, float]]:
         """Offsets (right, left) of each kerb-to-kerb surface: two for a road with a median."""

@@ -20,7 +20,7 @@ from minicity.lidar import footprint_array, scan, vehicle_footprints
 from minicity.lighting import Lighting, random_lighting
 from minicity.meshes import FrozenMesh, Mesh, add_building, add_pole, add_tree
 from minicity.paint import make_scene_map
-from minicity.renderer import SceneRenderer
+from minicity.renderer import LOWEST_SUN, SceneRenderer
 from minicity.rig import (
     CAMERAS,
     CameraMount,
@@ -393,8 +393,8 @@ def _make_surroundings(
     """
     mesh = Mesh()
     shadows = []
-    # Shift of the shadow of a point per metre of its height. A low sun counts as a higher one.
-    shadow_shift = -lighting.sun[:2] / max(float(lighting.sun[2]), 0.2)
+    # Shift of the shadow of a point per metre of its height.
+    shadow_shift = -lighting.sun[:2] / max(float(lighting.sun[2]), LOWEST_SUN)
 
     def track_distance(points: Array) -> Array:
         """Distance of points (n, 2) from the track in metres. (n,)"""

@@ -182,7 +182,7 @@ def zebra(side_a: Array, side_b: Array, stripe_m: float = 0.5, gap_m: float = 0.
 
 def _points_at_shares(line: Array, lengths: Array, shares: Array) -> Array:
     """Points of a polyline (n, 2) at shares (k,) of its length, in [0, 1]. (k, 2)"""
-    at = shares * lengths[-1]
-    x = np.interp(at, lengths, line[:, 0])
-    y = np.interp(at, lengths, line[:, 1])
+    arc_m = shares * lengths[-1]
+    x = np.interp(arc_m, lengths, line[:, 0])
+    y = np.interp(arc_m, lengths, line[:, 1])
     return np.stack([x, y], axis=1)

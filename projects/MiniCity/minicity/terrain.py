@@ -101,12 +101,12 @@ class Terrain:
         """
         direction, _ = self._rays(rows)
         hits = self.camera.center[:2] + self.distances(rows)[..., None] * direction
-        at = np.arange(self.camera.width)
+        image_columns = np.arange(self.camera.width)
         left = np.clip(
-            np.searchsorted(self.columns, at, side="right") - 1, 0, len(self.columns) - 2
+            np.searchsorted(self.columns, image_columns, side="right") - 1, 0, len(self.columns) - 2
         )
         span = self.columns[left + 1] - self.columns[left]
-        share = ((at - self.columns[left]) / span)[None, :, None]
+        share = ((image_columns - self.columns[left]) / span)[None, :, None]
         return hits[:, left] * (1 - share) + hits[:, left + 1] * share
 
     def _rays(self, rows: Array) -> tuple[Array, Array]:

@@ -270,20 +270,20 @@ def _add_buildings(town: Town, blocked: Polygon, rng: np.random.Generator) -> No
     for road in town.roads:
         dense = rng.random() < 0.75
         for sign, kerb in ((1, road.section.left_m), (-1, -road.section.right_m)):
-            at = float(rng.uniform(low=0, high=10))
-            while at < road.length_m - 5:
+            arc_m = float(rng.uniform(low=0, high=10))
+            while arc_m < road.length_m - 5:
                 front = float(rng.uniform(low=8, high=16))
                 depth = 3.0 if dense else 9.0
                 setback = road.style.walkway_m + float(rng.uniform(low=1.0, high=depth))
                 house = _draw_building(
                     road=road,
-                    at_m=min(at + front / 2, road.length_m - 0.1),
+                    at_m=min(arc_m + front / 2, road.length_m - 0.1),
                     front_offset_m=sign * (kerb + setback),
                     front_m=front,
                     rng=rng,
                 )
                 gap = rng.uniform(low=0.5, high=3.0) if dense else rng.uniform(low=4, high=25)
-                at += front + float(gap)
+                arc_m += front + float(gap)
                 outline = Polygon(house.footprint)
                 center = house.footprint.mean(axis=0)
                 distances = np.abs(centers - center).max(axis=1, initial=0.0)
@@ -333,16 +333,16 @@ def _add_furniture(town: Town, rng: np.random.Generator) -> None:
         tree_share = rng.random()
         for sign, kerb in ((1, road.section.left_m), (-1, -road.section.right_m)):
             first_tree = rng.uniform(low=3, high=12)
-            for at in np.arange(first_tree, road.length_m - 3, 11.0):
+            for arc_m in np.arange(first_tree, road.length_m - 3, 11.0):
                 back = road.style.walkway_m + 1.0
                 if rng.random() < 0.6:
                     back = float(rng.uniform(low=0.9, high=1.5))
-                x, y = road.point(float(at), sign * (kerb + back))
+                x, y = road.point(float(arc_m), sign * (kerb + back))
                 if rng.random() < tree_share and not keep_clear.contains(shapely.Point(x, y)):
                     trees.append([x, y, rng.uniform(low=3.5, high=7.5)])
             first_pole = rng.uniform(low=2, high=20)
-            for at in np.arange(first_pole, road.length_m - 2, 27.0):
-                x, y = road.point(float(at), sign * (kerb + 0.65))
+            for arc_m in np.arange(first_pole, road.length_m - 2, 27.0):
+                x, y = road.point(float(arc_m), sign * (kerb + 0.65))
                 if not keep_clear.contains(shapely.Point(x, y)):
                     poles.append([x, y, rng.uniform(low=5.0, high=8.0)])
     town.trees = np.array(trees).reshape(-1, 3)

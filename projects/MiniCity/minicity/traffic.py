@@ -65,14 +65,14 @@ class Drive:
         """Position x, y in metres and heading in radians at a time in seconds."""
         lengths: list[float] = self._lengths  # type: ignore[attr-defined]
         rows: list[list[float]] = self._rows  # type: ignore[attr-defined]
-        at = min(max(self.start_m + self.speed * time_s, 0.0), lengths[-1])
-        i = min(max(bisect_right(lengths, at) - 1, 0), len(lengths) - 2)
-        share = (at - lengths[i]) / (lengths[i + 1] - lengths[i])
+        arc_m = min(max(self.start_m + self.speed * time_s, 0.0), lengths[-1])
+        i = min(max(bisect_right(lengths, arc_m) - 1, 0), len(lengths) - 2)
+        share = (arc_m - lengths[i]) / (lengths[i + 1] - lengths[i])
         x, y, dx, dy = [a + share * (b - a) for a, b in zip(rows[i], rows[i + 1], strict=True)]
         norm = math.hypot(dx, dy)
         dx = dx / norm
         dy = dy / norm
-        phase = self.swing_rad + at / SWING_M
+        phase = self.swing_rad + arc_m / SWING_M
         side = self.shift_m + self.swing_m * math.sin(phase)
         slope = self.swing_m * math.cos(phase) / SWING_M
         return x - side * dy, y + side * dx, math.atan2(dy, dx) + math.atan(slope)
@@ -264,21 +264,21 @@ def _moving_vehicles(
     for lane in town.lanes.values():
         if not _is_near(lane.center[::6], track):
             continue
-        at = float(rng.uniform(low=0, high=40))
+        arc_m = float(rng.uniform(low=0, high=40))
         lane_m = float(arc_lengths(lane.center)[-1])
         driving_speed = rng.uniform(low=4, high=12)
         speed = float(rng.choice([0.0, driving_speed], p=[0.25, 0.75]))
-        while at < lane_m:
+        while arc_m < lane_m:
             drive = Drive(
-                path=follow_lanes(town, lane, length_m=at + speed * 20, rng=rng),
+                path=follow_lanes(town, lane, length_m=arc_m + speed * 20, rng=rng),
                 speed=speed,
-                start_m=at,
+                start_m=arc_m,
                 swing_m=0.1,
                 swing_rad=float(rng.uniform(low=0, high=6)),
                 shift_m=float(rng.normal(loc=0, scale=0.1)),
             )
             actors.append(Actor(_random_vehicle(rng, f"m{len(actors)}"), drive=drive))
-            at += float(rng.uniform(low=12, high=60)) / density
+            arc_m += float(rng.uniform(low=12, high=60)) / density
     return actors
 
 
@@ -303,13 +303,13 @@ def _parked_vehicles(
             (section.right_m + 1.15, section.right_shoulder_m, 0.0),
             (section.left_m - 1.15, section.left_shoulder_m, left_turn),
         ):
-            at = float(rng.uniform(low=4, high=12))
-            while width > 2 and at < road.length_m - 12:
+            arc_m = float(rng.uniform(low=4, high=12))
+            while width > 2 and arc_m < road.length_m - 12:
                 if rng.random() < 0.55 * density + 0.15:
                     car = _random_vehicle(rng, f"p{len(actors)}", only_cars=True)
-                    yaw = road.direction(at) + turn
-                    actors.append(_actor_at_rest(car, road.point(at, offset), yaw=yaw))
-                at += 6.2
+                    yaw = road.direction(arc_m) + turn
+                    actors.append(_actor_at_rest(car, road.point(arc_m, offset), yaw=yaw))
+                arc_m += 6.2
     for park in town.carparks:
         if not _is_near(park.slots[:, :2], track):
             continue
@@ -326,7 +326,7 @@ def _people(town: Town, track: Array, rng: np.random.Generator) -> list[Actor]:
     for road in town.roads:
         if not _is_near(road.center[::6], track):
             continue
-        for at, offset in _people_spots(road, rng):
+        for arc_m, offset in _people_spots(road, rng):
             height = round(float(rng.uniform(low=1.5, high=1.9)), 3)
             person = Vehicle(
                 category="human.pedestrian.adult",
@@ -337,7 +337,7 @@ def _people(town: Town, track: Array, rng: np.random.Generator) -> list[Actor]:
                 identity=f"w{len(actors)}",
             )
             yaw = float(rng.uniform(low=0, high=6.28))
-            actors.append(_actor_at_rest(person, road.point(at, offset), yaw=yaw))
+            actors.append(_actor_at_rest(person, road.point(arc_m, offset), yaw=yaw))
     return actors
 
 
@@ -347,11 +347,11 @@ def _people_spots(road: Road, rng: np.random.Generator) -> list[tuple[float, flo
     spots = []
     for _ in range(int(road.length_m / 18)):
         offset = section.right_m - 1.2 if rng.random() < 0.5 else section.left_m + 1.2
-        at = float(rng.uniform(low=0, high=road.length_m))
-        spots.append((at, offset))
+        arc_m = float(rng.uniform(low=0, high=road.length_m))
+        spots.append((arc_m, offset))
     for start, end in road.crossings:
         if rng.random() < 0.4:
-            at = float(rng.uniform(low=start, high=end))
+            arc_m = float(rng.uniform(low=start, high=end))
             offset = float(rng.uniform(low=section.right_m, high=section.left_m))
-            spots.append((at, offset))
+            spots.append((arc_m, offset))
     return spots

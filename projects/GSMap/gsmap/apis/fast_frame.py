@@ -196,7 +196,7 @@ class FastFrames:
         Raises:
             RuntimeError: If a frame of this size cannot be recorded.
             ValueError: If a sample lacks a field that the encoder reads, or its number of cameras
-                differs from the model's.
+                differs from the model.
         """
         samples = batch["data_samples"]
         images = batch["inputs"]["img"]

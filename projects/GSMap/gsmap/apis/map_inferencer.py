@@ -188,14 +188,15 @@ class MapInferencer:
     ) -> "VectorizedMapDataset":
         """Create the test data set of the config, with its pipeline, from other samples.
 
-        Samples in another annotation frame are transformed to the config's. If the samples have no
-        camera of the config, all of their cameras are used.
+        Samples in another annotation frame are transformed to the frame of the config. If they have
+        no camera of the config, all of their cameras are used.
 
         Args:
             source: An annotation file, a recording of ``mapdata.inputs.open_input``, or samples in
                 the annotation frame of the config.
-            data_root: Folder of the image paths. By default the folder of the file, or the config's
-                if an annotation file is not in the folder of its images.
+            data_root: Folder of the image paths. By default the folder of the file, or the
+                ``data_root`` of the config if an annotation file is not in the folder of its
+                images.
 
         Raises:
             FileNotFoundError: If a file does not exist.

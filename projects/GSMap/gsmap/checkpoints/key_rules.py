@@ -17,15 +17,15 @@ class KeyMap:
 
     Attributes:
         name: Name of the architecture.
-        rules: Pairs of key prefixes (upstream's, ours). ``{i}`` stands for a number; the numbers
+        rules: Key prefixes in pairs (upstream, here). ``{i}`` stands for a number; the numbers
             of both sides are equal, in order. The first rule that matches is applied.
         unused: Upstream keys without a counterpart, which take precedence over ``rules``, and the
             values that conversion back writes; None for a key that only some upstream models have.
-        markers: Pairs of key prefixes (upstream's, ours). If all of them are present, the keys
+        markers: Key prefixes in pairs (upstream, here). If all of them are present, the keys
             belong to this architecture, not to a method that it is built on.
         idle: Pattern of further upstream keys without a counterpart, which conversion back leaves
             out.
-        sign: Prefix of some keys of the release, which no key of this project has.
+        sign: Prefix of some upstream keys, which no key of this project has.
     """
 
     name: str

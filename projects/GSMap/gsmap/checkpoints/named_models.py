@@ -108,7 +108,7 @@ def find_checkpoint(checkpoint: str | Path) -> Path:
 
     Raises:
         FileNotFoundError: If there is no such file or model, or the model's file is absent.
-        ValueError: If the digest of the model's file differs from the registry's.
+        ValueError: If the digest of the model's file differs from the registry.
     """
     if Path(checkpoint).is_file():
         if str(checkpoint) not in named_models():

@@ -353,7 +353,7 @@ def _build_settings(
 
 
 def _with_elements_of(settings: dict[str, Any], config: dict[str, Any]) -> dict[str, Any]:
-    """Replace the memory of elements, which is not trained, by the config's.
+    """Take the memory of elements from the config, since it is not trained.
 
     Args:
         settings: Settings of the model in a checkpoint.

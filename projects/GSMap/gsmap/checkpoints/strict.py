@@ -49,7 +49,7 @@ def adapt_state(
     fit: Callable[[dict[str, Tensor]], None] | None = None,
     allow_untrained: bool = True,
 ) -> None:
-    """Rename upstream keys in a state in place, and compare the state with the model's.
+    """Rename upstream keys in a state in place, and compare the state with the model.
 
     Batch counters of BatchNorm may be missing, as in old checkpoints. Missing neutral weights are
     filled with the values of the model.

@@ -423,7 +423,8 @@ class VectorizedMapDataset(BaseDataset):
             image_sample = self.annotations[entry["image_row"]]
             image_cameras = {camera.name: camera for camera in image_sample.cameras}
         images = {}
-        for name in tuple(cameras) if self.cameras is None else self.cameras:
+        names = tuple(cameras) if self.cameras is None else self.cameras
+        for name in names:
             if name not in cameras or name not in image_cameras:
                 raise BrokenSampleError(
                     f"sample {sample.token!r} has no camera {name!r}, only {list(cameras)}: name "

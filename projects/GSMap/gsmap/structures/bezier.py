@@ -94,7 +94,7 @@ def fit_piece(points: Points, degree: int) -> Float:
 
 
 def mean_deviation(line: Float, curve: Float, ignored_m: float = 0.05) -> float:
-    """Compute the mean distance of a line and a curve, as in the release.
+    """Compute the mean distance of a line and a curve, as in the released code of BeMapNet.
 
     Args:
         line: Vertices of the line in metres, resampled to 100 points. (n, D)

@@ -189,9 +189,9 @@ class MapElements:
         """
         axis_x, axis_y = transform[:2, 0]
         cos, sin = transform[:2, 0] / np.hypot(axis_x, axis_y)
-        turn = np.eye(self.points.shape[1])
-        turn[:2, :2] = [[cos, -sin], [sin, cos]]
-        points = self.points @ turn.T + transform[: len(turn), 3]
+        rotation = np.eye(self.points.shape[1])
+        rotation[:2, :2] = [[cos, -sin], [sin, cos]]
+        points = self.points @ rotation.T + transform[: len(rotation), 3]
         rotations = self.rotations
         if rotations is not None:
             rotations = rotations + np.arctan2(sin, cos)

@@ -28,8 +28,8 @@ class Past:
     @property
     def then_from_now(self) -> Tensor:
         """Transform from the current to the previous frame in metres. (B, 4, 4)"""
-        turn = self.now_from_then[:, :3, :3].transpose(1, 2)
-        shift = -turn @ self.now_from_then[:, :3, 3:]
-        upper_rows = torch.cat([turn, shift], dim=2)
+        rotation = self.now_from_then[:, :3, :3].transpose(1, 2)
+        shift = -rotation @ self.now_from_then[:, :3, 3:]
+        upper_rows = torch.cat([rotation, shift], dim=2)
         last_row = self.now_from_then[:, 3:]
         return torch.cat([upper_rows, last_row], dim=1)

@@ -68,8 +68,8 @@ def motion_signals(
     ego_from_global = pose[:3, :3].T
     acceleration = _GRAVITY
     if end > start:
-        turn = Quaternion(matrix=first[:3, :3].T @ last[:3, :3], atol=1e-6, rtol=1e-6)
-        values[10:13] = turn.axis * turn.radians / (end - start)
+        rotation = Quaternion(matrix=first[:3, :3].T @ last[:3, :3], atol=1e-6, rtol=1e-6)
+        values[10:13] = rotation.axis * rotation.radians / (end - start)
         values[13:16] = ego_from_global @ (last - first)[:3, 3] / (end - start)
     if end > time > start:
         velocity_before = (pose - first)[:3, 3] / (time - start)
