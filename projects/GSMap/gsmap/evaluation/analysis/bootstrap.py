@@ -286,7 +286,7 @@ def _mean(values: Sequence[FloatArray]) -> FloatArray:
 
 
 def _interval(value: float, values: FloatArray) -> Interval:
-    """Create the interval of a figure from its values in the resamples, without those of NaN."""
+    """Create the interval of a figure from its values in the resamples; NaN values are left out."""
     known = values[~np.isnan(values)]
     if not len(known):
         return Interval(value, low=UNDEFINED, high=UNDEFINED)

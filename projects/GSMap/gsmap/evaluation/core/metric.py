@@ -276,8 +276,8 @@ def matches_of(token: str, arrays: Mapping[str, npt.NDArray[Any]], like: Matches
     Raises:
         ValueError: If names or shapes do not fit ``like``.
     """
-    expected = {name: values.shape for name, values in arrays_of(like).items()}
-    shapes = {name: values.shape for name, values in arrays.items()}
+    expected = _shapes(arrays_of(like))
+    shapes = _shapes(arrays)
     if not _fits_record(shapes, expected):
         raise InputError(f"shapes {shapes} where an empty sample has {expected}")
     if isinstance(like, SampleValues):
@@ -288,15 +288,20 @@ def matches_of(token: str, arrays: Mapping[str, npt.NDArray[Any]], like: Matches
     return FrameMatches(token, **arrays)
 
 
+def _shapes(arrays: Mapping[str, npt.NDArray[Any]]) -> dict[str, _Shape]:
+    """Shapes of arrays, by name."""
+    return {name: values.shape for name, values in arrays.items()}
+
+
 def _fits_record(shapes: Mapping[str, _Shape], expected: Mapping[str, _Shape]) -> bool:
-    """Whether names and shapes of arrays fit those of an empty sample."""
+    """Whether arrays have the names and the shapes of an empty sample."""
     if shapes.keys() != expected.keys():
         return False
     return all(_fits_shape(shapes[name], empty_shape=expected[name]) for name in expected)
 
 
 def _fits_shape(shape: _Shape, empty_shape: _Shape) -> bool:
-    """Whether a shape differs from that of an empty sample at most in a first axis of length 0."""
+    """Whether a shape equals the shape of an empty sample, apart from a first axis of length 0."""
     if shape == empty_shape:
         return True
     varies = len(empty_shape) > 0 and empty_shape[0] == 0

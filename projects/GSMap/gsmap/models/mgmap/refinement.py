@@ -148,7 +148,7 @@ class PatchRefinement(BaseModule):
         )
 
     def init_weights(self) -> None:
-        """Initialise all matrices but those of the layer by Xavier's normal distribution."""
+        """Initialise all matrices outside of the layer by Xavier's normal distribution."""
         for module in (*self.patch_net, *self.memory, *self.fuser):
             if isinstance(module, (nn.Conv2d, nn.Linear)):
                 nn.init.xavier_normal_(module.weight)
