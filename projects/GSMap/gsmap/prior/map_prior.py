@@ -17,6 +17,8 @@ from gsmap.prior.file_format import FARTHEST_TILE, read_header, write_tiles
 from gsmap.prior.rules import HitMissCounts, States, WriteRule
 from gsmap.prior.settings import PriorSettings
 from gsmap.prior.tiles import TileStore
+from gsmap.prior.vectors import covered_cells
+from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.rigid import is_rigid
 from gsmap.utils.errors import InputError
@@ -235,6 +237,29 @@ class MapPrior:
             flat_canvas = canvas.reshape(*canvas.shape[:2], -1)
             flat_canvas[..., touched] = self.rule.update(flat_canvas[..., touched], largest)
             self._store_canvas(window, canvas=canvas, touched=touched)
+
+    def write_map(self, elements: MapElements, width_m: float = 0.6) -> None:
+        """Write the lines and areas of a vector map, each cell that they cover as a certain hit.
+
+        Other cells do not change. Closed elements of area classes, such as crossings, are filled.
+
+        Args:
+            elements: Map in the global frame, in metres, with the classes of the prior.
+            width_m: Width of a line in metres, > 0.
+
+        Raises:
+            ValueError: If a label or a vertex is out of range, the map is too large, or ``width_m``
+                is not in (0, 10].
+        """
+        if not 0 < width_m <= 10:
+            raise InputError(f"width_m must be in (0, 10], got {width_m}.")
+        for key, covered in covered_cells(elements, self.settings, width_m):
+            with self._lock:
+                tile = self._tiles.get_to_write(key, empty=self.rule.empty)
+                for channel, mask in enumerate(covered):
+                    states = tile[:, channel, mask][:, None]  # (S, 1, n)
+                    hits = np.ones(states.shape[1:], dtype=np.float32)
+                    tile[:, channel, mask] = self.rule.update(states, hits)[:, 0]
 
     def _window(self, pose: Pose, grid: BEVGrid) -> "_Window":
         """Place the cells of a frame in the rectangle around them, in cells of the prior."""

@@ -1,0 +1,110 @@
+"""Cells of a map prior that the lines and areas of a vector map cover."""
+
+from collections import defaultdict
+from collections.abc import Iterator
+from itertools import pairwise
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gsmap.ops.polyline_raster import draw_polylines
+from gsmap.prior.file_format import TileKey
+from gsmap.prior.settings import PriorSettings
+from gsmap.structures.classes import AREA_CLASSES
+from gsmap.structures.elements import FloatArray, MapElements
+from gsmap.structures.grid import BEVGrid
+from gsmap.structures.polylines import is_closed
+from gsmap.utils.errors import InputError
+
+_MOST_PIECES = 1_000_000  # of lines and areas, in all tiles together
+_CHUNK = 64  # pieces of a tile that are drawn at a time
+_FARTHEST_M = 1e7  # largest coordinate of a vertex
+Piece = tuple[int, bool, FloatArray]
+"""Label, whether it is filled, and vertices."""
+
+
+def covered_cells(
+    elements: MapElements, settings: PriorSettings, width_m: float
+) -> Iterator[tuple[TileKey, NDArray[np.bool_]]]:
+    """Iterate over the tiles that a map touches, each with the cells that it covers.
+
+    Closed elements of `AREA_CLASSES` are filled. A cell is covered if half of it is.
+
+    Args:
+        elements: Map in the global frame, in metres.
+        settings: Classes and cells of the prior.
+        width_m: Width of a line in metres, > 0.
+
+    Returns:
+        Place of each tile, and whether an element of a class covers a cell, (C, tile_cells,
+        tile_cells).
+
+    Raises:
+        ValueError: If a label or a vertex is out of range, or the map is too large.
+    """
+    num_classes = len(settings.classes)
+    if len(elements) and not 0 <= elements.labels.min() <= elements.labels.max() < num_classes:
+        raise InputError(f"labels of elements must be in [0, {num_classes}), the prior's classes.")
+    if np.abs(elements.points[:, :2]).max(initial=0.0) > _FARTHEST_M:
+        raise InputError(f"vertices must be within {_FARTHEST_M:g} m of the origin.")
+    pieces_of_tile = _pieces_by_tile(elements, settings, width_m)
+    side = settings.tile_cells
+    extent = (0.0, settings.tile_m)
+    grid = BEVGrid(extent, extent, side, side)
+    for key, pieces in sorted(pieces_of_tile.items()):
+        corner = settings.tile_m * np.array(key)
+        covered = np.zeros((num_classes, side, side), dtype=np.bool_)
+        for first in range(0, len(pieces), _CHUNK):
+            chunk = pieces[first : first + _CHUNK]
+            lengths = [len(points) for _, _, points in chunk]
+            padded = np.zeros((len(chunk), max(lengths), 2))
+            for row, (_, _, points) in zip(padded, chunk, strict=True):
+                row[: len(points)] = points - corner
+                row[len(points) :] = points[-1] - corner
+            filled = torch.tensor([is_filled for _, is_filled, _ in chunk])
+            lines = torch.from_numpy(padded).float()
+            masks = draw_polylines(lines, grid, width_m=width_m, filled=filled).numpy() >= 0.5
+            for mask, (label, _, _) in zip(masks, chunk, strict=True):
+                covered[label] |= mask
+        if covered.any():
+            yield key, covered
+
+
+def _pieces_by_tile(
+    elements: MapElements, settings: PriorSettings, width_m: float
+) -> dict[TileKey, list[Piece]]:
+    """Distribute areas and short pieces of lines to the tiles that they may touch."""
+    pieces_of_tile: dict[TileKey, list[Piece]] = defaultdict(list)
+    num_pieces = 0
+    for line, label, _ in elements.rows:
+        if len(line) < 2:
+            continue
+        points = line[:, :2]
+        is_area = settings.classes[label] in AREA_CLASSES and is_closed(points)
+        length_m = np.hypot(*np.diff(points, axis=0).T).sum()
+        size = np.ptp(points, axis=0) / settings.tile_m + 2
+        num_pieces += int(size.prod() if is_area else length_m / settings.tile_m * 4) + len(line)
+        if num_pieces > _MOST_PIECES:
+            raise InputError(
+                f"the map covers more than {_MOST_PIECES} tiles: its coordinates are no metres, or "
+                "it must be split."
+            )
+        parts = [points] if is_area else _short_segments(points, settings.tile_m / 4)
+        for part in parts:
+            low = np.floor((part.min(axis=0) - width_m) / settings.tile_m).astype(int)
+            high = np.floor((part.max(axis=0) + width_m) / settings.tile_m).astype(int)
+            for column in range(low[0], high[0] + 1):
+                for row in range(low[1], high[1] + 1):
+                    pieces_of_tile[column, row].append((label, is_area, part))
+    return pieces_of_tile
+
+
+def _short_segments(points: FloatArray, longest_m: float) -> list[FloatArray]:
+    """Cut a line into segments of at most ``longest_m``. (P, 2) -> list of (2, 2)"""
+    segments = []
+    for start, end in pairwise(points):
+        count = max(1, int(np.ceil(np.hypot(*(end - start)) / longest_m)))
+        cuts = start + np.linspace(0, 1, count + 1)[:, None] * (end - start)
+        segments += [cuts[index : index + 2] for index in range(count)]
+    return segments
