@@ -40,6 +40,7 @@ def _draw_moment(moment: Moment, replay: Replay, width_px: int) -> np.ndarray:
     sample = frame.sample
     drive = replay.drive
     elements = frame.elements
+    # ``moment.lines`` are the lines of the frame's elements, in their order.
     predictions = MapElements.from_polylines(
         moment.lines, labels=elements.labels, scores=elements.scores
     )

@@ -187,7 +187,7 @@ def test_lines_in_metres_are_elements():
         (lambda s, e, d: (s[:, 1:], e, d), "must be .channels, H, W. of one size"),
         (lambda s, e, d: (s[0], e, d), "must be .channels, H, W. of one size"),
         (lambda s, e, d: (s[:1], e, d), "at least one class"),
-        (lambda s, e, d: (s, e, d[:20]), "no circle in steps of 10 degrees"),
+        (lambda s, e, d: (s, e, d[:20]), "no full circle in steps of 10 degrees"),
         (lambda s, e, d: (s / 0, e, d), "^semantic have values that are not finite"),
         (lambda s, e, d: (s, e * np.nan, d / 0), "^embedding and direction have values"),
     ],

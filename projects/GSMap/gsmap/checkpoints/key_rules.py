@@ -19,13 +19,15 @@ class KeyMap:
         name: Name of the architecture.
         rules: Key prefixes in pairs (upstream, here). ``{i}`` stands for a number; the numbers
             of both sides are equal, in order. The first rule that matches is applied.
-        unused: Upstream keys without a counterpart, which take precedence over ``rules``, and the
-            values that conversion back writes; None for a key that only some upstream models have.
+        unused: Upstream keys without a counterpart here, with the values that conversion to
+            upstream's format writes; None for a key that only some upstream models have. They take
+            precedence over ``rules``.
         markers: Key prefixes in pairs (upstream, here). If all of them are present, the keys
-            belong to this architecture, not to a method that it is built on.
+            belong to this architecture, not to a method that it is built on. The empty prefix of
+            the default is present in every key.
         idle: Pattern of further upstream keys without a counterpart, which conversion back leaves
             out.
-        sign: Prefix of some upstream keys, which no key of this project has.
+        sign: Prefix that only keys in upstream's format have, for telling the two formats apart.
     """
 
     name: str

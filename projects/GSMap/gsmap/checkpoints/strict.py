@@ -13,8 +13,8 @@ class AddsWeights:
     """Mixin for a module with weights that the module it extends does not have.
 
     Attributes:
-        neutral_keys: Prefixes of the state keys of additional weights that have no effect at their
-            initial values, relative to the module. A checkpoint may lack these weights.
+        neutral_keys: Prefixes, relative to the module, of the state keys of additional weights.
+            At their initial values these have no effect, so a checkpoint may lack them.
     """
 
     neutral_keys: tuple[str, ...] = ()

@@ -104,8 +104,8 @@ def read_header(
     index = bytes(content[offset : offset + index_size])
     if zlib.crc32(header) != header_crc or zlib.crc32(index) != index_crc:
         raise InputError(f"{path} is damaged: a checksum is wrong; copy or build it again.")
-    settings, rule = _parse_header(header, path)
-    places = _parse_index(index, path, start=header_end, end=offset)
+    settings, rule = _parse_header(header, path=path)
+    places = _parse_index(index, path=path, start=header_end, end=offset)
     return settings, rule, places
 
 

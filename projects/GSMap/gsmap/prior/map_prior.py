@@ -58,7 +58,8 @@ class MapPrior:
         self.rule: WriteRule = HitMissCounts() if rule is None else rule
         side = settings.tile_cells
         num_classes = len(settings.classes)
-        self._tiles = TileStore((self.rule.num_states, num_classes, side, side), memory_bytes)
+        tile_shape = (self.rule.num_states, num_classes, side, side)
+        self._tiles = TileStore(tile_shape, memory_bytes=memory_bytes)
         self._lock = threading.RLock()
         self._owner: IO[str] | None = None
         self._owned_path: Path | None = None
@@ -103,7 +104,7 @@ class MapPrior:
                 owner.close()
             raise
         prior = cls(found, rule, memory_bytes=memory_bytes)
-        prior._tiles.open(mapped, path, places=places)
+        prior._tiles.open(mapped, path=path, places=places)
         prior._owner = owner
         prior._owned_path = path.resolve() if update else None
         return prior
@@ -187,7 +188,8 @@ class MapPrior:
         window = self._window(pose, grid)
         with self._lock:
             canvas = self._load_canvas(window)
-        states = canvas.reshape(*canvas.shape[:2], -1)[..., window.cells]  # (S, C, H * W)
+        flat_canvas = _flatten_cells(canvas)
+        states = flat_canvas[..., window.cells]  # (S, C, H * W)
         values = self.rule.read(states).reshape(-1, grid.height, grid.width)
         device = pose.device if isinstance(pose, Tensor) else torch.device("cpu")
         return torch.from_numpy(values).to(device)
@@ -234,8 +236,10 @@ class MapPrior:
         touched, largest = _largest_per_cell(cells, flat_values, size=window.height * window.width)
         with self._lock:
             canvas = self._load_canvas(window)
-            flat_canvas = canvas.reshape(*canvas.shape[:2], -1)
-            flat_canvas[..., touched] = self.rule.update(flat_canvas[..., touched], largest)
+            flat_canvas = _flatten_cells(canvas)
+            flat_canvas[..., touched] = self.rule.update(
+                states=flat_canvas[..., touched], values=largest
+            )
             self._store_canvas(window, canvas=canvas, touched=touched)
 
     def write_map(self, elements: MapElements, width_m: float = 0.6) -> None:
@@ -253,13 +257,14 @@ class MapPrior:
         """
         if not 0 < width_m <= 10:
             raise InputError(f"width_m must be in (0, 10], got {width_m}.")
-        for key, covered in covered_cells(elements, self.settings, width_m):
+        for key, covered in covered_cells(elements, settings=self.settings, width_m=width_m):
             with self._lock:
                 tile = self._tiles.get_to_write(key, empty=self.rule.empty)
                 for channel, mask in enumerate(covered):
                     states = tile[:, channel, mask][:, None]  # (S, 1, n)
                     hits = np.ones(states.shape[1:], dtype=np.float32)
-                    tile[:, channel, mask] = self.rule.update(states, hits)[:, 0]
+                    updated = self.rule.update(states=states, values=hits)
+                    tile[:, channel, mask] = updated[:, 0]
 
     def _window(self, pose: Pose, grid: BEVGrid) -> "_Window":
         """Place the cells of a frame in the rectangle around them, in cells of the prior."""
@@ -296,7 +301,13 @@ class MapPrior:
         cells = (rows - first_row) * width + (columns - first_column)
         farthest = max(abs(first_column), abs(first_row)) + max(width, height)
         assert farthest < FARTHEST_TILE * self.settings.tile_cells
-        return _Window(first_column, first_row, width=width, height=height, cells=cells.ravel())
+        return _Window(
+            first_column=first_column,
+            first_row=first_row,
+            width=width,
+            height=height,
+            cells=cells.ravel(),
+        )
 
     def _load_canvas(self, window: "_Window") -> States:
         """Copy the tiles of a window to one raster. (S, C, height, width)"""
@@ -356,12 +367,12 @@ class _Window:
     def parts(self, side: int) -> list[_Part]:
         """Cut the rectangle at the borders of tiles of ``side`` cells."""
         parts = []
-        row_cuts = _cuts(self.first_row, self.height, side=side)
-        column_cuts = _cuts(self.first_column, self.width, side=side)
+        row_cuts = _cuts(first=self.first_row, length=self.height, side=side)
+        column_cuts = _cuts(first=self.first_column, length=self.width, side=side)
         for tile_row, rows, tile_rows in row_cuts:
             for tile_column, columns, tile_columns in column_cuts:
                 part = _Part(
-                    (tile_column, tile_row),
+                    key=(tile_column, tile_row),
                     columns=columns,
                     rows=rows,
                     tile_columns=tile_columns,
@@ -405,6 +416,12 @@ def _largest_per_cell(
     for channel, channel_values in zip(largest, values, strict=True):
         channel.scatter_reduce_(0, index, torch.from_numpy(channel_values), reduce="amax")
     return touched, largest.numpy()[:, touched]
+
+
+def _flatten_cells(canvas: States) -> States:
+    """View of a canvas with its rows and columns in one axis. (S, C, h, w) -> (S, C, h * w)"""
+    num_states, num_classes, height, width = canvas.shape
+    return canvas.reshape(num_states, num_classes, height * width)
 
 
 def _numpy(values: Raster) -> NDArray[Any]:

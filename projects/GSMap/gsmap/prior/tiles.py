@@ -44,7 +44,7 @@ class TileStore:
         self._spill = _SpillFile()
 
     def open(self, mapped: mmap.mmap, path: Path, places: dict[TileKey, TilePlace]) -> None:
-        """Replace the content by that of a file.
+        """Replace the content by the content of a file.
 
         Args:
             mapped: Content of the file.
@@ -106,9 +106,9 @@ class TileStore:
     def _packed(self, key: TileKey) -> bytes:
         """Compressed states of a tile; a damaged tile raises an error instead of being copied."""
         if key in self._changed:
-            return zlib.compress(self._tiles[key].tobytes(), _LEVEL)
+            return zlib.compress(self._tiles[key].tobytes(), level=_LEVEL)
         content, crc = self._stored(key)
-        unpack_tile(content, crc, num_bytes=self._tile_bytes, path=self._path)
+        unpack_tile(content, crc=crc, num_bytes=self._tile_bytes, path=self._path)
         return content
 
     def _stored(self, key: TileKey) -> tuple[bytes, int]:
@@ -129,7 +129,7 @@ class TileStore:
         if key not in self._spill.places and key not in self._file_places:
             return None
         content, crc = self._stored(key)
-        states = unpack_tile(content, crc, num_bytes=self._tile_bytes, path=self._path)
+        states = unpack_tile(content, crc=crc, num_bytes=self._tile_bytes, path=self._path)
         return np.frombuffer(states, dtype=np.uint8).reshape(self.shape)
 
     def _keep(self, key: TileKey, tile: Tile) -> None:
@@ -137,7 +137,7 @@ class TileStore:
         while len(self._tiles) >= self._most_tiles:
             oldest = next(iter(self._tiles))
             if oldest in self._changed:
-                content = zlib.compress(self._tiles[oldest].tobytes(), _LEVEL)
+                content = zlib.compress(self._tiles[oldest].tobytes(), level=_LEVEL)
                 self._spill.write(oldest, content)
                 self._changed.discard(oldest)
             del self._tiles[oldest]

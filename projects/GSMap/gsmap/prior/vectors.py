@@ -48,10 +48,10 @@ def covered_cells(
         raise InputError(f"labels of elements must be in [0, {num_classes}), the prior's classes.")
     if np.abs(elements.points[:, :2]).max(initial=0.0) > _FARTHEST_M:
         raise InputError(f"vertices must be within {_FARTHEST_M:g} m of the origin.")
-    pieces_of_tile = _pieces_by_tile(elements, settings, width_m)
+    pieces_of_tile = _pieces_by_tile(elements, settings=settings, width_m=width_m)
     side = settings.tile_cells
     extent = (0.0, settings.tile_m)
-    grid = BEVGrid(extent, extent, side, side)
+    grid = BEVGrid(x_range=extent, y_range=extent, height=side, width=side)
     for key, pieces in sorted(pieces_of_tile.items()):
         corner = settings.tile_m * np.array(key)
         covered = np.zeros((num_classes, side, side), dtype=np.bool_)
@@ -82,7 +82,7 @@ def _pieces_by_tile(
             continue
         points = line[:, :2]
         is_area = settings.classes[label] in AREA_CLASSES and is_closed(points)
-        length_m = np.hypot(*np.diff(points, axis=0).T).sum()
+        length_m = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
         size = np.ptp(points, axis=0) / settings.tile_m + 2
         num_pieces += int(size.prod() if is_area else length_m / settings.tile_m * 4) + len(line)
         if num_pieces > _MOST_PIECES:
@@ -90,7 +90,9 @@ def _pieces_by_tile(
                 f"the map covers more than {_MOST_PIECES} tiles: its coordinates are no metres, or "
                 "it must be split."
             )
-        parts = [points] if is_area else _short_segments(points, settings.tile_m / 4)
+        parts = [points]
+        if not is_area:
+            parts = _short_segments(points, longest_m=settings.tile_m / 4)
         for part in parts:
             low = np.floor((part.min(axis=0) - width_m) / settings.tile_m).astype(int)
             high = np.floor((part.max(axis=0) + width_m) / settings.tile_m).astype(int)
@@ -104,7 +106,8 @@ def _short_segments(points: FloatArray, longest_m: float) -> list[FloatArray]:
     """Cut a line into segments of at most ``longest_m``. (P, 2) -> list of (2, 2)"""
     segments = []
     for start, end in pairwise(points):
-        count = max(1, int(np.ceil(np.hypot(*(end - start)) / longest_m)))
+        length_m = np.linalg.norm(end - start)
+        count = max(1, int(np.ceil(length_m / longest_m)))
         cuts = start + np.linspace(0, 1, count + 1)[:, None] * (end - start)
         segments += [cuts[index : index + 2] for index in range(count)]
     return segments

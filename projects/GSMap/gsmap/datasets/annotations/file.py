@@ -111,7 +111,8 @@ class AnnotationWriter:
     def finish(self) -> None:
         """Write all remaining samples and the seal to the disk, under the temporary name.
 
-        Several files appear together if all are finished before the end of the first block.
+        To make several files appear together, finish all of them before any of their ``with``
+        blocks ends.
 
         Raises:
             ValueError: If a value is wrong.
@@ -132,7 +133,7 @@ class AnnotationWriter:
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         with self._resources:
             if error is not None:
-                raise error
+                raise error  # leaving the resources with an error removes the temporary file
             self.finish()
         self._write_manifest(samples=len(self))
 
@@ -276,7 +277,8 @@ class AnnotationFile(Sequence[MapSample]):
         """Raise an error if the file does not match the seal, or a value is wrong."""
         if seal is not None:
             expected = json.loads(seal)
-            checksum = dict(self._sums).get(expected["bytes"])
+            checksum_up_to = dict(self._sums)
+            checksum = checksum_up_to.get(expected["bytes"])
             num_rows = sum(map(len, self._batches))
             if checksum != expected["crc32"] or num_rows != expected["rows"]:
                 raise InputError("its checksum does not fit its content")
@@ -289,7 +291,10 @@ class AnnotationFile(Sequence[MapSample]):
             raise InputError("two samples have one token")
 
     def _current_state(self) -> tuple[int, int, int]:
-        """Return size and time of the file, which change with a write, and the process id."""
+        """Return size and time of the file, and the process id.
+
+        Size and time change with a write. A forked process checks the file again.
+        """
         status = os.fstat(self._map.fileno())
         return status.st_size, status.st_mtime_ns, os.getpid()
 
@@ -307,6 +312,7 @@ class AnnotationFile(Sequence[MapSample]):
             return
         size = state[0]
         if size == self._content.size:
+            # The start of the file and the schema come before the first batch.
             start, previous_checksum = self._sums[number + 1]
             end, checksum = self._sums[number + 2]
             content = memoryview(self._content)[start:end]
@@ -372,8 +378,8 @@ class AnnotationFile(Sequence[MapSample]):
         _, scenes = np.unique(names, return_inverse=True)
         seconds = np.asarray(self.seconds_into_scene)
         order = np.lexsort((seconds, scenes))
-        has_one_scene = np.diff(scenes[order]) == 0
-        steps = np.diff(seconds[order])[has_one_scene]
+        is_within_scene = np.diff(scenes[order]) == 0
+        steps = np.diff(seconds[order])[is_within_scene]
         if not len(steps):
             return
         ratio = np.median(steps) * wanted_hz

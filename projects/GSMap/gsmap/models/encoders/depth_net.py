@@ -13,7 +13,7 @@ CAMERA_VECTOR_SIZE = 22
 def _conv_bn_relu(
     in_channels: int, out_channels: int, kernel_size: int, dilation: int = 1
 ) -> nn.Sequential:
-    """Build a size-keeping convolution with BatchNorm and ReLU, under the released names."""
+    """Build a size-keeping convolution with BatchNorm and ReLU, with the released layer names."""
     padding = dilation * (kernel_size // 2)
     conv = nn.Conv2d(
         in_channels, out_channels, kernel_size, padding=padding, dilation=dilation, bias=False
@@ -23,7 +23,7 @@ def _conv_bn_relu(
 
 
 def _camera_mlp(channels: int) -> nn.Sequential:
-    """Build the embedding of a camera's parameter vector, under the released parameter names."""
+    """Build the embedding of a camera's parameter vector, with the released layer names."""
     first = nn.Linear(CAMERA_VECTOR_SIZE, channels)
     second = nn.Linear(channels, channels)
     return nn.Sequential(OrderedDict(fc1=first, relu=nn.ReLU(), fc2=second))
@@ -37,8 +37,8 @@ def camera_vector(cam2img: Tensor, img_aug_matrix: Tensor, ego_from_cam: Tensor)
 
     Args:
         cam2img: Intrinsics of the original image, in pixels. (..., >= 3, >= 3)
-        img_aug_matrix: Augmentation, which acts on (u * d, v * d, d, 1); its translation in pixels
-            is in the third column. (..., 4, 4)
+        img_aug_matrix: Augmentation, which acts on (u * d, v * d, d, 1). Its third column, which is
+            multiplied by the depth d, has the translation in pixels. (..., 4, 4)
         ego_from_cam: Pose of the camera in the frame of the vehicle, in metres. (..., 4, 4)
 
     Returns:

@@ -29,7 +29,7 @@ class VectorizeConfig:
     """Settings of `vectorize`, by default as in the released code.
 
     Args:
-        min_area_px: Largest area of a class's components that are removed, in pixels, >= 0.
+        min_area_px: Components of a class up to this area are removed, in pixels, >= 0.
         eps: Largest distance of two neighbours in the standardised embedding space.
         min_neighbours: Smallest number of neighbours of a cluster's core pixel, itself included.
         ridge_tolerance: Largest difference of a ridge pixel's probability from the largest
@@ -149,8 +149,8 @@ def _check(semantic: Tensor, embedding: Tensor, direction: Tensor, config: Vecto
         raise InputError("semantic needs the background and at least one class.")
     if (len(direction) - 1) * config.degrees != 360:
         raise InputError(
-            f"{len(direction)} channels of direction are none and {len(direction) - 1} directions, "
-            f"which make no circle in steps of {config.degrees} degrees."
+            f"direction has a channel for none and {len(direction) - 1} for directions, which make "
+            f"no full circle in steps of {config.degrees} degrees."
         )
     not_finite = []
     for name, values in maps.items():
@@ -341,10 +341,10 @@ def trace(points: IntArray, directions: IntArray, start: int, config: VectorizeC
     """
     is_used = np.zeros(directions.shape, dtype=bool)
     line = [points[start]]
-    for _ in range(2):
-        line.extend(_walk(line[-1], points, directions, is_used=is_used, config=config))
-        line.reverse()
-    return np.stack(line[::-1])
+    line.extend(_walk(line[-1], points, directions, is_used=is_used, config=config))
+    line.reverse()  # now it ends at the start, from which the second walk goes on
+    line.extend(_walk(line[-1], points, directions, is_used=is_used, config=config))
+    return np.stack(line)
 
 
 def _walk(
@@ -364,6 +364,7 @@ def _walk(
         direction = directions[row, column, free[0]]
         if direction == NONE:
             continue
+        # Points near the line are left out for good: the line does not turn back to them.
         points = points[_distances(points, last) > config.step_px - 1]
         if not len(points):
             return

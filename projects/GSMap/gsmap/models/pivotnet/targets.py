@@ -28,7 +28,9 @@ def significances(points: Points) -> NDArray[np.float64]:
     areas = np.full(len(points), fill_value=np.inf)
     areas[1:-1] = _triangle_areas(points[:-2], points[1:-1], points[2:])
     remaining = list(range(len(points)))
-    next_position = 0  # of a point that is no more significant than the last one, or 0
+    # Position of a neighbour that is to be removed next, as it is no more significant than the
+    # point before; 0 if there is none.
+    next_position = 0
     while len(remaining) > 2:
         position = next_position or int(np.argmin(areas[remaining]))
         smallest = areas[remaining.pop(position)]
@@ -60,8 +62,8 @@ class FormatPivotTargets(FormatLineTargets):
     The fields of the targets and the other settings are described in `FormatLineTargets`.
 
     Args:
-        num_points: Largest number P of pivots of a line of each class, >= 2. A config sets it in
-            the queries of the head.
+        num_points: Largest number P of pivots of a line of each class, >= 2. Filled in from the
+            queries of the head if the pipeline does not set it.
         min_area_m2: Smallest significance of a pivot, in square metres.
         keep_end: Whether a line of too many pivots keeps the most significant ones. By default it
             keeps the first ones and loses its end, as in the released code.

@@ -39,7 +39,7 @@ from gsmap.visualization.page.tables import (
 from gsmap.visualization.style import MATCH_COLOURS, MapStyle
 
 _GENERATOR = b'<meta name="generator" content="gsmap">'
-_HEAD_BYTES = 4096  # of a page, which contain its generator
+_HEAD_BYTES = 4096  # the first bytes of a page contain the generator
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,8 @@ class PageOptions:
             results without ground truth are ignored; otherwise both are errors.
         by: Groups of samples with separate AP, as in `read_groups`.
         allow_other_split: Whether models may be of another split than the annotation file.
-        law: Distribution of the errors of vertices with Gaussians, ``normal`` or ``laplace``; by
-            default the one of the calibration of each result, or the normal one.
+        law: Distribution of the errors of vertices, ``normal`` or ``laplace``, for results with
+            Gaussians; by default the distribution of their calibration, or else ``normal``.
 
     Raises:
         ValueError: If a value is out of its range.
@@ -127,7 +127,7 @@ def page_data(
     frames = []
     for index in chosen:
         sample = file[index]
-        sample_view = view.with_mounting(sample.ego_from_frame)
+        sample_view = view.with_mounting(sample.ego_from_frame)  # for its ground in the images
         cameras = cameras_of(sample, view=sample_view, data_root=root, width_px=options.image_width)
         predictions = []
         for result in scored:
@@ -214,7 +214,8 @@ def _tables(
     tables = [summary_table(scored, resamples), *class_tables(scored, style)]
     if options.by == DISTANCE:
         in_bands = [score_by_distance(result, truth=truth, meta=file.meta) for result in scored]
-        groups = distance_groups(in_bands[0].reports[0].tokens)
+        band_tokens = in_bands[0].reports[0].tokens  # one for each sample and band
+        groups = distance_groups(band_tokens)
         tables += group_tables(in_bands, groups=groups, by=DISTANCE)
     elif options.by:
         groups = read_groups(file.path, options.by)
