@@ -1,4 +1,4 @@
-"""Time and memory of the rasterizers and the losses on top of them, beside their floors."""
+"""Time and memory of the rasterizers and their losses, with lower bounds of the time (floors)."""
 
 import argparse
 import math
@@ -22,10 +22,11 @@ SCALES_M = ((1.0, 0.4), (0.2, 0.2), (5.0, 5.0))
 POINTS = 20
 TRAINING_SIZE = (200, 100)
 RATE_REPEATS = 20
-# The reference is measured on as many instances as fill a tensor of this size and scaled up: it is
-# linear in them. Freed tensors of smaller sizes stay with malloc and blur the peak memory.
+# Time and memory of the reference are linear in the number of instances. They are measured on as
+# many instances as fill a tensor of this size, and scaled up. Freed tensors of smaller sizes stay
+# with malloc and blur the peak memory.
 REFERENCE_BYTES = 36 * MIB
-FLOOR_DENSITY = 1e-6  # pixels where a Gaussian is below need no exponential
+FLOOR_DENSITY = 1e-6  # a pixel with a smaller density of a Gaussian needs no exponential
 Gaussians = tuple[Tensor, Tensor, Tensor]
 
 
@@ -312,7 +313,7 @@ def training_table(args: argparse.Namespace) -> str:
     device = torch.device(args.device)
     height, width = TRAINING_SIZE
     grid = BEVGrid((-15, 15), (-30, 30), height=height, width=width)
-    num_matched = args.instances // 4
+    num_matched = args.instances // 4  # the instances are of a batch of 4 samples
     num_truths = min(15, num_matched)
     lines = random_polylines(num_matched, grid).to(device)
     targets = draw_polylines(lines, grid)

@@ -229,7 +229,7 @@ def test_the_tables_of_keys_in_the_docs_are_the_tables_of_the_code():
     maps = {key_map.name: key_map for key_map in key_maps() if key_map.name in groups}
     assert maps.keys() == groups.keys()
     common = re.findall(
-        r"^\| ([^`|]+) \| `([\w.*]+)` \| (?:`([\w.*]+)`|the same) \|$", PAGES[0].read_text(), re.M
+        r"^\| ([^`|]+) \| `([\w.*]+)` \| (?:`([\w.*]+)`|unchanged) \|$", PAGES[0].read_text(), re.M
     )
     assert len(common) > 20
     assert set().union(*groups.values()) == {group for group, *_ in common}

@@ -38,9 +38,10 @@ class Method:
         Returns:
             Dictionary with ``arxiv``, the number of the paper at arXiv; ``parameters``, the number
             of trainable parameters of each config; ``settings``, the published values by config
-            and path of the setting; ``heads``, for each config the number of queries of each
-            group, the weights of losses and auxiliary heads by name, and the weights of matching
-            costs in order; and ``tables``, tables in the format of ``configs/tables.json``.
+            and path of the setting; ``heads``, the published parts of each config's head; and
+            ``tables``, tables in the format of ``configs/tables.json``. A head has the number of
+            queries of each group, the weights of its losses and auxiliary heads by name, and the
+            weights of its matching costs in the order of the config.
         """
         return read_json(self.folder / "paper.json")
 

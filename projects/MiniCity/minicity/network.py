@@ -10,7 +10,7 @@ from minicity.roads import CrossSection, Road, RoadStyle
 
 PITCH_M = 115.0
 MARGIN_M = 130.0
-STATION_M = 3.0
+STATION_M = 3.0  # distance of the points of a centre line
 MIN_ROAD_M = 40.0
 CORNER_M = (4.0, 8.0)
 BEND_CUT_M = 40.0  # length of a street that the curve of a bend replaces, on each side
@@ -94,7 +94,7 @@ def random_section(rng: np.random.Generator) -> CrossSection:
         difference = rng.choice([-1, 0, 1], p=[0.15, 0.7, 0.15])
         backward = int(np.clip(forward + difference, 1, 3))
     median_m = 0.0
-    if not (one_way or rng.random() > 0.33):
+    if not one_way and rng.random() <= 0.33:
         median_m = float(rng.choice([1.6, 2.4, 3.5]))
     shoulder_widths = [0.3, 0.6, 2.3]
     shoulder_shares = [0.4, 0.25, 0.35]
@@ -238,9 +238,13 @@ def _follow_street(nodes: list[Node], start: int, arm: int, rng: np.random.Gener
 
 
 def _half_widths(chain: Chain, at_start: bool) -> tuple[float, float]:
-    """Distance of the (left, right) kerb from the centre line in metres, facing the street."""
+    """Distances of the left and the right kerb from the centre line, in metres.
+
+    Left and right are seen from the junction along the street. A section has them along its centre
+    line, so they are exchanged at its end.
+    """
     left = chain.section.left_m
-    right = -chain.section.right_m
+    right = -chain.section.right_m  # offsets to the right are negative
     return (left, right) if at_start else (right, left)
 
 

@@ -221,7 +221,7 @@ def test_positions_of_other_images_are_refused(size):
 
 def test_more_levels_than_weights_are_refused():
     levels = [torch.randn(1, 16, 8, 4)] * 5
-    with pytest.raises(ValueError, match="returns 5 levels, but BezierHead has weights"):
+    with pytest.raises(ValueError, match="each of its 5 layers, but BezierHead has weights"):
         head().loss({"bev_feats": levels[-1], "bev_levels": levels}, [sample(*LINES)])
 
 

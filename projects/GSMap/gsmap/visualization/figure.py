@@ -44,6 +44,7 @@ _TITLE = 44  # space for the title of a panel
 _USABLE = _WIDTH - 2 * _MARGIN
 _PNG_IN_SVG = re.compile(rb"data:image/png;base64,([\w+/=\s]+)")
 _RANDOM_TOKEN = re.compile(r"[0-9a-f]{16,}")
+# Numbers of four and more decimals, which are cut after the second; factors of scale( stay.
 _LONG_NUMBER = re.compile(rb"(?<!scale\()\b(\d+\.\d\d)\d{2,}")
 _TALLEST = 0.5 * _USABLE  # largest height of a row of cameras or a panel
 _LONGEST_TITLE = 88  # characters
@@ -111,6 +112,8 @@ def _layout(
         slope = sum(1 / sum(row) for row in rows)
         offset = _GAP * (len(rows) - 1) - sum(_GAP * (len(row) - 1) / sum(row) for row in rows)
         frame_height = _TITLE + _TICKS  # above and below the panel
+        # Part of the total width that does not depend on the width of the cameras: the labels
+        # beside the panel, and the constant part of the panel's width.
         fixed_width = 1.3 * _TICKS + aspect * (offset - frame_height)
         camera_width = (_USABLE - fixed_width) / (1 + aspect * slope)
         camera_boxes, bottom = _camera_boxes(rows, camera_width)
@@ -124,11 +127,11 @@ def _layout(
     slot = _USABLE / num_panels
     height = min((slot - _TICKS) / aspect, _TALLEST)
     width = height * aspect
-    pitch = min(slot, width + 3 * _TICKS)
-    left = _MARGIN + (_USABLE - pitch * num_panels + pitch - width + _TICKS) / 2
-    panel_boxes = _row(
-        [aspect] * num_panels, left=left, top=top + _TITLE, height=height, gap=pitch - width
-    )
+    pitch = min(slot, width + 3 * _TICKS)  # from the left edge of a panel to the next one's
+    gap = pitch - width
+    total_width = pitch * num_panels - gap
+    left = _MARGIN + (_USABLE - total_width + _TICKS) / 2  # centred, with the labels at the left
+    panel_boxes = _row([aspect] * num_panels, left=left, top=top + _TITLE, height=height, gap=gap)
     return camera_boxes, panel_boxes, top + _TITLE + height + _TICKS
 
 
@@ -151,7 +154,7 @@ def _legend_lines(
     lines = []
     for label in sorted(labels):
         lines.append(Line2D([], [], color=style.colour(label), lw=2.6, label=style.title(label)))
-    fates: list[str] = []
+    fates: list[str] = []  # results of the matching: "hit", "false", or of truths
     for panel in panels:
         for panel_fates in panel.fates:
             fates += panel_fates

@@ -130,7 +130,8 @@ def _select_splits(options: NuScenesOptions) -> tuple[SplitList, str]:
             )
         for part in _OFFICIAL_SPLITS[each]:
             scenes[part] = official[part]
-    # the mini splits are parts of these three
+    # The identity of the list is of these three splits for all versions: the mini splits are parts
+    # of them.
     all_scenes = {part: official[part] for part in ("train", "val", "test")}
     return SplitList(OFFICIAL, scenes), list_identity(OFFICIAL, all_scenes)
 
@@ -404,9 +405,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add(
         "--crossings", choices=CROSSINGS, default=UNITED,
-        help="rule of the crossings: rings that are united where they overlap, the two longest "
-        "edges of each, or outlines of parallel neighbours, open where the patch cuts them "
-        "(default: %(default)s)",
+        help="rule of the crossings: rings, joined where they overlap (united); the two longest "
+        "edges of each (edges); or outlines of parallel neighbours, which are open where the "
+        "patch cuts them (parallel; default: %(default)s)",
     )  # fmt: skip
     add_file_options(parser, "lidar", max_sweeps=10)
 

@@ -36,6 +36,7 @@ def _path_rules(path: str, release_path: str, number: int, levels: Sequence[int]
     """
     rules: list[tuple[str, str]] = []
     for i, level in enumerate(levels):
+        # {{i}} is the placeholder of a key for the number of the round; {i} is the level's place.
         theirs = f"{_NECK}{{i}}."
         ours = f"img_neck.rounds.{{i}}.{path}.{i}."
         rules += rules_of(f"{theirs}conv{level}_{release_path}.", ours, names=_CONVS)
@@ -52,6 +53,7 @@ def _projection_rules() -> Rules:
     return tuple(rules)
 
 
+# The release names the paths the other way round.
 _NECK_RULES = (
     *_path_rules("down", release_path="up", number=1, levels=(6, 5, 4, 3)),
     *_path_rules("up", release_path="down", number=2, levels=(4, 5, 6, 7)),

@@ -68,7 +68,7 @@ class LineHead(DetectionHead):
             no line.
         embed_dims: Channels C.
         hidden_dims: Hidden channels of the network of map coordinates.
-        point_dims: Channels of each coordinate of a point.
+        point_dims: Channels D of the feature of a map coordinate (x, y).
 
     Attributes:
         targets: Description of the targets of the transform, for error messages.
@@ -140,7 +140,8 @@ class LineHead(DetectionHead):
         Args:
             bev_outputs: Outputs of the encoder, with ``bev_feats`` (B, C, H, W).
         """
-        layers = self.decoder(self.front(bev_outputs["bev_feats"]))[1:]
+        outputs = self.decoder(self.front(bev_outputs["bev_feats"]))
+        layers = outputs[1:]  # the first output is of the queries before all layers
         mean = self.coordinate_feature()
         return [self.predictions(layer, mean) for layer in layers]
 
@@ -156,8 +157,8 @@ class LineHead(DetectionHead):
     def coordinate_feature(self) -> Tensor:
         """Mean over the map of the features of its coordinates, cached in inference. (D,)
 
-        Differs from the paper, as in the released code: points are compared with this mean instead
-        of with the features of single cells.
+        Differs from the paper, as in the released code: the point branches multiply their outputs
+        by this mean instead of the features of single cells.
         """
         if torch.is_grad_enabled() or torch.compiler.is_compiling():
             self._cache = None  # fused optimizers change weights without a new version
@@ -254,9 +255,9 @@ class LineHead(DetectionHead):
         """
         if len(levels) > len(self.level_weights):
             raise InputError(
-                f"the BEV encoder returns {len(levels)} levels, but {type(self).__name__} has "
-                f"weights for the class masks of {len(self.level_weights)}: give the encoder fewer "
-                "layers."
+                f"the BEV encoder returns a level for each of its {len(levels)} layers, but "
+                f"{type(self).__name__} has weights for {len(self.level_weights)} levels: give the "
+                "encoder fewer layers."
             )
         targets = []
         for label in range(len(self.classes)):

@@ -1,4 +1,4 @@
-"""MGMap's neck: BEV features at four levels, and their fusion to one map."""
+"""MGMap's neck: BEV features of three stages and their fusion, which is the fourth level."""
 
 from typing import Any
 
@@ -90,7 +90,7 @@ class EnhancedNeck(nn.Module):
 
         Returns:
             Fusion of all stages (B, C, H, W), and maps of four levels (B, C, h, w): of the stages,
-            and of their fusion at half the size.
+            and of their fusion at the size of the stem, which is half of (H, W).
         """
         stem = self.stem(bev_feats)
         feats = stem

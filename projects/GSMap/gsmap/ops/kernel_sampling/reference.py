@@ -92,6 +92,7 @@ def sample_kernels_reference(
     view = torch.arange(views, device=value.device).view(1, 1, -1, 1, 1)
     head = torch.arange(heads, device=value.device).view(1, 1, 1, -1, 1)
     rows = ((sample * views + view) * num_pixels + pixels) * heads + head
-    rows = rows.transpose(2, 3).flatten(3)  # (B, Q, heads, V * S)
+    # (B, Q, heads, V * S), with ``bilinear`` (B, Q, heads, V * 4 S)
+    rows = rows.transpose(2, 3).flatten(3)
     weights = weights.transpose(2, 3).flatten(3)
     return sum_rows(value.reshape(-1, channels), rows, weights=weights)
