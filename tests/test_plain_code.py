@@ -23,7 +23,7 @@ def rooms() -> list[Path]:
         modules += package.glob("models/*/__init__.py")
         folders += [module.parent for module in sorted(modules)]
     large = [folder for folder in folders if count(folder).lines >= SMALL]
-    assert len(large) > 30
+    assert len(large) > 20
     return large
 
 

@@ -75,8 +75,13 @@ def test_the_last_layers_gaussians_are_fused_with_those_before_point_by_point():
     step(head, memory, 0)
     kept = memory.streams.states["a"].values["references"][None]
     refined: list[Tensor] = []
-    own = memory.queries.fuse_references
-    memory.queries.fuse_references = lambda lines, *args: refined.append(lines) or own(lines, *args)
+    fuse_references = memory.queries.fuse_references
+
+    def record_and_fuse(**arguments):
+        refined.append(arguments["refined"])
+        return fuse_references(**arguments)
+
+    memory.queries.fuse_references = record_and_fuse
     predicted, propagation = step(head, memory, 1)
     before, seen, fused = (
         of_first(head, lines)

@@ -37,8 +37,8 @@ class _Scene:
         samples: Indices of the samples in temporal order.
         rng: Generator for the order of the frames and pieces and for the cuts between pieces.
         num_pieces: Number of pieces that the scene is cut into at random places.
-        finish_singles: Whether all single frames come before the first piece, as in StreamMapNet's
-            released code.
+        finish_singles: Whether all single frames come before the first piece, as in the released
+            code.
     """
 
     def __init__(
@@ -96,8 +96,8 @@ class StreamTrainSampler(Sampler[int]):
         single_frame_iters: Number of iterations with single frames.
         pieces: Number of pieces that a scene is cut into.
         late_switch: Whether a scene switches to pieces only after all of its single frames, as in
-            StreamMapNet's released code. Pieces then have half of the samples of a batch at
-            iteration 1.6 x ``single_frame_iters``.
+            the released code. Half of the samples then continue a piece at 1.6 times
+            ``single_frame_iters`` iterations.
         seed: Seed of the random numbers, equal on all ranks; None for 0.
 
     Raises:
