@@ -30,8 +30,9 @@ def free_port() -> int:
 
 
 def search_path(*folders: object) -> dict[str, str]:
-    """Return the variable that has new processes import from folders, and from `tests`."""
-    paths = [*map(str, folders), str(REPO / "tests"), os.environ.get("PYTHONPATH", "")]
+    """Variable with which new processes import from folders, and from `tests` and `tools`."""
+    own_folders = [str(REPO / "tests"), str(REPO / "tools")]
+    paths = [*map(str, folders), *own_folders, os.environ.get("PYTHONPATH", "")]
     return {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
 
 

@@ -123,7 +123,7 @@ def test_commands_that_are_killed_leave_what_they_leave_unkilled(
     minicity_root, minicity_annotations, tiny_config
 ):
     """A part of ``python -m fuzz.kills``."""
-    paths = [str(REPO), str(REPO / "tests"), os.environ.get("PYTHONPATH", "")]
+    paths = [str(REPO), str(REPO / "tests"), str(REPO / "tools"), os.environ.get("PYTHONPATH", "")]
     done = run_python(
         "-m", "fuzz.kills", "--kills", 2, "--data", minicity_root, tiny_config,
         env={"PYTHONPATH": os.pathsep.join(paths)},

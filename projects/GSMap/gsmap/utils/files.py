@@ -179,7 +179,7 @@ def atomic_write(path: str | Path, mode: Literal["w", "wb"] = "w") -> Iterator[I
             if not special:
                 os.fsync(file.fileno())
                 forget_output(path)
-                os.replace(src=partial_file, dst=path)
+                os.replace(partial_file, path)
     except Exception as raised:
         error = failures[0] if failures else raised
         if not isinstance(error, OSError) or not error.errno:
