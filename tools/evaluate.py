@@ -26,6 +26,7 @@ from scoring.analyses import (
     consistency_report,
     group_report,
     interval_report,
+    open_pairs,
     read_groups,
     read_resamples,
     uncertainty_report,
@@ -38,7 +39,6 @@ from gsmap.evaluation.core.chamfer_ap import HARD_CHAMFER_THRESHOLDS
 from gsmap.evaluation.core.evaluator import MapEvaluator
 from gsmap.evaluation.core.file_evaluation import (
     Evaluation,
-    SamplePairs,
     evaluate_files,
     match_samples,
 )
@@ -162,14 +162,7 @@ def match_shard(args: argparse.Namespace, evaluator: MapEvaluator, settings: Met
     else:
         results = results_shard
         source = digest_of_common(read_shard(results_shard))
-    pairs = SamplePairs(
-        results,
-        args.ground_truth,
-        evaluator.classes,
-        allow_mismatch=args.allow_mismatch,
-        shard=args.shard,
-        allow_other_split=args.allow_other_split,
-    )
+    pairs = open_pairs(args, results, classes=evaluator.classes)
     matches = list(match_samples(pairs, evaluator, args.workers))
     notes = pairs.notes(evaluator.counts_heights)
     source += digest(args.ground_truth)

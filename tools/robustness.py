@@ -147,17 +147,23 @@ def earlier_figures(path: Path) -> dict[str, list[dict[str, float]]]:
     if not path.exists():
         return {}
     figures = read_json(path)
-    refusal = InputError(f"{path} holds no figures of this command: give another --out.")
-    if not isinstance(figures, dict) or CLEAN not in figures:
-        raise refusal
-    for kind, rows in figures.items():
+    if not are_figures(figures):
+        raise InputError(f"{path} holds no figures of this command: give another --out.")
+    return figures
+
+
+def are_figures(content: Any) -> bool:
+    """Whether the content of a file has the form of figures of this command."""
+    if not isinstance(content, dict) or CLEAN not in content:
+        return False
+    for kind, rows in content.items():
         number = 1 if kind == CLEAN else len(SEVERITIES)
         if kind not in (CLEAN, *KINDS) or not isinstance(rows, list) or len(rows) != number:
-            raise refusal
+            return False
         for row in rows:
             if not isinstance(row, dict) or not isinstance(row.get("mean"), float):
-                raise refusal
-    return figures
+                return False
+    return True
 
 
 def other_figures(

@@ -6,6 +6,7 @@ quickly.
 
 import argparse
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gsmap.datasets.annotations.file import AnnotationFile
@@ -30,6 +31,28 @@ if TYPE_CHECKING:
     from gsmap.evaluation.analysis.groups import Groups
 
 DEFAULT_RESAMPLES = 1000
+
+
+def open_pairs(
+    args: argparse.Namespace, results: Path, classes: Sequence[str], gaussians: bool = False
+) -> SamplePairs:
+    """Open a result file and the ground truth.
+
+    Args:
+        args: The options of the command.
+        results: The result file.
+        classes: Names of the classes.
+        gaussians: Whether to read the Gaussians of the results.
+    """
+    return SamplePairs(
+        results,
+        args.ground_truth,
+        classes,
+        allow_mismatch=args.allow_mismatch,
+        shard=args.shard,
+        allow_other_split=args.allow_other_split,
+        gaussians=gaussians,
+    )
 
 
 def polygon_labels(args: argparse.Namespace, classes: Sequence[str]) -> list[int]:
@@ -66,15 +89,7 @@ def uncertainty_report(args: argparse.Namespace, settings: MetricSettings) -> Me
 
     classes = settings.classes
     rules = ChamferConfig.of(settings) if "chamfer" in args.eval else ChamferConfig(classes)
-    pairs = SamplePairs(
-        args.results,
-        args.ground_truth,
-        classes,
-        allow_mismatch=args.allow_mismatch,
-        shard=args.shard,
-        allow_other_split=args.allow_other_split,
-        gaussians=True,
-    )
+    pairs = open_pairs(args, args.results, classes=classes, gaussians=True)
     vertices = calibration.matched_vertices(pairs, rules)
     law = args.law or law_of(pairs.about)
     if args.reliability:
@@ -175,14 +190,7 @@ def group_report(
         ranking = [metric for metric in evaluator.metrics if metric.ranks]
         evaluator = MapEvaluator(*ranking, ground_truth_points=evaluator.ground_truth_points)
         classes = evaluator.classes
-        pairs = SamplePairs(
-            args.results,
-            args.ground_truth,
-            classes,
-            allow_mismatch=args.allow_mismatch,
-            shard=args.shard,
-            allow_other_split=True,  # the first reading of the files has checked it
-        )
+        pairs = open_pairs(args, args.results, classes=classes)
         pieces = cut_by_distance(pairs, polygon_labels(args, classes))
         reports = evaluator.reports(match_samples(pieces, evaluator, args.workers))
         groups = distance_groups(reports[0].tokens)

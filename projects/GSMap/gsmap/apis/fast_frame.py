@@ -12,12 +12,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 from mmengine.structures import InstanceData
 from torch import Tensor, nn
 
-from gsmap.structures.calibration import calibration_arrays
+from gsmap.structures.calibration import stack_calibration_arrays
 from gsmap.structures.grid import padded_size
 from gsmap.structures.tensors import tensor_versions, upload
 from gsmap.utils.errors import InputError, WorkError
@@ -207,7 +206,10 @@ class FastFrames:
         else:
             images = torch.stack(list(images))
         self._add_shapes(batch, image_size=(images.shape[-2], images.shape[-1]))
-        inputs = [images, *self._stack_calibration(samples)]
+        metas = [sample.metainfo for sample in samples]
+        inputs = [images]
+        for stack in stack_calibration_arrays(metas, names=self.frame.names):
+            inputs.append(torch.from_numpy(stack))
         with (
             self._lock,
             torch.no_grad(),
@@ -218,16 +220,6 @@ class FastFrames:
         for sample, elements in zip(samples, batch_elements, strict=True):
             predictions.append(self._with_predictions(sample, elements=elements))
         return predictions
-
-    def _stack_calibration(self, samples: "Sequence[Det3DDataSample]") -> list[Tensor]:
-        """Stack the calibration arrays of samples, in the order of ``names``. (B, ...) each"""
-        names = self.frame.names
-        arrays = [calibration_arrays(sample.metainfo, names=names) for sample in samples]
-        stacks = []
-        for name in names:
-            stack = np.stack([sample_arrays[name] for sample_arrays in arrays])
-            stacks.append(torch.from_numpy(stack))
-        return stacks
 
     def _add_shapes(self, batch: dict[str, Any], image_size: tuple[int, int]) -> None:
         """Add the sizes of the padded images to the samples, as the data preprocessor does.

@@ -1,6 +1,6 @@
 """Calibration of a sample as arrays for the BEV encoders of cameras."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -93,6 +93,25 @@ def calibration_arrays(
         values = derived[name]() if name in derived else field(name)
         arrays[name] = values.astype(np.float32)
     return arrays
+
+
+def stack_calibration_arrays(
+    metas: Sequence[Mapping[str, Any]], names: Sequence[str]
+) -> list[NDArray[np.float32]]:
+    """Stack the calibration arrays of the samples of a batch.
+
+    Args:
+        metas: Metainfo of the samples, as in `calibration_arrays`. B in number.
+        names: Names of the arrays.
+
+    Returns:
+        An array for each name, in their order. (B, ...)
+
+    Raises:
+        ValueError: If a sample lacks a field.
+    """
+    samples = [calibration_arrays(meta, names) for meta in metas]
+    return [np.stack([arrays[name] for arrays in samples]) for name in names]
 
 
 def _frame_from_ground(ego_from_frame: NDArray[np.floating[Any]]) -> NDArray[np.float64]:

@@ -13,6 +13,7 @@ import shutil
 import stat
 import time
 import unicodedata
+import weakref
 import zipfile
 import zlib
 from collections import Counter
@@ -401,6 +402,19 @@ def lock(file: IO[Any] | int, message: str) -> None:
         logging.getLogger("gsmap").warning(text)
 
 
+_LOCK_FILES: "weakref.WeakSet[IO[str]]" = weakref.WeakSet()
+
+
+def _close_lock_files() -> None:
+    """Close the lock files in a forked worker, which would hold the locks of a killed parent."""
+    for file in list(_LOCK_FILES):
+        file.close()
+
+
+if hasattr(os, "register_at_fork"):  # not on Windows
+    os.register_at_fork(after_in_child=_close_lock_files)
+
+
 def lock_folder(folder: Path, name: str, advice: str) -> IO[str]:
     """Reserve a folder for this process until the returned file is closed.
 
@@ -439,7 +453,7 @@ def lock_file(path: Path, subject: Path, advice: str) -> IO[str]:
     """
     raw = open_to_append(path)
     file = io.TextIOWrapper(io.BufferedRandom(raw), encoding="utf-8", errors="replace")
-    os.register_at_fork(after_in_child=file.close)  # workers would hold the lock of a killed parent
+    _LOCK_FILES.add(file)
     file.seek(0)
     holder = file.read(200)
     if not _HOLDER.fullmatch(holder):

@@ -3,12 +3,11 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from mmengine.model import BaseModule
 from torch import Tensor
 
-from gsmap.structures.calibration import calibration_arrays
+from gsmap.structures.calibration import stack_calibration_arrays
 from gsmap.structures.tensors import exclude_from_compile, upload
 
 
@@ -26,11 +25,7 @@ def stack_calibration(
     Returns:
         A tensor for each name. (B, ...)
     """
-    arrays = [calibration_arrays(meta, names) for meta in img_metas]
-    stacks = []
-    for name in names:
-        stack = np.stack([sample_arrays[name] for sample_arrays in arrays])
-        stacks.append(torch.from_numpy(stack))
+    stacks = [torch.from_numpy(stack) for stack in stack_calibration_arrays(img_metas, names)]
     return dict(zip(names, upload(stacks, device), strict=True))
 
 
