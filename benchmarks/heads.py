@@ -144,7 +144,10 @@ def cells(figures: dict[str, float]) -> list[str]:
     keys.append("mAP")
     texts = []
     for key in keys:
-        percentages = [f"{100 * figures[f'{metric}/{key}']:.1f}" for metric in METRIC_NAMES]
+        percentages = []
+        for metric in METRIC_NAMES:
+            value = figures[f"{metric}/{key}"]
+            percentages.append(f"{100 * value:.1f}")
         texts.append(" / ".join(percentages))
     return texts
 

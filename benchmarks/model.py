@@ -67,7 +67,11 @@ def measure_each(
     """
     on_cpu = all(args.device == "cpu" for _, args, *_ in arguments)
     call = partial(in_own_process, task) if on_cpu else task
-    return [(values[0], call(*values)) for values in arguments]
+    costs = []
+    for values in arguments:
+        config_file = values[0]
+        costs.append((config_file, call(*values)))
+    return costs
 
 
 def build(path: str, args: argparse.Namespace, raster: str = "") -> Any:
@@ -124,7 +128,11 @@ def image_shape(path: str, args: argparse.Namespace) -> tuple[int, int, int]:
         return cameras, height, width
     scale = step.get("scale", 1.0)
     unit = cfg.model.data_preprocessor.get("pad_size_divisor", 1)
-    width, height = [math.ceil(int(side * scale + 1e-6) / unit) * unit for side in cfg._file_size]
+    sides = []
+    for side in cfg._file_size:
+        scaled = int(side * scale + 1e-6)
+        sides.append(math.ceil(scaled / unit) * unit)
+    width, height = sides
     return cameras, height, width
 
 
@@ -295,9 +303,13 @@ def report(args: argparse.Namespace, header: list[str], rows: list[list[str]]) -
     """
     clock = "wall clock" if args.device != "cpu" else "processor time of all threads"
     kind = "fp16 autocast" if args.fp16 else "float32"
-    shapes = dict.fromkeys(image_shape(path, args) for path in args.configs)
-    sizes = " and ".join(f"{cameras} cameras of {h} x {w}" for cameras, h, w in shapes)
+    sizes: list[str] = []
+    for path in args.configs:
+        cameras, height, width = image_shape(path, args)
+        size = f"{cameras} cameras of {height} x {width}"
+        if size not in sizes:
+            sizes.append(size)
     print(
-        f"{sizes}, {kind}, {args.device}, {args.threads} threads, torch {torch.__version__}; "
-        f"{clock}\n\n{markdown_table(header, rows)}"
+        f"{' and '.join(sizes)}, {kind}, {args.device}, {args.threads} threads, "
+        f"torch {torch.__version__}; {clock}\n\n{markdown_table(header, rows)}"
     )

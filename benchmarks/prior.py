@@ -3,6 +3,8 @@
 import argparse
 import math
 import tempfile
+from collections.abc import Iterator
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +83,12 @@ def pose_at(distance_m: float) -> NDArray[np.float64]:
     return pose
 
 
+def cycle_poses(number: int, offset_m: float) -> Iterator[NDArray[np.float64]]:
+    """Yield the poses of the first frames of a road without an end, each moved along the road."""
+    for index in cycle(range(number)):
+        yield pose_at(STEP_M * index + offset_m)
+
+
 def frame_times_ms(rule: WriteRule, repeats: int) -> tuple[float, float]:
     """Measure reading and writing on a road that has been driven once.
 
@@ -95,11 +103,11 @@ def frame_times_ms(rule: WriteRule, repeats: int) -> tuple[float, float]:
     values = prediction(0)
     for index in range(repeats):
         prior.write(pose_at(STEP_M * index), GRID, values)
-    poses = iter([pose_at(STEP_M * (index % repeats) + 0.1) for index in range(2 * repeats + 4)])
     cpu = torch.device("cpu")
-    read = measure(lambda: prior.read(next(poses), GRID), cpu, repeats=repeats)
-    poses = iter([pose_at(STEP_M * (index % repeats) + 0.2) for index in range(2 * repeats + 4)])
-    write = measure(lambda: prior.write(next(poses), GRID, values), cpu, repeats=repeats)
+    read_poses = cycle_poses(repeats, offset_m=0.1)
+    read = measure(lambda: prior.read(next(read_poses), GRID), cpu, repeats=repeats)
+    write_poses = cycle_poses(repeats, offset_m=0.2)
+    write = measure(lambda: prior.write(next(write_poses), GRID, values), cpu, repeats=repeats)
     return 1e3 * read.cpu_s, 1e3 * write.cpu_s
 
 
@@ -114,7 +122,8 @@ def drive(rule: WriteRule, length_km: float) -> tuple[int, Cost]:
         Size of the file in bytes, and cost of the work.
     """
     torch.set_num_threads(1)
-    poses = [pose_at(distance_m) for distance_m in np.arange(0, 1000 * length_km, STEP_M).tolist()]
+    distances_m = np.arange(0, 1000 * length_km, STEP_M)
+    poses = [pose_at(distance_m) for distance_m in distances_m.tolist()]
     rasters = [prediction(index) for index in range(40)]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "drive.prior"
