@@ -23,7 +23,7 @@ from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.errors import WorkError
 from gsmap.utils.files import read_json
-from gsmap.utils.shipped import shipped
+from gsmap.utils.shipped import shipped_path
 
 Record = dict[str, Any]
 
@@ -191,7 +191,7 @@ def _evaluate(files: tuple[Path, Path], metrics: list[str], grid: BEVGrid, worke
     Raises:
         WorkError: If the command fails.
     """
-    command = [sys.executable, str(shipped("tools/evaluate.py")), *map(str, files)]
+    command = [sys.executable, str(shipped_path("tools/evaluate.py")), *map(str, files)]
     command += ["--eval", *metrics]
     x_min, x_max = grid.x_range
     y_min, y_max = grid.y_range

@@ -23,9 +23,9 @@ import numpy as np
 
 from benchmarks.measure import markdown_table
 from gsmap.utils.errors import InputError
-from gsmap.utils.shipped import shipped
+from gsmap.utils.shipped import shipped_path
 
-REPO = shipped()
+REPO = shipped_path()
 TESTS = {"mapdata": "map_data", "drivemaps": "drive_maps"}  # test folder by room
 FOLDERS = ("GSMap/gsmap", "MapData/mapdata", "DriveMaps/drivemaps")
 ROOMS = ("models", "ops", "structures", "evaluation", "datasets", "mapdata", "drivemaps")

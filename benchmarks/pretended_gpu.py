@@ -38,11 +38,11 @@ from benchmarks.pretended_operators import (
     run_cpu_kernel,
 )
 from gsmap.ops import backends
-from gsmap.utils.shipped import shipped
+from gsmap.utils.shipped import shipped_path
 
 NAME = "pretended"
 DEVICE = f"{NAME}:0"
-ROOT = shipped()
+ROOT = shipped_path()
 aten = torch.ops.aten
 
 # Tensors per launch of a kernel for lists of tensors, by number of lists.

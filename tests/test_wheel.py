@@ -22,11 +22,12 @@ BROUGHT = {"absl-py", "descartes", "pyquaternion", "triton"}
 LOAD_CONFIGS = """
 import sys
 from mmengine.config import Config
-from gsmap.utils.shipped import shipped
-files = [*shipped("configs").rglob("*.py"), *shipped("projects/GSMap/configs").glob("*.py")]
+from gsmap.utils.shipped import shipped_path
+files = list(shipped_path("configs").rglob("*.py"))
+files += shipped_path("projects/GSMap/configs").glob("*.py")
 for file in files:
     Config.fromfile(file, import_custom_modules=False)
-print(len(files), shipped())
+print(len(files), shipped_path())
 """
 
 

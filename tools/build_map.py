@@ -43,7 +43,7 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.extras import import_extra
 from gsmap.utils.files import file_names, write_text
 from gsmap.utils.split_lists import require_results_of
-from gsmap.utils.words import counted
+from gsmap.utils.words import format_count
 from gsmap.visualization.bev_view import draw_lines
 from gsmap.visualization.figure import save_figure
 from gsmap.visualization.plots import WIDTH_IN, finish_panel, panel_grid
@@ -190,7 +190,7 @@ def write_map(
             write_geojson(path, elements, classes, origin=None)
         elif suffix == "osm":
             lanes = lane_graph_of(drive, elements)
-            print(f"{counted(len(lanes.lanelets), 'lanelet')} of centre lines: {path}")
+            print(f"{format_count(len(lanes.lanelets), 'lanelet')} of centre lines: {path}")
             write_lanelet2(
                 path,
                 elements,
@@ -333,13 +333,14 @@ def main(argv: list[str] | None = None) -> str:
         processor_s += time.process_time() - start_s
         drives.append(drive)
         merged.append(elements)
-        summary = f"{counted(len(elements), 'element')} of {counted(len(drive.frames), 'frame')}"
+        num_frames = format_count(len(drive.frames), noun="frame")
+        summary = f"{format_count(len(elements), noun='element')} of {num_frames}"
         for path in write_map(args.out / names[scene], args, ann, drive, elements):
             print(f"{summary}: {path}")
     if has_truth(ann):
         score(drives, merged, ann, args.out)
     frames = sum(len(drive.frames) for drive in drives)
-    numbers = f"{counted(len(drives), 'drive')}, {counted(frames, 'frame')}"
+    numbers = f"{format_count(len(drives), 'drive')}, {format_count(frames, 'frame')}"
     return f"{numbers}, merged in {processor_s:.1f} s of processor time"
 
 

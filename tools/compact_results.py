@@ -11,7 +11,7 @@ from pathlib import Path
 
 from gsmap.evaluation.analysis.compact import compact_results
 from gsmap.utils.cli import CommandParser, output_file, run_command
-from gsmap.utils.words import counted
+from gsmap.utils.words import format_count
 
 
 def main(argv: list[str] | None = None) -> str:
@@ -29,8 +29,8 @@ def main(argv: list[str] | None = None) -> str:
     old_mb = args.results.stat().st_size / 1e6
     new_mb = args.out.stat().st_size / 1e6
     return (
-        f"{counted(summary.elements, 'element')}, {summary.vertices} points as {summary.controls} "
-        f"control points, at most {summary.largest_m:.3f} m off: {args.out} "
+        f"{format_count(summary.elements, 'element')}, {summary.vertices} points as "
+        f"{summary.controls} control points, at most {summary.largest_m:.3f} m off: {args.out} "
         f"({new_mb:.1f} MB instead of {old_mb:.1f})"
     )
 

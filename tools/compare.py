@@ -43,7 +43,7 @@ from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.errors import InputError, WorkError
 from gsmap.utils.files import read_json, write_text
 from gsmap.utils.progress import Progress
-from gsmap.utils.shipped import shipped
+from gsmap.utils.shipped import shipped_path
 from gsmap.visualization.figure import save_figure
 
 
@@ -96,7 +96,7 @@ def read_tables(pattern: str = "*") -> list[dict[str, Any]]:
     tables = []
     for method in METHODS:
         tables += method.paper()["tables"]
-    tables += read_json(shipped("configs/tables.json"))  # of several methods
+    tables += read_json(shipped_path("configs/tables.json"))  # of several methods
     chosen = [table for table in tables if fnmatchcase(table["table"], pattern)]
     if not chosen:
         raise InputError(

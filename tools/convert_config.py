@@ -12,7 +12,7 @@ from pathlib import Path
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import write_text
-from gsmap.utils.shipped import shipped
+from gsmap.utils.shipped import shipped_path
 from mapdata.upstream_configs.reader import read_assignments
 from mapdata.upstream_configs.upstream import convert_upstream, merge, python_text
 
@@ -48,7 +48,7 @@ def convert(source: Path, target: Path, allow_changes: bool = False) -> str:
     settings = read_assignments(source)
     try:
         conversion = convert_upstream(settings)
-        text = python_text(merge(conversion, shipped("configs")))
+        text = python_text(merge(conversion, shipped_path("configs")))
     except (
         ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError,
     ) as error:  # fmt: skip

@@ -24,7 +24,7 @@ from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.errors import WorkError
 from gsmap.utils.files import write_text
 from gsmap.utils.parallel import die_with_parent
-from gsmap.utils.shipped import shipped
+from gsmap.utils.shipped import shipped_path
 from gsmap.utils.words import markdown_table
 
 MODELS = {"GSMap": "gsmap_r18_minicity", "MapTR": "maptr_r18_minicity"}  # that ship
@@ -156,7 +156,7 @@ class Step:
         environment = {**os.environ, "PYTHON": sys.executable}
         status = subprocess.run(
             command,
-            cwd=shipped(),
+            cwd=shipped_path(),
             env=environment,
             check=False,
             preexec_fn=partial(die_with_parent, os.getpid()),

@@ -52,7 +52,7 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.faults import nearest
 from gsmap.utils.ray_shards import run_on_ray
 from gsmap.utils.shards import digest, digest_of_common, read_shard
-from gsmap.utils.words import counted
+from gsmap.utils.words import format_count
 
 PRINTED = ("intervals", "by", "uncertainty")  # reports whose analysis has printed them
 
@@ -95,7 +95,7 @@ def build_evaluator(args: argparse.Namespace, settings: MetricSettings) -> MapEv
     """
     for module in args.custom_imports:
         import_module(module)
-    evaluator = MapEvaluator.named(args.eval, settings, args.gt_points)
+    evaluator = MapEvaluator.from_names(args.eval, settings, args.gt_points)
     if args.min_score is not None and not any(m.takes_min_score for m in evaluator.metrics):
         takers = [name for name in metric_files() if metric_class(name).takes_min_score]
         raise InputError(f"--min-score is of {', '.join(takers)}: leave it out.")
@@ -167,7 +167,7 @@ def match_shard(args: argparse.Namespace, evaluator: MapEvaluator, settings: Met
     notes = pairs.notes(evaluator.counts_heights)
     source += digest(args.ground_truth)
     path = write_matches(args.out, args.shard, matches, notes, evaluator, settings, source)
-    return f"{counted(len(matches), 'sample')} matched: {path}"
+    return f"{format_count(len(matches), 'sample')} matched: {path}"
 
 
 def print_reports(reports: list[MetricReport], notes: list[str], args: argparse.Namespace) -> None:
@@ -226,7 +226,7 @@ def main(argv: list[str] | None = None) -> str:
         analyses.append(uncertainty_report(args, settings))
     print_reports([*ranked, *analyses], notes, args)
     number = len(reports[0].tokens)
-    return f"{counted(number, 'sample')} in {time.perf_counter() - start:.1f} s"
+    return f"{format_count(number, 'sample')} in {time.perf_counter() - start:.1f} s"
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ from gsmap.utils.progress import Progress
 from gsmap.utils.ray_shards import run_on_ray
 from gsmap.utils.shards import add_shard_options, digest
 from gsmap.utils.split_lists import SPLIT_LIST, TRAINED_ON
-from gsmap.utils.words import counted
+from gsmap.utils.words import format_count
 from gsmap.visualization.figure import FORMATS, sample_name, save_figure
 from mapdata.bag_topics import parse_topics
 from mapdata.calibration_check import (
@@ -223,7 +223,7 @@ def check_calibration(args: argparse.Namespace, source: Source) -> list[str]:
     if args.check_calibration:
         figure = calibration_figure(sample, source.frame, root, source.ground_z_m)
         path = save_figure(figure, args.check_calibration)
-        number = counted(len(warnings), "warning")
+        number = format_count(len(warnings), "warning")
         print(f"{number}; the ground plane as the cameras should see it: {path}")
     return warnings
 
@@ -325,11 +325,11 @@ def predict(
     with Progress(total=len(chosen), unit="samples", smoothing=0.05) as bar:
         if results and results.dropped:
             bar.write(
-                f"{results.path} had {counted(results.dropped, 'sample')} of a run with other "
+                f"{results.path} had {format_count(results.dropped, 'sample')} of a run with other "
                 "settings, which are not used"
             )
         if results and done:
-            bar.write(f"going on after {len(done)} of {counted(len(chosen), 'sample')}")
+            bar.write(f"going on after {len(done)} of {format_count(len(chosen), 'sample')}")
             broken.update(results.broken)
             if inferencer.model.temporal is None:  # memory needs the frames before
                 bar.update(len(done))
@@ -443,7 +443,7 @@ def print_summary(
     """
     out = args.out and args.shard.path_of(args.out)
     written = " and ".join(str(path) for path in (out, args.show_dir) if path)
-    print(f"{count - len(broken)} of {counted(count, 'sample')} predicted: {written}")
+    print(f"{count - len(broken)} of {format_count(count, 'sample')} predicted: {written}")
     if args.out and not isinstance(source.samples, AnnotationFile):
         annotations = args.out.with_suffix(_SAMPLES)
         write_bytes(annotations, Path(ann_file).read_bytes())

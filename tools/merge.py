@@ -18,7 +18,7 @@ from gsmap.evaluation.core.results_json import merge_results
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.errors import InputError
 from gsmap.utils.shards import ShardFile, find_shards
-from gsmap.utils.words import counted
+from gsmap.utils.words import format_count
 
 
 def merge_matches(path: Path, shards: list[ShardFile]) -> int:
@@ -59,7 +59,9 @@ def main(argv: list[str] | None = None) -> str:
         if kind not in MERGE:
             raise InputError(f"{shards[0].path} holds {kind!r}, of which no whole is made.")
         count = MERGE[kind](target, shards)
-        lines.append(f"{target}: {counted(count, 'sample')} of {counted(len(shards), 'shard')}")
+        lines.append(
+            f"{target}: {format_count(count, 'sample')} of {format_count(len(shards), 'shard')}"
+        )
     return "\n".join(lines)
 
 

@@ -20,7 +20,7 @@ from gsmap.checkpoints.named_models import (
 )
 from gsmap.checkpoints.reading import load_weights
 from gsmap.engine.launch import read_config
-from gsmap.utils.shipped import shipped
+from gsmap.utils.shipped import shipped_path
 
 REPO = Path(__file__).resolve().parents[2]
 SHIPPED = [name for name, model in named_models().items() if model.address is None]
@@ -29,7 +29,7 @@ SHIPPED = [name for name, model in named_models().items() if model.address is No
 def test_every_model_has_a_config_and_says_where_its_file_is():
     for model in named_models().values():
         assert re.fullmatch(r"\w+", model.name)  # of a file in models/
-        assert shipped(model.config).is_file(), model.name
+        assert shipped_path(model.config).is_file(), model.name
         assert model.file.is_file() == (model.address is None), model.name
         assert model.address is None or model.address.startswith("https://")
 
@@ -56,7 +56,7 @@ def test_the_inferencer_takes_a_name_alone():
 def test_a_config_is_found_by_its_path_in_the_repository_from_any_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     config = "configs/maptr/maptr_r18_minicity.py"
-    assert find_config(config) == shipped(config)
+    assert find_config(config) == shipped_path(config)
     Path(config).parent.mkdir(parents=True)
     Path(config).touch()
     assert find_config(config) == Path(config)  # one's own comes first
@@ -65,8 +65,8 @@ def test_a_config_is_found_by_its_path_in_the_repository_from_any_folder(tmp_pat
 def test_a_config_is_found_by_its_name_from_any_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     name = "gsmap_maptr_r18_minicity"
-    assert find_config(name) == shipped(f"projects/GSMap/configs/{name}.py")
-    assert find_config("maptr_r50_24e") == shipped("configs/maptr/maptr_r50_24e.py")
+    assert find_config(name) == shipped_path(f"projects/GSMap/configs/{name}.py")
+    assert find_config("maptr_r50_24e") == shipped_path("configs/maptr/maptr_r50_24e.py")
     with pytest.raises(ValueError, match=f"give a checkpoint after {name}: only a model's name"):
         checkpoint_for(name, None)
     with pytest.raises(FileNotFoundError, match=r"config file gsmap.*mean gsmap_maptr_r50_24e\?"):
@@ -76,11 +76,11 @@ def test_a_config_is_found_by_its_name_from_any_folder(tmp_path, monkeypatch):
 
 
 def test_a_name_means_one_config():
-    files = [*shipped("configs").glob("*.py"), *shipped("configs").glob("[!_]*/*.py")]
-    files += shipped("projects/GSMap/configs").glob("*.py")
+    files = [*shipped_path("configs").glob("*.py"), *shipped_path("configs").glob("[!_]*/*.py")]
+    files += shipped_path("projects/GSMap/configs").glob("*.py")
     assert sorted(named_configs().values()) == sorted(files)  # so no name stands for two
     for name in named_configs().keys() & named_models():
-        assert named_configs()[name] == shipped(named_models()[name].config)
+        assert named_configs()[name] == shipped_path(named_models()[name].config)
 
 
 def test_a_wrong_name_gets_the_nearest_right_one():
@@ -102,7 +102,7 @@ def test_a_model_that_does_not_ship_says_where_it_is_fetched():
 
 def test_a_damaged_file_is_refused(tmp_path, monkeypatch):
     named_models()
-    monkeypatch.setattr(registry, "shipped", tmp_path.joinpath)
+    monkeypatch.setattr(registry, "shipped_path", tmp_path.joinpath)
     (tmp_path / "models").mkdir()
     (tmp_path / "models/gsmap_r18_minicity.pth").write_bytes(b"half")
     assert list_models() == ["gsmap_r18_minicity"]
@@ -116,8 +116,8 @@ def test_a_file_of_the_working_folder_does_not_stand_for_a_named_model(tmp_path,
     monkeypatch.setattr(registry, "print_log", lambda text, **_: said.append(text))
     for name in ("gsmap_r18_minicity", "maptr_r18_minicity"):
         Path(name).write_bytes(b"somebody's")
-        assert find_checkpoint(name) == shipped(f"models/{name}.pth")
-        assert checkpoint_for(name, None) == shipped(f"models/{name}.pth")
+        assert find_checkpoint(name) == shipped_path(f"models/{name}.pth")
+        assert checkpoint_for(name, None) == shipped_path(f"models/{name}.pth")
         assert find_checkpoint(f"./{name}") == Path(name)
     assert said[0] == (
         "gsmap_r18_minicity refers to the named model; for the file in the working folder write "
@@ -128,7 +128,7 @@ def test_a_file_of_the_working_folder_does_not_stand_for_a_named_model(tmp_path,
 def test_a_file_without_a_known_digest_is_called_unverified_once(tmp_path, monkeypatch):
     named_models()
     registry._warn_unverified.cache_clear()
-    monkeypatch.setattr(registry, "shipped", tmp_path.joinpath)
+    monkeypatch.setattr(registry, "shipped_path", tmp_path.joinpath)
     (tmp_path / "models").mkdir()
     said = []
     monkeypatch.setattr(registry, "print_log", lambda text, **_: said.append(text))

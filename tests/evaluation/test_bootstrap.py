@@ -71,7 +71,7 @@ def repeated(samples: list, drawn: np.ndarray) -> list:
 def test_resampled_figures_equal_those_of_files_with_the_scenes_repeated():
     samples = drive(0, 0.6)
     resamples = resamples_of(samples)
-    _, drawn = resamples.draw([token for token, *_ in samples])
+    _, drawn = resamples.draw_copies([token for token, *_ in samples])
     assert (drawn.sum(1) == 5).all()
     found = {}
     for report in reports_of(samples):
@@ -129,13 +129,13 @@ def test_a_difference_is_paired_scene_by_scene():
 
 def test_resamples_are_repeatable_and_need_scenes():
     scenes = {f"t{i}": f"s{i}" for i in range(6)}
-    draw = [Resamples(scenes, 50, seed).draw(list(scenes))[1] for seed in (0, 0, 1)]
+    draw = [Resamples(scenes, 50, seed).draw_copies(list(scenes))[1] for seed in (0, 0, 1)]
     np.testing.assert_array_equal(draw[0], draw[1])
     assert (draw[0] != draw[2]).any()
     with pytest.raises(ValueError, match="two scenes, two resamples"):
         Resamples({"a": "s", "b": "s"})
     with pytest.raises(ValueError, match="scene of sample 'x' is not known"):
-        Resamples(scenes).draw(["x"])
+        Resamples(scenes).draw_copies(["x"])
 
 
 def test_the_command_writes_intervals_and_differences(tmp_path, capsys):

@@ -73,7 +73,7 @@ def test_a_file_without_a_group_for_each_scene_is_refused(content, message, tmp_
     with pytest.raises(ValueError, match="knows no scenes"):
         read_groups(tmp_path / "truth.json", "scene")
     with pytest.raises(ValueError, match="the group of sample 't1' is not known"):
-        Groups({"t0": "a"}).draw(["t0", "t1"])
+        Groups({"t0": "a"}).draw_copies(["t0", "t1"])
 
 
 def test_the_command_prints_and_writes_the_ap_of_each_group(tmp_path, capsys):

@@ -165,7 +165,7 @@ def test_a_table_of_values_is_in_the_order_of_tokens_and_counts_a_token_once():
 @pytest.mark.parametrize("name", ["chamfer", "raster", "pld", "topology", "heights", "bemapnet"])
 def test_matches_made_again_are_the_same_and_of_other_shapes_refused(name):
     settings = MetricSettings(CLASSES, grid=BEVGrid((-15.0, 15.0), (-30.0, 30.0)))
-    evaluator = MapEvaluator.named([name], settings)
+    evaluator = MapEvaluator.from_names([name], settings)
     line = [[[0.0, -20.0, 0.0], [0.0, 20.0, 0.0]]]
     found = MapElements.from_polylines(line, [0], [0.9])
     truth = MapElements.from_polylines(line, [0])

@@ -302,7 +302,7 @@ def check_groups_and_resamples(evaluator: MapEvaluator) -> None:
             assert value == pytest.approx(own[key], abs=1e-12), (group, key)
         assert aps.keys() == {k for k in own if "/AP" in k or k.endswith("/mAP")}
     resamples = Resamples(group_of, 4, seed=1)
-    scenes, drawn = resamples.draw(reports[0].tokens)
+    scenes, drawn = resamples.draw_copies(reports[0].tokens)
     for b, counts in enumerate(drawn.astype(int)):
         copies = [s[1:] for s, g in zip(samples, scenes, strict=True) for _ in range(counts[g])]
         own = figures(*copies, evaluator=DRAWN)
@@ -362,11 +362,11 @@ def test_bad_settings_are_refused(tmp_path):
         given_so = MetricSettings(CLASSES, grid=NUSCENES_GRID, **rules)
         for name in ("vectormapnet", "vectormapnet_shrunk"):
             with pytest.raises(ValueError, match="is AP_chamfer of lines of 100 points"):
-                MapEvaluator.named([name], given_so)
+                MapEvaluator.from_names([name], given_so)
     with pytest.raises(ValueError, match=r"there is no metric .*'image'.*'chamfer', .*'hdmapnet'"):
-        MapEvaluator.named(["image"], MetricSettings(CLASSES))
+        MapEvaluator.from_names(["image"], MetricSettings(CLASSES))
     with pytest.raises(ValueError, match="need the range of the map"):
-        MapEvaluator.named(["bemapnet"], MetricSettings(CLASSES))
+        MapEvaluator.from_names(["bemapnet"], MetricSettings(CLASSES))
     with pytest.raises(ValueError, match="predictions need scores"):
         match_sample_ap(TRUTH, TRUTH, RULES["thin"])
     results, truth = tmp_path / "results.json", tmp_path / "truth.json"

@@ -160,7 +160,7 @@ def write_shards(
     elements = elements_of_instances(sample.instances)
     results = [(token, vectors_of(elements, meta.classes)) for token in "ab"]
     settings = MetricSettings(meta.classes, grid=BEVGrid(meta.x_range, meta.y_range))
-    evaluator = MapEvaluator.named(["chamfer", "raster", "pld"], settings)
+    evaluator = MapEvaluator.from_names(["chamfer", "raster", "pld"], settings)
     for shard in (Shard(index, count) for index in range(count)):
         own = replace(sample, token=str(shard.index))
         if kind == ANNOTATIONS:

@@ -15,7 +15,7 @@ from torch.utils.data import DataLoader
 
 from gsmap.checkpoints.building import building
 from gsmap.checkpoints.reading import refusing
-from gsmap.datasets.errors import naming
+from gsmap.datasets.errors import explain_errors
 from gsmap.utils.errors import InputError, WorkError
 from gsmap.utils.faults import in_words, is_of_the_machine
 
@@ -225,7 +225,7 @@ def test_the_signal_of_a_worker_says_what_was_missing(cause, text):
 )
 def test_a_file_is_not_to_blame_for_what_the_machine_lacks(error, of_machine):
     assert is_of_the_machine(error) == of_machine
-    for reading in (refusing("a.pth"), naming("a.json", "copy it again")):
+    for reading in (refusing("a.pth"), explain_errors("a.json", "copy it again")):
         with pytest.raises(type(error) if of_machine else Exception) as raised, reading:
             raise error
         assert not of_machine or raised.value is error

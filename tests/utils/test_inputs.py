@@ -12,7 +12,7 @@ from processes import REPO, run_tool
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.files import write_text
-from gsmap.utils.inputs import InputReplacedError, heed_input
+from gsmap.utils.inputs import InputReplacedError, check_input
 from gsmap.utils.parallel import ordered_map
 
 
@@ -90,7 +90,7 @@ def test_an_output_may_be_read_once_it_is_written(folder):
 
     run_command(command)
     assert out.read_text() == "new"
-    heed_input(out)  # the command has ended
+    check_input(out)  # the command has ended
 
 
 @pytest.mark.parametrize("kind", ["pipe", "socket", "device", "link to a pipe"])

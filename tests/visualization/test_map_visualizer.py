@@ -123,7 +123,7 @@ def test_hits_are_those_of_the_evaluation_and_the_legend_has_what_is_drawn(tmp_p
     matched = match_chamfer(found, truth, ChamferConfig(CLASSES))
     hits = set(matched.pred_index[matched.matched_gt[:, 1] >= 0])
     (panel,) = visualizer._bev_panels(truth, found, None, "")
-    assert panel.fates == (["hit" if i in hits else "false" for i in range(4)], ["found"])
+    assert panel.outcomes == (["hit" if i in hits else "false" for i in range(4)], ["found"])
     assert found.confidence[list(hits)] == [0.9]
     figure = visualizer.draw_sample(sample)
     assert labels(figure) == [

@@ -29,7 +29,7 @@ from gsmap.engine.launch import check_config, read_config
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import read_json
 from gsmap.utils.shards import digest
-from gsmap.utils.shipped import shipped
+from gsmap.utils.shipped import shipped_path
 
 SETTINGS = "settings.json"  # settings at the start of a run; a later start must have equal ones
 RECORD = "run.json"  # machine, load, command and end of a run
@@ -140,15 +140,15 @@ class Run:
 
     def commands(self) -> dict[str, list[str]]:
         """Commands that train and test the model, by stage."""
-        train = [str(shipped("tools/train.py")), self.config]
+        train = [str(shipped_path("tools/train.py")), self.config]
         train += ["--work-dir", str(self.folder), "--resume"]
         python = [sys.executable, "-u"]
         launcher = python
         if self.processes > 1:  # alone, torchrun chooses a free port
-            launcher = [str(shipped("tools/dist_run.sh")), str(self.processes)]
+            launcher = [str(shipped_path("tools/dist_run.sh")), str(self.processes)]
             launcher += ["--standalone", "--local_addr=127.0.0.1"]
             train += ["--launcher", "pytorch"]
-        test = [str(shipped("tools/test.py")), self.config, str(self.checkpoint)]
+        test = [str(shipped_path("tools/test.py")), self.config, str(self.checkpoint)]
         test += ["--work-dir", str(self.folder / "test")]
         test += ["--out", str(self.folder / "results.json")]
         test += ["--metrics-out", str(self.folder / "metrics.json")]

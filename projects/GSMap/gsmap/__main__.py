@@ -8,7 +8,7 @@ from pathlib import Path
 from gsmap import __version__
 from gsmap.utils.cli import BAD_INPUT, CommandParser
 from gsmap.utils.faults import nearest
-from gsmap.utils.shipped import shipped
+from gsmap.utils.shipped import shipped_path
 
 
 def _summary(tool: Path) -> str:
@@ -31,7 +31,7 @@ def _overview(tools: dict[str, Path]) -> str:
 
 def main() -> None:
     """Run the script named by the first argument, like ``python tools/NAME.py``."""
-    scripts = sorted(shipped("tools").glob("*.py"))
+    scripts = sorted(shipped_path("tools").glob("*.py"))
     tools = {path.stem: path for path in scripts}
     name = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if name in ("-h", "--help"):

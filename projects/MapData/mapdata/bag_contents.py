@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.datasets.errors import naming
+from gsmap.datasets.errors import explain_errors
 from gsmap.structures.rigid import rigid
 from gsmap.utils.errors import InputError
 from mapdata.bag_cameras import ImageTopic, is_calibrated, is_same_calibration
@@ -209,7 +209,7 @@ def read_content(bag: Bag, topics: Mapping[str, tuple[str, str]]) -> BagContent:
         if topic in known_infos and raw[_AFTER_STAMP:] == known_infos[topic]:
             continue  # the stored camera info once more
         try:
-            with naming(f"the message at {recorded_ns} ns", "it is damaged"):
+            with explain_errors(f"the message at {recorded_ns} ns", "it is damaged"):
                 with library_errors():
                     message = bag.parser(connection)(raw)
                 if topic in image_topics_of:

@@ -8,7 +8,7 @@ from pathlib import Path
 import yaml
 
 from gsmap.utils.errors import InputError
-from gsmap.utils.inputs import heed_input
+from gsmap.utils.inputs import check_input
 from mapdata.mcap_bag import MAGIC, McapBag, is_plain_ros2
 from mapdata.ros_bag import RosBag
 
@@ -57,7 +57,7 @@ def bag_at(path: Path) -> Bag:
         ValueError: If a folder holds parts of several recordings, or the path is a pipe.
     """
     if not path.is_dir():
-        heed_input(path)
+        check_input(path)
         return _bag_of([path], notes=_notes_on([path]))
     parts = parts_in(path)
     if not (path / _METADATA).is_file():

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsmap.datasets.errors import naming
+from gsmap.datasets.errors import explain_errors
 from gsmap.datasets.source import Source
 from gsmap.structures.rigid import invert_rigid, rigid
 from gsmap.utils.errors import InputError
@@ -52,7 +52,7 @@ def read_bag(path: Path, options: InputOptions) -> Source:
         ValueError: If the bag is damaged, or lacks topics, transforms or poses; the message lists
             its content.
     """
-    with naming(path, "see docs/inference.md"):
+    with explain_errors(path, "see docs/inference.md"):
         try:
             bag = bag_at(path)
             try:
@@ -332,7 +332,7 @@ def _write_images(
             continue
         where = f"camera {camera.name!r}, image at {target.stem} ns"
         try:
-            with naming(where, "its frame is left out"):
+            with explain_errors(where, "its frame is left out"):
                 write_image(message, camera, target=target, where=where)
         except ValueError as error:
             notes.append(str(error))

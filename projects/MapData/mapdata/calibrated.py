@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from gsmap.datasets.annotations.record import AnnotationMeta, MapSample
-from gsmap.datasets.errors import naming
+from gsmap.datasets.errors import explain_errors
 from gsmap.datasets.source import Mount, change_frame, ground_from_frame
 from gsmap.utils.errors import InputError
 from mapdata.folders.calibration_file import read_vehicle
@@ -45,7 +45,7 @@ def calibrated_records(
     images: dict[str, list[Path]] = {}
     time_of: dict[str, int] = {}
     for number, record in enumerate(records):
-        with naming(f"record {_name_of(record, number)!r}", "correct it"):
+        with explain_errors(f"record {_name_of(record, number)!r}", "correct it"):
             for camera in record["cameras"]:
                 _require_keys(camera, file)
                 images.setdefault(str(camera["name"]), []).append(root / camera["path"])
@@ -54,7 +54,7 @@ def calibrated_records(
     camera_of = {camera.name: camera for camera in rig}
     pose_at = None if poses is None else cache(poses.at)
     for number, record in enumerate(records):
-        with naming(f"record {_name_of(record, number)!r}", "correct it"):
+        with explain_errors(f"record {_name_of(record, number)!r}", "correct it"):
             frame = _rig_frame(record, camera_of=camera_of, file=file)
             if pose_at is not None and record.get(_POSE) is not None:
                 raise InputError(f"{_POSE} is given, and {file} has poses, too: leave out one.")

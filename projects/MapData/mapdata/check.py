@@ -16,7 +16,7 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.faults import is_of_the_machine
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
-from gsmap.utils.words import counted
+from gsmap.utils.words import format_count
 from mapdata.command_line import add_workers_option
 
 _MOST_PROBLEMS = 10  # in a message
@@ -74,14 +74,14 @@ def _describe_content(file: AnnotationFile) -> list[str]:
     counts = counts[counts >= 0]  # without samples whose ground truth is not known
     lines = []
     if len(counts):
-        elements = counted(int(counts.sum()), "map element")
+        elements = format_count(int(counts.sum()), "map element")
         lines.append(
             f"{elements}, up to {counts.max()} in a sample (a model needs at least as many queries)"
         )
         empty = int((counts == 0).sum())
         if empty:
             lines.append(
-                f"warning: {empty} of {counted(len(counts), 'sample')} have no element in the "
+                f"warning: {empty} of {format_count(len(counts), 'sample')} have no element in the "
                 "range: are points in metres of the frame, not of the world?"
             )
     for warning in calibration_warnings(file, file.meta.frame, file.meta.ground_z_m):
@@ -109,7 +109,7 @@ def check_files(paths: Sequence[Path], root: Path | None, workers: int) -> str:
         file = _open(path)
         mark = "checksum right" if file.sealed else "no checksum, as it is of an earlier version"
         lines += [f"{path}: {line}" for line in _describe_content(file)]
-        lines.append(f"{path}: {counted(len(file), 'sample')}, values right, {mark}")
+        lines.append(f"{path}: {format_count(len(file), 'sample')}, values right, {mark}")
         if root is not None:
             samples = Progress(file, desc=path.name, unit="samples")
             problems = []

@@ -19,7 +19,7 @@ from gsmap.datasets.annotations.record import (
     MapSample,
     SweepRecord,
 )
-from gsmap.datasets.errors import naming
+from gsmap.datasets.errors import explain_errors
 from gsmap.datasets.image_files import image_size, read_image
 from gsmap.structures.frames import frame_view
 from gsmap.structures.polylines import Points, clip_to_box, is_closed
@@ -126,7 +126,7 @@ def _samples(
     count = 0
     for number, record in enumerate(records):
         name = record.get("token", number) if isinstance(record, Mapping) else number
-        with naming(f"record {name!r}", "correct it"):
+        with explain_errors(f"record {name!r}", "correct it"):
             unknown = set(record) - set(_KEYS)
             if unknown:
                 raise InputError(f"unknown keys {sorted(unknown)}; known are {_KEYS}.")

@@ -15,7 +15,7 @@ from gsmap.datasets.annotations.record import MapSample
 from gsmap.utils.cli import output_file
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import atomic_write
-from gsmap.utils.words import counted
+from gsmap.utils.words import format_count
 
 _DECIMALS = 6
 _GROUND_TRUTH = "GTs"  # key of the samples in MapTR's format
@@ -107,4 +107,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> str:
     """Run the command ``export`` and return its report."""
     count = write_vectors(arguments.annotations, arguments.target)
-    return f"{counted(count, 'sample')} written to {arguments.target}"
+    return f"{format_count(count, 'sample')} written to {arguments.target}"

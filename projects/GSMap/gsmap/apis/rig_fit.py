@@ -21,7 +21,7 @@ from gsmap.datasets.annotations.record import MapSample
 from gsmap.engine.run_log import innermost
 from gsmap.structures.frames import FRAME_VIEWS, viewing_azimuth
 from gsmap.utils.errors import InputError
-from gsmap.utils.shipped import shipped
+from gsmap.utils.shipped import shipped_path
 
 if TYPE_CHECKING:
     from mmengine.runner import Runner
@@ -363,7 +363,7 @@ def _training_facts(path: Any, checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     metadata: Any = (checkpoint.get("meta") or {}).get("dataset_meta") or {}
     for model in named_models().values():
         if not metadata and Path(str(path)) == model.file:
-            metadata = dict(Config.fromfile(shipped(model.config)).train_dataloader.dataset)
+            metadata = dict(Config.fromfile(shipped_path(model.config)).train_dataloader.dataset)
             metadata |= metadata["grid"]
     if not isinstance(metadata, Mapping):
         return {}

@@ -13,7 +13,7 @@ from mmengine.registry import Registry, build_from_cfg
 
 from gsmap.utils.errors import GsmapError, InputError
 from gsmap.utils.faults import in_words, nearest, registry_names
-from gsmap.utils.shipped import shipped
+from gsmap.utils.shipped import shipped_path
 
 _BUILDER = build_from_cfg.__code__  # every registry calls it, also registries inside of classes
 _RUNNER = "mmengine.runner.runner"  # compared by name, since importing the runner is slow
@@ -67,7 +67,8 @@ def reading_config(source: object) -> Iterator[None]:
             reason = error.__context__  # mmengine's ImportError omits the cause
         if "load gsmap config" in str(reason):  # mmengine has a fixed list of scopes
             reason = ValueError(
-                f"'gsmap::' is not read in _base_; write a path below {shipped('configs')} instead"
+                f"'gsmap::' is not read in _base_; write a path below {shipped_path('configs')} "
+                "instead"
             )
         raise InputError(
             f"{source}{place} cannot be used: {type(reason).__name__}: {reason}."

@@ -16,7 +16,7 @@ from mmengine.logging import print_log
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import read_json
 from gsmap.utils.shards import digest
-from gsmap.utils.shipped import shipped
+from gsmap.utils.shipped import shipped_path
 
 
 @dataclass(frozen=True)
@@ -49,14 +49,14 @@ class NamedModel:
     @property
     def file(self) -> Path:
         """File of the weights."""
-        return shipped(f"models/{self.name}.pth")
+        return shipped_path(f"models/{self.name}.pth")
 
 
 @cache
 def named_models() -> dict[str, NamedModel]:
     """Models of the registry by name."""
     models: dict[str, NamedModel] = {}
-    for row in read_json(shipped("models/registry.json")):
+    for row in read_json(shipped_path("models/registry.json")):
         models[row["name"]] = NamedModel(**row)
     return models
 
@@ -71,7 +71,7 @@ def named_configs() -> dict[str, Path]:
     """Files of the shipped configs by name (the file name without suffix); no base configs."""
     configs: dict[str, Path] = {}
     for pattern in ("configs/*.py", "configs/[!_]*/*.py", "projects/GSMap/configs/*.py"):
-        for path in sorted(shipped().glob(pattern)):
+        for path in sorted(shipped_path().glob(pattern)):
             configs[path.stem] = path
     return configs
 
@@ -86,15 +86,15 @@ def find_config(config: str | Path) -> Path:
         FileNotFoundError: If there is no such config; the message contains the nearest name.
     """
     name = str(config)
-    for path in (Path(config), shipped(name)):
+    for path in (Path(config), shipped_path(name)):
         if path.is_file():
             return path
     configs = named_configs()
     if name in configs and configs[name].is_file():
         return configs[name]
-    places = f"; configs are in configs/ and projects/GSMap/configs/ of {shipped()}"
+    places = f"; configs are in configs/ and projects/GSMap/configs/ of {shipped_path()}"
     model = _find_model(config, kind="config file", message_end=places, other_names=configs)
-    return shipped(model.config)
+    return shipped_path(model.config)
 
 
 def find_checkpoint(checkpoint: str | Path) -> Path:

@@ -25,7 +25,7 @@ _CONTENT_ERRORS = (
 
 
 @contextmanager
-def naming(subject: object, remedy: str) -> Iterator[None]:
+def explain_errors(subject: object, remedy: str) -> Iterator[None]:
     """Context manager that adds the name of a file and a remedy to errors about its content.
 
     Errors of the system, such as a lack of memory, and errors with the name pass unchanged.

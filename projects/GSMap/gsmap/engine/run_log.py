@@ -23,7 +23,7 @@ from gsmap.engine.rank_watch import RankWatch
 from gsmap.engine.resuming import refusing_state
 from gsmap.utils.errors import NotFiniteError
 from gsmap.utils.files import naming_file, write_text
-from gsmap.utils.words import counted
+from gsmap.utils.words import format_count
 
 # Prefixes of mmengine's long log records and of records without information about the run
 _DUMPS = (
@@ -167,7 +167,7 @@ class RunSummaryHook(Hook):
             source = runner._load_from or "the config's initial weights"
             start = f"from {source}"
         device = next(model.parameters()).device
-        threads = counted(torch.get_num_threads(), noun="thread")
+        threads = format_count(torch.get_num_threads(), noun="thread")
         log_dir = getattr(runner, "log_dir", None) or runner._log_dir  # public in FlexibleRunner
         lines = {
             "model": _describe_model(model),
@@ -216,7 +216,7 @@ def _describe_data(runner: Runner) -> dict[str, str]:
     for name, loader in loaders.items():
         dataset = innermost(loader.dataset)
         file = getattr(dataset, "ann_file", type(dataset).__name__)
-        lines[name] = f"{counted(len(loader.dataset), noun='sample')} of {file}"
+        lines[name] = f"{format_count(len(loader.dataset), noun='sample')} of {file}"
     if not hasattr(dataset, "sample"):
         return lines
     cameras = dataset.sample(0).cameras
@@ -249,7 +249,7 @@ def _missed_elements(runner: Runner, model: Any) -> str | None:
     excess = np.maximum(counts - queries, 0)
     if not excess.any():
         return None
-    samples = counted(len(counts), noun="training sample")
+    samples = format_count(len(counts), noun="training sample")
     return (
         f"{(excess > 0).sum()} of {samples} have more elements (up to {counts.max()}) than the "
         f"model has queries ({queries}): {excess.sum()} elements can never be found. Set "
@@ -264,16 +264,15 @@ def _describe_length(runner: Runner) -> str:
     loader = runner.train_dataloader
     if isinstance(loop, EpochBasedTrainLoop):
         unit = "epoch"
-        length = (
-            f"{counted(loop.max_epochs, noun='epoch')} of {counted(len(loader), noun='iteration')}"
-        )
+        epochs = format_count(loop.max_epochs, noun="epoch")
+        length = f"{epochs} of {format_count(len(loader), noun='iteration')}"
     else:
         unit = "iteration"
-        length = counted(loop.max_iters, noun="iteration")
+        length = format_count(loop.max_iters, noun="iteration")
     validation = "no validation"
     if runner.val_loop is not None:
-        validation = f"validation every {counted(loop.val_interval, noun=unit)}"
+        validation = f"validation every {format_count(loop.val_interval, noun=unit)}"
     return (
-        f"{length}, {counted(loader.batch_size, noun='sample')} x "
-        f"{counted(runner.world_size, noun='process')} each; {validation}"
+        f"{length}, {format_count(loader.batch_size, noun='sample')} x "
+        f"{format_count(runner.world_size, noun='process')} each; {validation}"
     )

@@ -81,7 +81,7 @@ class MapMetric(BaseMetric):
         settings = MetricSettings(
             classes=classes, thresholds=self.thresholds, dim=meta.get("dim", 2), grid=grid
         )
-        return MapEvaluator.named(self.eval, settings)
+        return MapEvaluator.from_names(self.eval, settings)
 
     def process(self, data_batch: Any, data_samples: Sequence[Mapping[str, Any]]) -> None:
         """Match the samples of one batch.

@@ -29,7 +29,7 @@ class _Command:
 
 
 def watch_files() -> None:
-    """Check every file that this process opens after this call (`heed_input`)."""
+    """Check every file that this process opens after this call (`check_input`)."""
     _Command.is_running = True
     if not _Command.has_hook:
         sys.addaudithook(_on_event)
@@ -85,7 +85,7 @@ def declare_files(inputs: Iterable[Path], outputs: Sequence[tuple[Path, str]]) -
     _Command.outputs |= existing_outputs
 
 
-def heed_input(path: str | bytes | os.PathLike) -> None:
+def check_input(path: str | bytes | os.PathLike) -> None:
     """Check a file before it is read.
 
     Code calls this for libraries that do not open files through Python.
@@ -153,10 +153,10 @@ def _on_event(event: str, arguments: tuple[Any, ...]) -> None:
     if event == "open":
         path, _, flags = arguments
         if isinstance(path, str | bytes) and not (flags or 0) & _WRITING:
-            heed_input(path)
+            check_input(path)
     elif event == "sqlite3.connect" and isinstance(arguments[0], str):
         path, _, _ = arguments[0].removeprefix("file:").partition("?")
-        heed_input(path)
+        check_input(path)
 
 
 def _identity(path: str | bytes | os.PathLike) -> _Identity | None:

@@ -7,7 +7,7 @@ import gsmap
 _MARKER = "models/registry.json"
 
 
-def shipped(path: str = "") -> Path:
+def shipped_path(path: str = "") -> Path:
     """Return the installed place of a file or folder of the repository.
 
     A wheel installs these files to ``gsmap/.mim``; an editable installation uses the repository.

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 
 
-def counted(count: int, noun: str) -> str:
+def format_count(count: int, noun: str) -> str:
     """Format a number with its noun, in the plural unless the number is 1: ``3 samples``."""
     if count == 1:
         return f"{count} {noun}"

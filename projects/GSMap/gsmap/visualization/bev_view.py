@@ -66,7 +66,7 @@ class BEVPanel:
     colours: Sequence[str] = ()
 
     @property
-    def fates(self) -> tuple[list[str], list[str]]:
+    def outcomes(self) -> tuple[list[str], list[str]]:
         """Kinds of matches, keys of ``MATCH_COLOURS``.
 
         Returns:
@@ -74,10 +74,10 @@ class BEVPanel:
             ``found`` or ``missed`` for each ground truth (K,).
         """
         hits: Sequence[int] = () if self.hits is None else self.hits.tolist()
-        fates = ["hit" if hit >= 0 else "false" for hit in hits]
+        outcomes = ["hit" if hit >= 0 else "false" for hit in hits]
         num_truths = len(self.truth or ())
-        truth_fates = ["found" if index in hits else "missed" for index in range(num_truths)]
-        return fates, truth_fates
+        truth_outcomes = ["found" if index in hits else "missed" for index in range(num_truths)]
+        return outcomes, truth_outcomes
 
 
 def display_extent(grid: BEVGrid, view: FrameView) -> tuple[float, float, float, float]:
@@ -161,7 +161,7 @@ def draw_lines(
     colours: Sequence[Any],
     width_pt: float,
     zorder: float = 10,
-    fates: Sequence[str] = (),
+    outcomes: Sequence[str] = (),
 ) -> None:
     """Draw polylines, and fill the elements of closed classes. False predictions are dashed.
 
@@ -173,7 +173,7 @@ def draw_lines(
         colours: Colour of each polyline. (N,)
         width_pt: Width of the lines in points.
         zorder: Drawing order of the lines. Higher values are drawn later, on top.
-        fates: ``hit`` or ``false`` for each polyline (N,), or empty to dash none.
+        outcomes: ``hit`` or ``false`` for each polyline (N,), or empty to dash none.
     """
     shapes = []
     faces = []
@@ -182,7 +182,7 @@ def draw_lines(
             shapes.append(line)
             faces.append((*mcolors.to_rgb(colour), 0.2))
     ax.add_collection(PolyCollection(shapes, facecolors=faces, edgecolors="none", zorder=4))
-    line_styles = [FALSE_DASHES if fate == "false" else "-" for fate in fates]
+    line_styles = [FALSE_DASHES if outcome == "false" else "-" for outcome in outcomes]
     strokes = LineCollection(
         lines, colors=colours, linewidths=width_pt, linestyles=line_styles or "-"
     )
@@ -306,10 +306,10 @@ def _draw_truth(ax: Axes, panel: BEVPanel, view: FrameView, style: MapStyle) -> 
     """Draw the ground truth in broad lines, coloured by its matches."""
     if not panel.truth:
         return
-    _, fates = panel.fates
+    _, outcomes = panel.outcomes
     colours = []
-    for fate in fates:
-        colours.append(mcolors.to_rgba(MATCH_COLOURS[fate], TRUTH_OPACITY[fate]))
+    for outcome in outcomes:
+        colours.append(mcolors.to_rgba(MATCH_COLOURS[outcome], TRUTH_OPACITY[outcome]))
     draw_lines(
         ax,
         lines=[view.display_from_frame(line) for line in panel.truth.polylines],
@@ -323,9 +323,9 @@ def _draw_truth(ax: Axes, panel: BEVPanel, view: FrameView, style: MapStyle) -> 
 
 def _element_colours(panel: BEVPanel, labels: np.ndarray, style: MapStyle) -> list[str]:
     """Colours of matches if there are any, else the given colours, else those of classes. (N,)"""
-    fates, _ = panel.fates
-    if fates:
-        return [MATCH_COLOURS[fate] for fate in fates]
+    outcomes, _ = panel.outcomes
+    if outcomes:
+        return [MATCH_COLOURS[outcome] for outcome in outcomes]
     return list(panel.colours) or style.colours(labels)
 
 
@@ -356,7 +356,7 @@ def draw_bev(ax: Axes, panel: BEVPanel, grid: BEVGrid, view: FrameView, style: M
     if panel.gaussians and elements.has_gaussians:
         _draw_gaussians(ax, elements, view=view, style=style)
     if panel.lines:
-        fates, _ = panel.fates
+        outcomes, _ = panel.outcomes
         draw_lines(
             ax,
             lines,
@@ -364,7 +364,7 @@ def draw_bev(ax: Axes, panel: BEVPanel, grid: BEVGrid, view: FrameView, style: M
             style=style,
             colours=colours,
             width_pt=style.bev_line_pt,
-            fates=fates,
+            outcomes=outcomes,
         )
     if panel.vertices:
         for line, colour in zip(lines, colours, strict=True):

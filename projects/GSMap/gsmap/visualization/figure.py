@@ -154,19 +154,19 @@ def _legend_lines(
     lines = []
     for label in sorted(labels):
         lines.append(Line2D([], [], color=style.colour(label), lw=2.6, label=style.title(label)))
-    fates: list[str] = []  # results of the matching: "hit", "false", or of truths
+    outcomes: list[str] = []  # results of the matching: "hit", "false", or of truths
     for panel in panels:
-        for panel_fates in panel.fates:
-            fates += panel_fates
-    for fate, colour in MATCH_COLOURS.items():
-        if fate not in fates:
+        for panel_outcomes in panel.outcomes:
+            outcomes += panel_outcomes
+    for outcome, colour in MATCH_COLOURS.items():
+        if outcome not in outcomes:
             continue
-        is_truth = fate in TRUTH_OPACITY
-        title = f"truth {fate}" if is_truth else fate
-        line = Line2D([], [], color=colour, label=f"{title} ({fates.count(fate)})")
-        line.set(linewidth=1.8, linestyle=FALSE_DASHES if fate == "false" else "-")
+        is_truth = outcome in TRUTH_OPACITY
+        title = f"truth {outcome}" if is_truth else outcome
+        line = Line2D([], [], color=colour, label=f"{title} ({outcomes.count(outcome)})")
+        line.set(linewidth=1.8, linestyle=FALSE_DASHES if outcome == "false" else "-")
         if is_truth:
-            line.set(linewidth=4.2, alpha=TRUTH_OPACITY[fate], solid_capstyle="butt")
+            line.set(linewidth=4.2, alpha=TRUTH_OPACITY[outcome], solid_capstyle="butt")
         lines.append(line)
     return lines
 

@@ -14,7 +14,7 @@ from gsmap.structures.grid import BEVGrid
 from gsmap.utils.errors import InputError
 from gsmap.utils.extras import import_extra
 from gsmap.utils.files import atomic_write
-from gsmap.utils.words import counted
+from gsmap.utils.words import format_count
 from gsmap.visualization.bev_view import BEVPanel
 from gsmap.visualization.camera_view import camera_views
 from gsmap.visualization.figure import compose_figure, figure_to_rgb
@@ -115,7 +115,7 @@ def write_drive_film(
         width_px=width_px,
     )
     write_film(path, pictures, times_ns)
-    return f"{scene}, {counted(len(rows), 'frame')}: {path}"
+    return f"{scene}, {format_count(len(rows), 'frame')}: {path}"
 
 
 def _draw_frames(

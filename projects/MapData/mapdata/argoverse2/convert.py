@@ -11,7 +11,7 @@ import shapely
 
 from gsmap.datasets.annotations.file import AnnotationWriter
 from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta
-from gsmap.datasets.errors import naming
+from gsmap.datasets.errors import explain_errors
 from gsmap.utils.errors import InputError, WorkError
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
@@ -110,7 +110,7 @@ def _listed_logs(
     log_by_name = {log.name: log for log in find_all_logs(options.root)}
     names = {name: name for name in log_by_name}
     source = options.split_file or f"split {split_list.name!r}"
-    with naming(source, "list each log in one split"):
+    with explain_errors(source, "list each log in one split"):
         part_by_name, absent = resolve_scenes(split_list.scenes, names)
     listed = set(split_list.scenes[options.split])
     missing = listed.intersection(absent)

@@ -11,11 +11,11 @@ from av2.geometry.geometry import quat_to_mat
 from av2.utils.synchronization_database import SynchronizationDB
 from pyarrow import feather
 
-from gsmap.datasets.errors import naming
+from gsmap.datasets.errors import explain_errors
 from gsmap.structures.rigid import rigid
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import SUFFIX as PARTIAL_SUFFIX
-from gsmap.utils.inputs import heed_input
+from gsmap.utils.inputs import check_input
 
 # Camera order of MapTR and its successors; the camera embeddings of checkpoints depend on it.
 RING_CAMERAS = (
@@ -46,7 +46,7 @@ def _read_feather(path: Path) -> Any:
     Raises:
         ArrowException: If the table is damaged.
     """
-    heed_input(path)  # because Arrow does not open files through Python
+    check_input(path)  # because Arrow does not open files through Python
     table = feather.read_table(path, memory_map=False)
     table.validate(full=True)
     return table.to_pandas()
@@ -74,7 +74,7 @@ class Argoverse2Log:
         path = self.log_dir / POSE_TABLE
         if not path.is_file():
             raise FileNotFoundError(f"no poses at {path}: download the log again.")
-        with naming(path, "download the log again"):
+        with explain_errors(path, "download the log again"):
             table = _read_feather(path)
             table = table.drop_duplicates("timestamp_ns").sort_values("timestamp_ns")
             quaternions = table[["qw", "qx", "qy", "qz"]].to_numpy(np.float64)
@@ -110,7 +110,7 @@ class Argoverse2Log:
         if not intrinsics_path.is_file() or not extrinsics_path.is_file():
             return {}
         cameras = {}
-        with naming(folder, "download the log again"):
+        with explain_errors(folder, "download the log again"):
             intrinsics = _read_feather(intrinsics_path)
             _read_feather(
                 extrinsics_path

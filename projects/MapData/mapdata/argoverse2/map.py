@@ -13,7 +13,7 @@ from av2.map.lane_segment import LaneMarkType, LaneSegment
 from av2.map.map_api import ArgoverseStaticMap
 
 from gsmap.datasets.annotations.record import RANGES
-from gsmap.datasets.errors import naming
+from gsmap.datasets.errors import explain_errors
 from gsmap.utils.errors import InputError
 from mapdata.argoverse2.map_file import read_map_file
 from mapdata.argoverse2.rules import (
@@ -131,7 +131,7 @@ class Argoverse2Map:
             ValueError: If the log has several maps, or the map is damaged.
         """
         path = find_map(log_dir)
-        with naming(path, "download it again"):
+        with explain_errors(path, "download it again"):
             static_map, left_out = read_map_file(path)
             return cls(static_map, left_out)
 

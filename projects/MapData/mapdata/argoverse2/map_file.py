@@ -12,7 +12,7 @@ from av2.map.lane_segment import LaneSegment
 from av2.map.map_api import ArgoverseStaticMap
 from av2.map.pedestrian_crossing import PedestrianCrossing
 
-from gsmap.datasets.errors import naming
+from gsmap.datasets.errors import explain_errors
 from gsmap.utils.errors import InputError
 
 # by key of the file: name in messages, constructor, and least number of points of each line
@@ -44,7 +44,7 @@ def read_map_file(path: Path) -> tuple[ArgoverseStaticMap, dict[str, list[str]]]
         ValueError: If the file is damaged, lacks a layer, or a layer has no usable element.
     """
     left_out: dict[str, list[str]] = defaultdict(list)
-    with naming(path, "download it again"):
+    with explain_errors(path, "download it again"):
         content = json.loads(path.read_text(encoding="utf-8"))
         layers: dict[str, dict[int, Any]] = {}
         for key, (name, from_dict, min_points) in _LAYERS.items():
@@ -53,7 +53,7 @@ def read_map_file(path: Path) -> tuple[ArgoverseStaticMap, dict[str, list[str]]]
             records = content.get(key, {}) if may_be_absent else content[key]
             for element_id, record in records.items():
                 try:
-                    with naming(name, "it is left out"):
+                    with explain_errors(name, "it is left out"):
                         _check_lines(record, min_points)
                         layers[key][record["id"]] = from_dict(record)
                 except ValueError as error:

@@ -17,7 +17,7 @@ from gsmap.datasets.annotations.record import (
     MapSample,
     SweepRecord,
 )
-from gsmap.datasets.errors import naming
+from gsmap.datasets.errors import explain_errors
 from gsmap.utils.errors import InputError
 from mapdata.argoverse2.log import (
     MAX_CAMERA_OFFSET_NS,
@@ -146,7 +146,7 @@ def read_log(
         if timestamp_ns in excluded_ns:
             continue
         try:
-            with naming(log_dir, "download the log again"):
+            with explain_errors(log_dir, "download the log again"):
                 sample = _sample(log, log_map, timestamp_ns=timestamp_ns, options=options)
         except _UnusableSample as reason:
             result.left_out[str(reason)] += 1
@@ -323,7 +323,7 @@ def _sample(
         lidar=_lidar(log, timestamp_ns, ego_from_city=ego_from_city, options=options),
     )
     if log_map is not None:
-        with naming(find_map(log.log_dir), "download it again"):
+        with explain_errors(find_map(log.log_dir), "download it again"):
             elements = log_map.extract(
                 city_from_ego,
                 options.classes,

@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from gsmap.datasets.errors import naming
+from gsmap.datasets.errors import explain_errors
 from gsmap.datasets.image_files import image_size
 from gsmap.structures.rigid import invert_rigid, is_rigid, rigid
 from gsmap.utils.errors import InputError
@@ -46,12 +46,12 @@ def read_rig(file: Path, ground: np.ndarray) -> tuple[list[tuple[RigCamera, str]
         ValueError: If the file is malformed; the message names the camera.
     """
     rig = []
-    with naming(file, remedy="see docs/inference.md"):
+    with explain_errors(file, remedy="see docs/inference.md"):
         content = read_calibration(file)
         if "ground_z_m" in content:
             ground = ground_pose(content)
         for name, camera in cameras_of(content):
-            with naming(f"{file}, camera {name!r}", remedy="see docs/inference.md"):
+            with explain_errors(f"{file}, camera {name!r}", remedy="see docs/inference.md"):
                 check_camera_keys(camera)
                 if "size_px" not in camera:
                     raise InputError("beside a bag it needs size_px: [width, height]")
@@ -78,13 +78,13 @@ def read_vehicle(
         ValueError: If the file is malformed; the message names the camera.
     """
     rig = []
-    with naming(file, remedy="see docs/inference.md"):
+    with explain_errors(file, remedy="see docs/inference.md"):
         content = read_calibration(file)
         ground = ground_pose(content)
         for name, camera in cameras_of(content):
             if name not in images:
                 continue
-            with naming(f"{file}, camera {name!r}", remedy="see docs/inference.md"):
+            with explain_errors(f"{file}, camera {name!r}", remedy="see docs/inference.md"):
                 check_camera_keys(camera)
                 rig.append(create_camera(name, camera, ground=ground, images=images[name]))
         poses = read_named_poses(content, folder=file.parent, time_of=time_of, ground=ground)

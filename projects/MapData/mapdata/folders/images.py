@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from gsmap.datasets.annotations.record import MapSample
-from gsmap.datasets.errors import BrokenSampleError, naming
+from gsmap.datasets.errors import BrokenSampleError, explain_errors
 from gsmap.datasets.image_files import read_image
 from gsmap.datasets.source import Source
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import file_name, is_hidden
-from gsmap.utils.words import counted
+from gsmap.utils.words import format_count
 from mapdata.folders.calibration_file import (
     cameras_of,
     check_camera_keys,
@@ -63,14 +63,14 @@ def read_image_folder(
         ValueError: If the file is malformed; the message names the camera.
     """
     folder = file.parent
-    with naming(file, remedy="see docs/inference.md"):
+    with explain_errors(file, remedy="see docs/inference.md"):
         content = read_calibration(file)
         ground = ground_pose(content)
         rig = []
         images = {}
         notes = []
         for name, camera in cameras_of(content):
-            with naming(f"{file}, camera {name!r}", remedy="see docs/inference.md"):
+            with explain_errors(f"{file}, camera {name!r}", remedy="see docs/inference.md"):
                 check_camera_keys(camera)
                 images[name], image_notes = _find_images(folder, name=name, camera=camera)
                 notes += image_notes
@@ -157,7 +157,9 @@ def _find_images(
         raise InputError(f"two of its images at {place} have one name: rename one")
     notes = []
     if suffixes:
-        notes.append(f"camera {name!r}: {counted(other_count, 'file')} with {suffixes} not read")
+        notes.append(
+            f"camera {name!r}: {format_count(other_count, 'file')} with {suffixes} not read"
+        )
     return sorted(images, key=natural_sort_key), notes
 
 
@@ -270,8 +272,8 @@ def _usage_notes(
     for name, paths in images.items():
         if not counts[name] == len(paths) == len(frames):
             notes.append(
-                f"camera {name!r}: {counts[name]} of {counted(len(paths), 'image')} used, for "
-                f"{counted(len(frames), 'sample')}; the others have no partner among those of "
+                f"camera {name!r}: {counts[name]} of {format_count(len(paths), 'image')} used, for "
+                f"{format_count(len(frames), 'sample')}; the others have no partner among those of "
                 f"{first!r}, by equal names or by times within {tolerance_ns / 1e6:g} ms"
             )
     return notes
@@ -296,8 +298,8 @@ def _frames_with_poses(
     if not selected:
         raise InputError(f"no image has a pose near its time: {spans}")
     note = (
-        f"{len(selected)} of {counted(len(frames), 'sample')} used: {missing} have no pose within "
-        f"0.1 s, nor poses around them less than 1 s apart ({spans})"
+        f"{len(selected)} of {format_count(len(frames), 'sample')} used: {missing} have no pose "
+        f"within 0.1 s, nor poses around them less than 1 s apart ({spans})"
     )
     return selected, [note]
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gsmap.datasets.errors import naming
+from gsmap.datasets.errors import explain_errors
 from gsmap.structures.rigid import rigid
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import read_text
@@ -48,7 +48,7 @@ def read_poses(path: Path, time_of: Mapping[str, int], ground: np.ndarray) -> Po
     times_ns = []
     values = []
     unknown_frames = []
-    with naming(path, remedy="see docs/inference.md"):
+    with explain_errors(path, remedy="see docs/inference.md"):
         for number, row in _rows(read_text(path)):
             try:
                 time_ns = _time_of(row, time_of=time_of)

@@ -24,7 +24,7 @@ from gsmap.datasets.annotations.record import (
     MapSample,
     SweepRecord,
 )
-from gsmap.datasets.errors import naming
+from gsmap.datasets.errors import explain_errors
 from gsmap.datasets.image_files import image_size
 from gsmap.structures.vehicle_signals import pose_signals
 from gsmap.utils.cli import output_file
@@ -263,7 +263,7 @@ def _samples(
     image_sizes = _ImageSizes(summary)
     remedy = f"a sample of such a file has {_NEEDED[meta.frame]}"
     for number, info in entries:
-        with naming(f"{infos}, sample {number}", remedy):
+        with explain_errors(f"{infos}, sample {number}", remedy):
             if meta.frame == "ego":
                 sample = _argoverse_sample(info, meta, root=root)
             else:
@@ -346,7 +346,7 @@ def convert_infos(
             truth outside the range.
     """
     entries, frame = _entries(load_plain_pickle(infos), infos)
-    with naming(infos, "make it anew"):
+    with explain_errors(infos, "make it anew"):
         dim = _dim(entries, classes) if frame == "ego" else 2
     usual_x_range, usual_y_range = RANGES[frame]
     meta = AnnotationMeta(

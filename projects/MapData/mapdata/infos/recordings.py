@@ -8,7 +8,7 @@ import numpy as np
 
 from gsmap.datasets.annotations.file import check_samples
 from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord, LidarRecord, MapSample
-from gsmap.datasets.errors import naming
+from gsmap.datasets.errors import explain_errors
 from gsmap.datasets.image_files import image_size
 from gsmap.utils.errors import InputError
 from mapdata.infos.plain_pickle import load_plain_pickle
@@ -51,7 +51,7 @@ def read_info_file(
     meta = AnnotationMeta("mmdet3d", "lidar", split="test")
     for i, info in enumerate(content["data_list"]):
         where = f"{path}, sample {i}"
-        with naming(where, _REMEDY):
+        with explain_errors(where, _REMEDY):
             sample = _sample(info, root, where=where, allow_missing=allow_missing_cameras)
             check_samples([sample], meta)
         samples.append(sample)

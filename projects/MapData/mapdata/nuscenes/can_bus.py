@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsmap.datasets.errors import naming
+from gsmap.datasets.errors import explain_errors
 from gsmap.structures.vehicle_signals import pose_signals
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import read_json
@@ -54,7 +54,8 @@ def read_messages(dataroot: Path, scene: str) -> Messages:
     path = dataroot / f"can_bus/{scene}_pose.json"
     if not path.is_file() or _is_unreliable(scene, dataroot):
         return np.zeros(0, np.int64), np.zeros((0, 9))
-    with naming(path, "unpack the CAN bus expansion again; a message has " + ", ".join(_FIELDS)):
+    remedy = "unpack the CAN bus expansion again; a message has " + ", ".join(_FIELDS)
+    with explain_errors(path, remedy=remedy):
         messages = read_json(path)
         times = []
         rows = []

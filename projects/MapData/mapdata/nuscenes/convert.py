@@ -16,7 +16,7 @@ import shapely
 
 from gsmap.datasets.annotations.file import AnnotationWriter
 from gsmap.datasets.annotations.record import CLASSES, UNITED, MapInstance, MapSample
-from gsmap.datasets.errors import naming
+from gsmap.datasets.errors import explain_errors
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import is_hidden
 from gsmap.utils.parallel import ordered_map
@@ -149,7 +149,7 @@ def _resolve_splits(
         names[scene["token"]] = scene["name"]
     where = " and ".join(str(options.root / version) for version in options.versions)
     source = options.split_file or f"split {split_list.name!r} of {where}"
-    with naming(source, "list each scene in one split"):
+    with explain_errors(source, "list each scene in one split"):
         split_of, missing = resolve_scenes(split_list.scenes, names)
     if not split_of:
         raise InputError(

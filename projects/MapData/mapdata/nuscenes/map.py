@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 
 from gsmap.datasets.annotations.record import RANGES, MapInstance
-from gsmap.datasets.errors import naming
+from gsmap.datasets.errors import explain_errors
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.polylines import Points
 from gsmap.utils.errors import InputError
@@ -133,7 +133,7 @@ def open_layers(root: Path, name: str, classes: Collection[str]) -> MapLayers:
     area_names = set(AREA_CLASSES) & set(classes)
     if "boundary" in classes:
         area_names |= set(SURFACE_LAYERS)
-    with naming(path, "unpack the map expansion pack (v1.3) again"):
+    with explain_errors(path, "unpack the map expansion pack (v1.3) again"):
         nusc_map = _open_map(root, name)
         polygons = {}
         for area in sorted(area_names):

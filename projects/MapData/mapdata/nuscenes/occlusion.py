@@ -19,7 +19,7 @@ from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.cli import output_file
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import write_text
-from gsmap.utils.words import counted
+from gsmap.utils.words import format_count
 from mapdata.nuscenes.tables import pose_of, read_table
 
 LIMITS = (10, 20)  # limits between the groups, per cent of the map
@@ -213,5 +213,5 @@ def run(arguments: argparse.Namespace) -> str:
         groups[sample.token] = word_for(share, limits)
     write_text(arguments.target, json.dumps(groups, indent=0) + "\n")
     sizes = sorted(Counter(groups.values()).items())
-    text = ", ".join(f"{group}: {counted(size, 'sample')}" for group, size in sizes)
+    text = ", ".join(f"{group}: {format_count(size, 'sample')}" for group, size in sizes)
     return f"{text}. Written to {arguments.target}"

@@ -15,7 +15,7 @@ from gsmap.structures.rigid import invert_rigid, rigid
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import is_hidden
 from gsmap.utils.json_items import items_of
-from gsmap.utils.words import counted
+from gsmap.utils.words import format_count
 from mapdata.nuscenes.can_bus import read_messages, signals_at
 
 CAMERAS = (
@@ -392,7 +392,7 @@ def read_nuscenes(
             if tables.lidar in record["data"]:
                 samples.append(tables.read(record, scene))
     note = (
-        f"{len(samples)} of {counted(total, 'sample')} used: the others have no key frame of "
+        f"{len(samples)} of {format_count(total, 'sample')} used: the others have no key frame of "
         f"{tables.lidar}"
     )
     if not samples:

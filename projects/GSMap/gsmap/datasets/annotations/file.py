@@ -33,7 +33,7 @@ from gsmap.datasets.annotations.schema import (
 from gsmap.utils.errors import InputError
 from gsmap.utils.faults import is_of_the_machine
 from gsmap.utils.files import atomic_write
-from gsmap.utils.inputs import heed_input
+from gsmap.utils.inputs import check_input
 from gsmap.utils.shards import WHOLE, Shard, ShardFile
 
 SHARD_KIND = "annotations"
@@ -238,7 +238,7 @@ class AnnotationFile(Sequence[MapSample]):
                 "docs/data.md)."
             )
         try:
-            heed_input(self.path)
+            check_input(self.path)
             self._map = pa.memory_map(str(self.path))
             self._state = self._current_state()
             self._content = self._map.read_buffer()

@@ -17,7 +17,7 @@ from gsmap.datasets.errors import BrokenSampleError
 from gsmap.structures.grid import padded_size
 from gsmap.utils.errors import InputError
 from gsmap.utils.faults import is_of_the_machine
-from gsmap.utils.inputs import heed_input
+from gsmap.utils.inputs import check_input
 
 # Columns of Argoverse 2. The first five have the meaning of the values in files of nuScenes.
 FEATHER_COLUMNS = ("x", "y", "z", "intensity", "laser_number", "offset_ns")
@@ -69,7 +69,7 @@ def _read_feather(path: str, load_dim: int) -> np.ndarray:
         )
     names = FEATHER_COLUMNS[:load_dim]
     try:
-        heed_input(path)
+        check_input(path)
         table = feather.read_table(path, columns=list(names), memory_map=False)
         table.validate(full=True)
         columns = [table[name].to_numpy().astype(np.float32) for name in names]

@@ -40,7 +40,7 @@ class Interval:
 class Weights(Protocol):
     """Random weights of parts of the data set (such as its scenes), in each of B resamples."""
 
-    def draw(self, tokens: Sequence[str]) -> tuple[IntArray, FloatArray]:
+    def draw_copies(self, tokens: Sequence[str]) -> tuple[IntArray, FloatArray]:
         """Draw the weights.
 
         Args:
@@ -76,7 +76,7 @@ class Resamples:
                 f"{num_scenes} scenes, {self.count} resamples and seed {self.seed}."
             )
 
-    def draw(self, tokens: Sequence[str]) -> tuple[IntArray, FloatArray]:
+    def draw_copies(self, tokens: Sequence[str]) -> tuple[IntArray, FloatArray]:
         """Draw scenes for each resample.
 
         Args:
@@ -220,7 +220,7 @@ def resampled_figures(report: MetricReport, resamples: Weights) -> dict[str, Flo
     """
     if not report.detections:
         return {}
-    scenes, drawn = resamples.draw(report.tokens)
+    scenes, drawn = resamples.draw_copies(report.tokens)
     interpolated = not report.by_distance  # AP_chamfer is an area, AP_raster a mean at 101 recalls
     class_aps: dict[str, FloatArray] = {}
     figures: dict[str, FloatArray] = {}

@@ -37,7 +37,7 @@ class Groups:
         """Names of the groups, sorted. (G,)"""
         return sorted(set(self.group_of.values()))
 
-    def draw(self, tokens: Sequence[str]) -> tuple[IntArray, FloatArray]:
+    def draw_copies(self, tokens: Sequence[str]) -> tuple[IntArray, FloatArray]:
         """Return each group alone as a resample (`bootstrap.Weights`).
 
         Args:
@@ -178,7 +178,7 @@ def group_table(
             for class_name in report.detections:
                 head.append(f"{report.name} {class_name}")
                 keys.append(f"{report.name}/{class_name}/AP")
-    group_index, _ = groups.draw(reports[0].tokens)
+    group_index, _ = groups.draw_copies(reports[0].tokens)
     num_samples = np.bincount(group_index, minlength=len(groups.names))
     rows = []
     for (name, figures), number in zip(group_aps.items(), num_samples, strict=True):

@@ -106,7 +106,7 @@ class HardChamferConfig(ChamferConfig):
     """AP_chamfer at 0.2, 0.5 and 1.0 m, reported together with AP_chamfer."""
 
     name: ClassVar[str] = "chamfer_hard"
-    beside: ClassVar[tuple[str, ...]] = ("chamfer",)
+    companions: ClassVar[tuple[str, ...]] = ("chamfer",)
 
     @classmethod
     def of(cls, settings: MetricSettings) -> "HardChamferConfig":

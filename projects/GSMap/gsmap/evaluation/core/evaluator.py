@@ -58,7 +58,7 @@ class MapEvaluator:
             raise InputError(f"ground_truth_points must be >= 2, got {ground_truth_points}.")
 
     @classmethod
-    def named(
+    def from_names(
         cls,
         names: Collection[str],
         settings: MetricSettings,
@@ -68,7 +68,7 @@ class MapEvaluator:
 
         Args:
             names: Names of metrics (`metric_class`). Metrics that are reported together with one
-                of them (`Metric.beside`) are inserted before it.
+                of them (`Metric.companions`) are inserted before it.
             settings: Settings from which each metric takes its rules.
             ground_truth_points: Number of points to which ground truth is resampled first, >= 2;
                 None for full resolution.
@@ -79,7 +79,7 @@ class MapEvaluator:
         metric_types: dict[str, type[Metric]] = {}
         for name in names:
             metric_type = metric_class(name)
-            for companion in metric_type.beside:
+            for companion in metric_type.companions:
                 metric_types.setdefault(companion, metric_class(companion))
             metric_types[name] = metric_type
         metrics = [metric_type.of(settings) for metric_type in metric_types.values()]

@@ -22,7 +22,7 @@ from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
 from gsmap.utils.shards import WHOLE, Shard
 from gsmap.utils.split_lists import require_results_of
-from gsmap.utils.words import counted
+from gsmap.utils.words import format_count
 
 CHUNK = 64  # samples per task: few tasks to hand over, and evenly distributed
 Evaluation = tuple[list[MetricReport], list[str]]
@@ -149,13 +149,13 @@ def mismatch_notes(results: Collection[str], truth: Collection[str], allowed: bo
     no_results = [token for token in truth if token not in results]
     if no_results:
         verb = "has" if len(no_results) == 1 else "have"
-        number = counted(len(no_results), "sample")
+        number = format_count(len(no_results), "sample")
         note = f"{number} {verb} no results, such as {no_results[0]!r}"
         notes.append(f"{note}: counted as without predictions" if allowed else note)
     no_truth = [token for token in results if token not in truth]
     if no_truth:
         verb = "has" if len(no_truth) == 1 else "have"
-        number = counted(len(no_truth), "result")
+        number = format_count(len(no_truth), "result")
         note = f"{number} {verb} no ground truth, such as {no_truth[0]!r}"
         notes.append(f"{note}: left out" if allowed else note)
     if notes and not allowed:

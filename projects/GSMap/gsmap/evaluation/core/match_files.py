@@ -39,7 +39,7 @@ def write_matches(
         shard: Number of the shard and of all shards.
         matches: Records of each sample of the shard.
         notes: Notes for the user.
-        evaluator: Evaluator, as `MapEvaluator.named` creates it from ``settings``.
+        evaluator: Evaluator, as `MapEvaluator.from_names` creates it from ``settings``.
         settings: Settings of the metrics.
         source: Digest of results and ground truth.
 
@@ -156,4 +156,4 @@ def _evaluator(options: Mapping[str, Any]) -> MapEvaluator:
         values["grid"] = BEVGrid(**values["grid"])
     settings = MetricSettings(**values)
     points = options["ground_truth_points"]
-    return MapEvaluator.named(options["metrics"], settings, ground_truth_points=points)
+    return MapEvaluator.from_names(options["metrics"], settings, ground_truth_points=points)

@@ -150,7 +150,7 @@ class Metric(ABC):
 
     Attributes:
         name: Name of the metric in ``--eval`` and prefix of the keys of its figures.
-        beside: Names of metrics that are also reported, before this one.
+        companions: Names of metrics that are also reported, before this one.
         ranks: Whether the metric ranks predictions over all samples. If so, `match` returns
             `FrameMatches` and reports have ``detections``, for intervals, groups and curves.
         has_curves: Whether precision-recall curves describe the metric.
@@ -159,7 +159,7 @@ class Metric(ABC):
     """
 
     name: ClassVar[str]
-    beside: ClassVar[tuple[str, ...]] = ()
+    companions: ClassVar[tuple[str, ...]] = ()
     ranks: ClassVar[bool] = False
     has_curves: ClassVar[bool] = False
     takes_min_score: ClassVar[bool] = False

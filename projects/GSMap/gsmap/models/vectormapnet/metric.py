@@ -24,7 +24,7 @@ class VectorMapNetAP(ChamferConfig):
     """
 
     name: ClassVar[str] = "vectormapnet"
-    beside: ClassVar[tuple[str, ...]] = ("chamfer",)
+    companions: ClassVar[tuple[str, ...]] = ("chamfer",)
 
     @classmethod
     def of(cls, settings: MetricSettings) -> "VectorMapNetAP":

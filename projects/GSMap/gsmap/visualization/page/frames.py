@@ -80,7 +80,7 @@ def truth_of(sample: MapSample, view: FrameView) -> list[dict[str, Any]]:
     return entries
 
 
-def found_of(token: str, result: ScoredResult, view: FrameView) -> list[dict[str, Any]]:
+def predictions_of(token: str, result: ScoredResult, view: FrameView) -> list[dict[str, Any]]:
     """Convert the predictions of a sample to plain values, by falling score.
 
     Predictions with scores too small for AP_raster are dropped.

@@ -23,9 +23,9 @@ from gsmap.structures.frames import frame_view
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import write_text
-from gsmap.utils.words import counted
+from gsmap.utils.words import format_count
 from gsmap.visualization.bev_view import display_extent
-from gsmap.visualization.page.frames import cameras_of, choose_frames, found_of, truth_of
+from gsmap.visualization.page.frames import cameras_of, choose_frames, predictions_of, truth_of
 from gsmap.visualization.page.scores import MATCH_M, ScoredResult, score_by_distance, score_result
 from gsmap.visualization.page.tables import (
     Table,
@@ -131,7 +131,7 @@ def page_data(
         cameras = cameras_of(sample, view=sample_view, data_root=root, width_px=options.image_width)
         predictions = []
         for result in scored:
-            predictions.append(found_of(sample.token, result=result, view=view))
+            predictions.append(predictions_of(sample.token, result=result, view=view))
         frame = {
             "token": sample.token,
             "title": _frame_title(sample.scene, seconds[index]),
@@ -305,4 +305,4 @@ def write_page(path: str | Path, data: Mapping[str, Any]) -> str:
     """
     text = page_html(data)
     write_text(path, text)
-    return f"{counted(len(data['frames']), 'frame')}, {len(text) / 1e6:.1f} MB: {path}"
+    return f"{format_count(len(data['frames']), 'frame')}, {len(text) / 1e6:.1f} MB: {path}"
