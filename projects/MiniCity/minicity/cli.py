@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=sorted(PRESETS),
         help="data set of a published comparison, in place of the options of size and seed below",
     )
-    parser.add_argument("--scenes", type=int, help="total number of scenes, a fifth for validation")
+    parser.add_argument("--scenes", type=int, help="number of scenes, a fifth for validation")
     parser.add_argument("--seed", type=int, help="seed of every random choice (default: 0)")
     parser.add_argument("--image-size", type=image_size, metavar="WxH", help="default: 800x450")
     parser.add_argument("--samples-per-scene", type=int, help="key frames per scene (default: 10)")
@@ -42,6 +42,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--sweeps-per-sample", type=int, help="LiDAR sweeps between key frames (default: 2)"
     )
     parser.add_argument("--val-scenes", type=int, help="validation scenes, instead of a fifth")
+    parser.add_argument(
+        "--passes", type=int, metavar="N", help="drive every scene N times (default: 1)"
+    )
+    parser.add_argument(
+        "--repainted",
+        type=float,
+        metavar="SHARE",
+        help="share of the streets that are repainted before the last pass (default: 0)",
+    )
     parser.add_argument("--workers", type=int, help="processes (default: one per core)")
 
 
@@ -52,6 +61,8 @@ SIZE_OPTIONS = (
     "samples_per_scene",
     "sweeps_per_sample",
     "val_scenes",
+    "passes",
+    "repainted",
 )
 
 
@@ -102,6 +113,8 @@ def run(arguments: argparse.Namespace) -> str:
         samples_per_scene=config.samples_per_scene,
         sweeps_per_sample=config.sweeps_per_sample,
         val_scenes=config.val_scenes,
+        passes=config.passes,
+        repainted=config.repainted,
         workers=arguments.workers,
     )
     if not is_new:

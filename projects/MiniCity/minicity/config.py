@@ -13,6 +13,7 @@ TRAIN_LOCATIONS = ("singapore-onenorth", "singapore-hollandvillage", "singapore-
 VAL_LOCATIONS = ("boston-seaport",)
 MAX_TRAIN_SCENES = 700
 MAX_VAL_SCENES = 150
+MAX_PASSES = 20
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,8 @@ class MiniCityConfig:
         samples_per_scene: Key frames per scene, half a second apart, in [1, 40].
         sweeps_per_sample: LiDAR sweeps between two key frames, in [0, 9].
         val_scenes: Validation scenes among ``scenes``; None takes a fifth, at least one.
+        passes: Number of times that every scene is driven, in [1, 20].
+        repainted: Share of the streets that are repainted before the last pass, in [0, 1].
 
     Raises:
         ValueError: If a value is out of range.
@@ -39,6 +42,8 @@ class MiniCityConfig:
     samples_per_scene: int = 10
     sweeps_per_sample: int = 2
     val_scenes: int | None = None
+    passes: int = 1
+    repainted: float = 0.0
 
     def __post_init__(self) -> None:
         """Check the range of every value."""
@@ -59,26 +64,45 @@ class MiniCityConfig:
             raise InputError(f"sweeps_per_sample must be in 0..9, got {self.sweeps_per_sample}.")
         if self.val_scenes is not None and not 1 <= self.val_scenes < self.scenes:
             raise InputError(f"val_scenes must be in 1..{self.scenes - 1}, got {self.val_scenes}.")
-        if self.num_val > MAX_VAL_SCENES or self.num_train > MAX_TRAIN_SCENES:
+        self._check_passes()
+
+    def _check_passes(self) -> None:
+        """Check the passes, and that the official split names their scenes."""
+        if not 1 <= self.passes <= MAX_PASSES:
+            raise InputError(f"passes must be in 1..{MAX_PASSES}, got {self.passes}.")
+        if not 0 <= self.repainted <= 1:
+            raise InputError(f"repainted must be a share in 0..1, got {self.repainted}.")
+        if self.repainted > 0 and self.passes == 1:
+            raise InputError("repainted streets need a pass before and one after: passes >= 2.")
+        train_names = self.num_train * self.passes
+        val_names = self.num_val * self.passes
+        if val_names > MAX_VAL_SCENES or train_names > MAX_TRAIN_SCENES:
             raise InputError(
                 f"the official nuScenes split names at most {MAX_TRAIN_SCENES} training and "
-                f"{MAX_VAL_SCENES} validation scenes, got {self.num_train} and {self.num_val}: "
+                f"{MAX_VAL_SCENES} validation scenes, got {train_names} and {val_names}: "
                 "ask for fewer scenes."
             )
 
     @property
     def num_val(self) -> int:
-        """Number of validation scenes."""
+        """Number of validation scenes, each counted once."""
         return self.val_scenes if self.val_scenes is not None else max(1, self.scenes // 5)
 
     @property
     def num_train(self) -> int:
-        """Number of training scenes."""
+        """Number of training scenes, each counted once."""
         return self.scenes - self.num_val
 
     def as_dict(self) -> dict:
-        """All values as JSON-ready fields, with the format version of the generator."""
-        return {"format": FORMAT, **asdict(self), "val_scenes": self.num_val}
+        """All values as JSON-ready fields, with the format version of the generator.
+
+        Without further passes, there are no fields of passes.
+        """
+        values = {"format": FORMAT, **asdict(self), "val_scenes": self.num_val}
+        if self.passes == 1:
+            del values["passes"]
+            del values["repainted"]
+        return values
 
 
 PRESETS = {

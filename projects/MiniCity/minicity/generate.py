@@ -19,12 +19,15 @@ from gsmap.utils.files import SUFFIX, read_json, require_no_link, try_lock
 from gsmap.utils.parallel import default_workers, ordered_map
 from gsmap.utils.progress import Progress
 from minicity.config import TRAIN_LOCATIONS, VAL_LOCATIONS, VERSION, MiniCityConfig, make_token
-from minicity.map_expansion import write_map
+from minicity.map_expansion import write_expansion, write_mask
+from minicity.repaint import changes_geojson, repaint_town
 from minicity.rig import CAMERAS, ego_from_lidar, quaternion
 from minicity.scene import Records, SceneMaker, SceneTask
 from minicity.town import Town, make_town
 
 MARKER = "minicity.json"
+BEFORE = ".before"  # ends the name of the map of a town before streets are repainted
+CHANGES = "changes.geojson"
 TABLES = [
     "category",
     "attribute",
@@ -46,7 +49,10 @@ LOGGER = logging.getLogger(__name__)
 
 
 def plan_scenes(config: MiniCityConfig) -> list[SceneTask]:
-    """Name the scenes after the official split and distribute them among the towns."""
+    """Name the scenes after the official split and distribute them among the towns.
+
+    A pass of all streets ends before the next one begins.
+    """
     from nuscenes.utils import splits
 
     tasks: list[SceneTask] = []
@@ -54,13 +60,19 @@ def plan_scenes(config: MiniCityConfig) -> list[SceneTask]:
         (splits.train, config.num_train, TRAIN_LOCATIONS),
         (splits.val, config.num_val, VAL_LOCATIONS),
     ):
-        for i, name in enumerate(names[:count]):
-            location = locations[i % len(locations)]
+        for i, name in enumerate(names[: count * config.passes]):
+            pass_index, route = divmod(i, count)
+            location = locations[route % len(locations)]
+            is_last_pass = pass_index == config.passes - 1
+            has_old_paint = config.repainted > 0 and not is_last_pass
             task = SceneTask(
                 name=name,
                 index=len(tasks),
                 location=location,
-                index_in_town=i // len(locations),
+                index_in_town=route // len(locations),
+                route=names[route],
+                pass_index=pass_index,
+                expansion=f"{location}{BEFORE}" if has_old_paint else location,
             )
             tasks.append(task)
     return tasks
@@ -74,6 +86,8 @@ def generate(
     samples_per_scene: int = 10,
     sweeps_per_sample: int = 2,
     val_scenes: int | None = None,
+    passes: int = 1,
+    repainted: float = 0.0,
     workers: int | None = None,
     progress: bool = True,
 ) -> bool:
@@ -90,6 +104,9 @@ def generate(
         samples_per_scene: Key frames per scene, half a second apart, in [1, 40].
         sweeps_per_sample: LiDAR sweeps between two key frames, in [0, 9].
         val_scenes: Validation scenes among ``scenes``; None takes a fifth.
+        passes: Number of times that every scene is driven, at other hours and in other weather and
+            traffic; the data set has ``scenes * passes`` scenes.
+        repainted: Share of the streets that are repainted before the last pass, in [0, 1].
         workers: Number of processes; None takes one per core, 0 or 1 works in this process.
         progress: Whether to show a progress bar.
 
@@ -109,6 +126,8 @@ def generate(
         samples_per_scene=samples_per_scene,
         sweeps_per_sample=sweeps_per_sample,
         val_scenes=val_scenes,
+        passes=passes,
+        repainted=repainted,
     )
     if workers is not None and workers < 0:
         raise InputError(f"workers must be >= 0, got {workers}.")
@@ -143,8 +162,11 @@ def is_complete(root: Path, config: MiniCityConfig) -> bool:
             raise InputError(f"{marker} is another program's file: choose another --root.")
         parts = []
         for key in sorted({*present, *requested}):
-            if present.get(key) != requested.get(key):
-                parts.append(f"{key} is {present.get(key)}, asked for {requested.get(key)}")
+            default = getattr(MiniCityConfig, key, None)
+            found = present.get(key, default)
+            wanted = requested.get(key, default)
+            if found != wanted:
+                parts.append(f"{key} is {found}, asked for {wanted}")
         differences = ", ".join(parts)
         raise InputError(
             f"{root} holds another MiniCity data set ({differences}): "
@@ -195,11 +217,7 @@ def _fill(root: Path, config: MiniCityConfig, workers: int | None, progress: boo
     (root / "sweeps" / "LIDAR_TOP").mkdir(parents=True)
     (root / "can_bus").mkdir()
     tasks = plan_scenes(config)
-    scene_counts = Counter(task.location for task in tasks)
-    towns = {}
-    for name in (*TRAIN_LOCATIONS, *VAL_LOCATIONS):
-        towns[name] = make_town(name, config.seed, num_scenes=scene_counts[name])
-    masks = {name: write_map(root, town, seed=config.seed) for name, town in towns.items()}
+    towns, masks = _make_towns(root, config, tasks=tasks)
     records_by_scene = _run_scenes(
         root, config, tasks=tasks, towns=towns, workers=workers, progress=progress
     )
@@ -220,8 +238,75 @@ def _fill(root: Path, config: MiniCityConfig, workers: int | None, progress: boo
         )
     folder = root / VERSION
     folder.mkdir()
+    if config.passes > 1:
+        (folder / "passes.json").write_text(json.dumps(_pass_table(config, tasks)))
+        (folder / "splits.json").write_text(json.dumps(_splits(config, tasks)))
     for table in TABLES:
         (folder / f"{table}.json").write_text(json.dumps(tables[table]))
+
+
+def _make_towns(
+    root: Path, config: MiniCityConfig, tasks: list[SceneTask]
+) -> tuple[dict[str, Town], dict[str, str]]:
+    """Make the towns and write their maps and changes.
+
+    Args:
+        root: Folder of the data set.
+        config: Configuration of the data set.
+        tasks: All scenes.
+
+    Returns:
+        Towns by the name of their map, and the path of the picture of each location.
+    """
+    (root / "maps" / "expansion").mkdir(parents=True)
+    street_counts = Counter(task.location for task in tasks if task.pass_index == 0)
+    towns = {}
+    masks = {}
+    changes = {}
+    for name in (*TRAIN_LOCATIONS, *VAL_LOCATIONS):
+        town = make_town(name, config.seed, num_scenes=street_counts[name])
+        masks[name] = write_mask(root, town, seed=config.seed)
+        if config.repainted > 0:
+            towns[f"{name}{BEFORE}"] = town
+            town, changes[name] = repaint_town(town, config.seed, share=config.repainted)
+        towns[name] = town
+    for name, town in towns.items():
+        write_expansion(root, town, seed=config.seed, name=name)
+    if config.repainted > 0:
+        content = json.dumps(changes_geojson(changes), indent=1)
+        (root / CHANGES).write_text(content + "\n")
+    return towns, masks
+
+
+def _pass_table(config: MiniCityConfig, tasks: list[SceneTask]) -> list[dict[str, Any]]:
+    """Records of the street and pass of each scene."""
+    records = []
+    for task in tasks:
+        records.append(
+            {
+                "token": make_token(config.seed, task.name, "pass"),
+                "scene_token": make_token(config.seed, task.name, "scene"),
+                "scene": task.name,
+                "location": task.location,
+                "first_scene": task.route,  # on the same street
+                "pass": task.pass_index + 1,
+                "passes": config.passes,
+                "map_expansion": task.expansion,
+            }
+        )
+    return records
+
+
+def _splits(config: MiniCityConfig, tasks: list[SceneTask]) -> dict[str, list[str]]:
+    """Names of the scenes of each split; the earlier passes of validation are apart."""
+    splits: dict[str, list[str]] = {"train": [], "val": [], "val_earlier": []}
+    for task in tasks:
+        split = "train"
+        if task.location in VAL_LOCATIONS:
+            is_last_pass = task.pass_index == config.passes - 1
+            split = "val" if is_last_pass else "val_earlier"
+        splits[split].append(task.name)
+    return splits
 
 
 def _add_fixed_tables(tables: dict[str, list[dict[str, Any]]], config: MiniCityConfig) -> None:
@@ -257,7 +342,7 @@ def _make_scene(
     """Make a scene in this process."""
     if parent_process() is not None:  # one of several workers, each of one thread
         cv2.setNumThreads(1)
-    maker = SceneMaker(config, task, town=towns[task.location], root=root)
+    maker = SceneMaker(config, task, town=towns[task.expansion], root=root)
     return maker.make()
 
 

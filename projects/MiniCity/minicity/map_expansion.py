@@ -13,7 +13,7 @@ from shapely.geometry import MultiPolygon, Polygon
 from minicity.config import make_token
 from minicity.curves import Array, arc_lengths, strip
 from minicity.junctions import CONNECTOR_M, Connector
-from minicity.paint import divider_pieces, has_center_line, lane_divider_offsets
+from minicity.paint import divider_pieces, lane_divider_offsets
 from minicity.roads import Lane, Road
 from minicity.town import Town, road_surface
 
@@ -115,11 +115,11 @@ class MapWriter:
                 is_intersection=False,
                 drivable_area_token="",
             )
-        self._add_block(road, road.section.forward_edges, segment=segment, direction="forward")
-        self._add_block(road, road.section.backward_edges, segment=segment, direction="backward")
+        self._add_block(road, road.forward_edges, segment=segment, direction="forward")
+        self._add_block(road, road.backward_edges, segment=segment, direction="backward")
         for start, end in divider_pieces(road):
-            if has_center_line(road):
-                center = self.line(road.line(0.0, start, end_m=end))
+            if road.has_center_line:
+                center = self.line(road.line(road.shift_m, start, end_m=end))
                 self.add("road_divider", line_token=center, road_segment_token=segment)
             for offset in lane_divider_offsets(road):
                 divider = self.line(road.line(offset, start, end_m=end))
@@ -132,8 +132,8 @@ class MapWriter:
                     polygon_token=self.polygon(crossing),
                     road_segment_token=segment,
                 )
-        self._add_stop_line(road, road.stop_forward, road.section.forward_edges)
-        self._add_stop_line(road, road.stop_backward, road.section.backward_edges)
+        self._add_stop_line(road, road.stop_forward, road.forward_edges)
+        self._add_stop_line(road, road.stop_backward, road.backward_edges)
 
     def _add_block(self, road: Road, edges: list[float], segment: str, direction: str) -> None:
         """Add the block of the lanes of one direction, given their edges in metres."""
@@ -169,7 +169,7 @@ class MapWriter:
     def add_lane(self, lane: Lane) -> str:
         """Add a lane with its outline and centre line, and return its token."""
         road = self.town.roads[lane.road]
-        edges = road.section.forward_edges if lane.forward else road.section.backward_edges
+        edges = road.forward_edges if lane.forward else road.backward_edges
         inner = edges[lane.index]
         outer = edges[lane.index + 1]
         outline = road.band(min(inner, outer), max(inner, outer))
@@ -267,11 +267,27 @@ def town_to_map(town: Town, seed: int) -> dict[str, Any]:
     return writer.as_dict()
 
 
-def write_map(root: Path, town: Town, seed: int) -> str:
-    """Write the expansion file and the drivable-area picture of a town.
+def write_expansion(root: Path, town: Town, seed: int, name: str) -> None:
+    """Write the expansion file of a town.
 
     Args:
-        root: Root folder of the data set.
+        root: Root folder of the data set, with the folder of maps.
+        town: The town.
+        seed: Seed of the data set, part of every token.
+        name: Name of the file, without the suffix.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    path = root / "maps" / "expansion" / f"{name}.json"
+    path.write_text(json.dumps(town_to_map(town, seed)))
+
+
+def write_mask(root: Path, town: Town, seed: int) -> str:
+    """Write the drivable-area picture of a town.
+
+    Args:
+        root: Root folder of the data set, with the folder of maps.
         town: The town.
         seed: Seed of the data set, part of every token.
 
@@ -279,11 +295,8 @@ def write_map(root: Path, town: Town, seed: int) -> str:
         Path of the picture relative to ``root``.
 
     Raises:
-        OSError: If a file cannot be written.
+        OSError: If the file cannot be written.
     """
-    expansion = root / "maps" / "expansion"
-    expansion.mkdir(parents=True, exist_ok=True)
-    (expansion / f"{town.name}.json").write_text(json.dumps(town_to_map(town, seed)))
     size = round(town.size_m / MASK_RESOLUTION_M)
     mask = np.zeros((size, size), dtype=np.uint8)
     for polygon in polygon_parts(town.drivable):

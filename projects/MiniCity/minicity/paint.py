@@ -96,12 +96,13 @@ def divider_pieces(road: Road) -> list[tuple[float, float]]:
 
 def lane_divider_offsets(road: Road) -> list[float]:
     """Offsets in metres of the lines between lanes of one direction."""
-    return [*road.section.forward_edges[1:-1], *road.section.backward_edges[1:-1]]
+    return [*road.forward_edges[1:-1], *road.backward_edges[1:-1]]
 
 
-def has_center_line(road: Road) -> bool:
-    """Whether paint instead of a median separates the two directions."""
-    return road.section.median_m == 0 and road.section.backward > 0
+def divider_offsets(road: Road) -> list[float]:
+    """Offsets in metres of all lines of divider paint, the centre line first."""
+    center = [road.shift_m] if road.has_center_line else []
+    return [*center, *lane_divider_offsets(road)]
 
 
 def road_markings(road: Road) -> list[Marking]:
@@ -114,8 +115,8 @@ def road_markings(road: Road) -> list[Marking]:
         for offset in lane_divider_offsets(road):
             line = road.line(offset, start, end_m=end)
             white += dashed_line(line, style.line_m, dash_m=dash_m, gap_m=gap_m)
-        if has_center_line(road):
-            paint = _center_paint(road.line(0.0, start, end_m=end), road)
+        if road.has_center_line:
+            paint = _center_paint(road.line(road.shift_m, start, end_m=end), road)
             if style.divider.endswith("white"):
                 white += paint
             else:
@@ -173,17 +174,16 @@ def _crossing_paint(road: Road, start: float, end: float) -> list[Array]:
 
 def _stop_paint(road: Road) -> list[Array]:
     """Painted areas of the stop lines of a road. Each (n, 2)"""
-    section = road.section
     outlines = []
     if road.stop_forward:
         start, end = road.stop_forward
-        right = section.forward_edges[-1]
-        left = section.forward_edges[0] - 0.1
+        right = road.forward_edges[-1]
+        left = road.forward_edges[0] - 0.1
         outlines.append(road.band(right, left, start_m=start, end_m=end))
     if road.stop_backward:
         start, end = road.stop_backward
-        right = section.backward_edges[0] + 0.1
-        left = section.backward_edges[-1]
+        right = road.backward_edges[0] + 0.1
+        left = road.backward_edges[-1]
         outlines.append(road.band(right, left, start_m=start, end_m=end))
     return outlines
 
@@ -198,8 +198,8 @@ def _arrows(road: Road) -> list[Array]:
     """Arrows in the lanes before a stop line, on roads with several lanes there. Each (7, 2)"""
     arrows = []
     for stop, edges, sign in (
-        (road.stop_forward, road.section.forward_edges, 1),
-        (road.stop_backward, road.section.backward_edges, -1),
+        (road.stop_forward, road.forward_edges, 1),
+        (road.stop_backward, road.backward_edges, -1),
     ):
         if stop is None or len(edges) < 3 or road.length_m < 40:
             continue

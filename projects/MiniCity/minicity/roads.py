@@ -130,6 +130,8 @@ class Road:
         clear_end_m: Arc length at which divider paint ends.
         stop_forward: Arc lengths (start, end) of the stop line for forward lanes, or None.
         stop_backward: Arc lengths (start, end) of the stop line for backward lanes, or None.
+        shift_m: Offset of the lines between lanes from their places in ``section``, in metres,
+            positive to the left. Kerbs and medians stay.
     """
 
     index: int
@@ -143,6 +145,7 @@ class Road:
     clear_end_m: float = 0.0
     stop_forward: tuple[float, float] | None = None
     stop_backward: tuple[float, float] | None = None
+    shift_m: float = 0.0
 
     def __post_init__(self) -> None:
         """Compute the arc lengths and normals of the centre line."""
@@ -217,6 +220,33 @@ class Road:
         normal = interpolate(self._normals, self._lengths, at=arc_m)[0]
         return interpolate(self.center, self._lengths, at=arc_m)[0] + offset_m * normal
 
+    @property
+    def has_center_line(self) -> bool:
+        """Whether paint instead of a median separates the two directions."""
+        return self.section.median_m == 0 and self.section.backward > 0
+
+    @property
+    def forward_edges(self) -> list[float]:
+        """Offsets of the edges of the forward lanes in metres, from the centre to the kerb."""
+        return self._shift_edges(self.section.forward_edges)
+
+    @property
+    def backward_edges(self) -> list[float]:
+        """Offsets of the edges of the backward lanes in metres, from the centre to the kerb."""
+        return self._shift_edges(self.section.backward_edges)
+
+    def _shift_edges(self, edges: list[float]) -> list[float]:
+        """Shift the edges that are painted lines between two lanes."""
+        if self.shift_m == 0:
+            return edges
+        first = 0 if self.has_center_line else 1
+        last = len(edges) - 1
+        shifted = []
+        for i, edge in enumerate(edges):
+            is_line = first <= i < last
+            shifted.append(edge + self.shift_m if is_line else edge)
+        return shifted
+
     def carriageways(self) -> list[tuple[float, float]]:
         """Offsets (right, left) of each kerb-to-kerb surface: two for a road with a median."""
         section = self.section
@@ -230,7 +260,7 @@ class Road:
     def lanes(self) -> list[Lane]:
         """Lanes of the road: forward ones, then backward ones, each from the innermost."""
         lanes = []
-        for i, (inner, outer) in enumerate(pairwise(self.section.forward_edges)):
+        for i, (inner, outer) in enumerate(pairwise(self.forward_edges)):
             lane = Lane(
                 road=self.index,
                 forward=True,
@@ -240,7 +270,7 @@ class Road:
                 end_node=self.end_node,
             )
             lanes.append(lane)
-        for i, (inner, outer) in enumerate(pairwise(self.section.backward_edges)):
+        for i, (inner, outer) in enumerate(pairwise(self.backward_edges)):
             lane = Lane(
                 road=self.index,
                 forward=False,

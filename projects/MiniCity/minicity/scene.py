@@ -30,7 +30,7 @@ from minicity.rig import (
     world_from_ego,
 )
 from minicity.town import Town
-from minicity.traffic import Actor, Drive, make_actors, plan_ego
+from minicity.traffic import Actor, Drive, make_actors, plan_ego, vary_drive
 from minicity.vehicles import Vehicle
 
 SAMPLE_PERIOD_S = 0.5
@@ -53,13 +53,20 @@ class SceneTask:
         name: Official scene name of nuScenes, whose split the scene is in.
         index: Number of the scene in the data set.
         location: Name of the town.
-        index_in_town: Number of the scene within its town.
+        index_in_town: Number of the street within the town; scenes of one street share it.
+        route: Name of the first scene on this street, whose random numbers choose the drive.
+        pass_index: Number of earlier passes of the street.
+        expansion: Name of the map file: the location or, before streets are repainted, a name of
+            its own.
     """
 
     name: str
     index: int
     location: str
     index_in_town: int
+    route: str
+    pass_index: int
+    expansion: str
 
 
 class SceneMaker:
@@ -81,8 +88,13 @@ class SceneMaker:
         self.duration_s = SAMPLE_PERIOD_S * (config.samples_per_scene - 1)
         self.samples = [self._token("sample", k) for k in range(config.samples_per_scene)]
         self.ego: Drive = plan_ego(
-            town, task.index_in_town, duration_s=self.duration_s, rng=self._rng("ego")
+            town,
+            task.index_in_town,
+            duration_s=self.duration_s,
+            rng=make_rng(config.seed, task.route, "ego"),
         )
+        if task.pass_index > 0:
+            self.ego = vary_drive(self.ego, self._rng("pass"))
         self.lighting: Lighting = random_lighting(self._rng("light"))
         self.actors: list[Actor] = make_actors(
             town, self.ego, duration_s=self.duration_s, rng=self._rng("traffic")
@@ -176,6 +188,9 @@ class SceneMaker:
 
     def _add_scene(self) -> None:
         """Add the log and scene records."""
+        expansion = {}
+        if self.task.expansion != self.task.location:
+            expansion["map_expansion"] = self.task.expansion
         self._add(
             "log",
             token=self._token("log"),
@@ -183,6 +198,7 @@ class SceneMaker:
             vehicle="minicity",
             date_captured="2020-09-13",
             location=self.task.location,
+            **expansion,
         )
         self._add(
             "scene",

@@ -13,6 +13,8 @@ from minicity.junctions import Connector, Junction, make_connectors, make_juncti
 from minicity.network import MARGIN_M, MIN_ROAD_M, PITCH_M, make_chains, make_nodes, make_roads
 from minicity.roads import CROSSING_GAP_M, STOP_LINE_M, Lane, Road
 
+LaneKey = tuple[int, bool, int]
+"""Identity of a lane within its town: road, direction and index."""
 MAX_SIDE = 8
 LARGEST_HOUSE_M = 22.0
 END_STOP_M = 0.6  # between a stop line without a crossing and the end of its road
@@ -84,8 +86,8 @@ class Town:
     size_m: float
     roads: list[Road]
     junctions: list[Junction]
-    lanes: dict[tuple[int, bool, int], Lane]
-    connectors: dict[tuple[int, bool, int], list[Connector]]
+    lanes: dict[LaneKey, Lane]
+    connectors: dict[LaneKey, list[Connector]]
     carparks: list[Carpark] = field(default_factory=list)
     buildings: list[Building] = field(default_factory=list)
     trees: Array = field(default_factory=lambda: np.zeros((0, 3)))
@@ -118,20 +120,12 @@ def make_town(name: str, seed: int, num_scenes: int) -> Town:
     roads, meetings = make_roads(nodes, chains, seed=seed, name=name)
     for road in roads:
         _add_crossings(road, make_rng(seed, name, "crossings", road.index))
-    lanes_by_road = {road.index: road.lanes() for road in roads}
     junctions = []
     for node, meeting in enumerate(meetings):
         if len(meeting) >= 3:
             arms = [(road_index, at_start) for road_index, at_start, _ in meeting]
             junctions.append(make_junction(node, arms, roads=roads))
-    connectors: dict[tuple[int, bool, int], list[Connector]] = {}
-    for junction in junctions:
-        for connector in make_connectors(junction, lanes_by_road):
-            connectors.setdefault(connector.source.key, []).append(connector)
-    lanes = {}
-    for road_lanes in lanes_by_road.values():
-        for lane in road_lanes:
-            lanes[lane.key] = lane
+    lanes, connectors = connect_lanes(roads, junctions)
     town = Town(
         name=name,
         size_m=2 * MARGIN_M + (side - 1) * PITCH_M,
@@ -142,6 +136,30 @@ def make_town(name: str, seed: int, num_scenes: int) -> Town:
     )
     _add_surroundings(town, make_rng(seed, name, "surroundings"))
     return town
+
+
+def connect_lanes(
+    roads: list[Road], junctions: list[Junction]
+) -> tuple[dict[LaneKey, Lane], dict[LaneKey, list[Connector]]]:
+    """Make the lanes of all roads and the paths between them.
+
+    Args:
+        roads: Roads of the town.
+        junctions: Junctions of the roads.
+
+    Returns:
+        Lanes by key, and the paths from a lane across a junction by the key of the lane.
+    """
+    lanes_by_road = {road.index: road.lanes() for road in roads}
+    connectors: dict[LaneKey, list[Connector]] = {}
+    for junction in junctions:
+        for connector in make_connectors(junction, lanes_by_road):
+            connectors.setdefault(connector.source.key, []).append(connector)
+    lanes = {}
+    for road_lanes in lanes_by_road.values():
+        for lane in road_lanes:
+            lanes[lane.key] = lane
+    return lanes, connectors
 
 
 def _add_crossings(road: Road, rng: np.random.Generator) -> None:

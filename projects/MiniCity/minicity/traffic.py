@@ -32,6 +32,7 @@ PAINTS: list[Color] = [
 ]
 REACH_M = 75.0
 SWING_M = 6.0
+PASS_START_M = 3.0  # largest distance between the starts of two passes, on each side
 
 
 @dataclass(frozen=True)
@@ -142,6 +143,28 @@ def plan_ego(town: Town, scene: int, duration_s: float, rng: np.random.Generator
             )
     raise WorkError(
         f"town {town.name} has no drive of {duration_s} s: please report this with the seed."
+    )
+
+
+def vary_drive(drive: Drive, rng: np.random.Generator) -> Drive:
+    """Vary a drive for another pass of its path: start, speed and place within the lane.
+
+    Args:
+        drive: Drive of `plan_ego`.
+        rng: Source of the differences.
+
+    Returns:
+        A drive along the path of ``drive`` that also lasts for the scene.
+    """
+    # The path of `plan_ego` ends at least 4 m after the drive.
+    start = drive.start_m + float(rng.uniform(low=-PASS_START_M, high=PASS_START_M))
+    return replace(
+        drive,
+        speed=drive.speed * float(rng.uniform(low=0.8, high=1.0)),
+        start_m=max(start, 0.0),
+        swing_m=float(rng.uniform(low=0.0, high=0.55)),
+        swing_rad=float(rng.uniform(low=0, high=6.28)),
+        shift_m=float(rng.normal(loc=0, scale=0.2)),
     )
 
 

@@ -182,10 +182,10 @@ def _extract_instances(
     return results
 
 
-def _location(scene_of_version: _Scene) -> str:
-    """Name of the map of a scene."""
+def _map_names(scene_of_version: _Scene) -> tuple[str, str]:
+    """Location of a scene, and name of its map file."""
     scene, tables = scene_of_version
-    return tables.location_of(scene)
+    return tables.location_of(scene), tables.expansion_of(scene)
 
 
 def _count_samples(scenes: list[_Scene]) -> int:
@@ -229,7 +229,7 @@ class _Conversion:
             writers: Writer of each split.
         """
         scenes = [scene for scene in self.scenes if scene[0]["name"] in self.split_of]
-        scenes = self.options.shard.part(sorted(scenes, key=_location))
+        scenes = self.options.shard.part(sorted(scenes, key=_map_names))
         progress = Progress(
             desc=f"{self.options.dataset} {'+'.join(self.options.versions)}",
             unit="samples",
@@ -237,8 +237,8 @@ class _Conversion:
             total=_count_samples(scenes),
         )
         with progress as bar:
-            for location, scenes_of_map in groupby(scenes, key=_location):
-                for sample, instances in self._with_instances(location, list(scenes_of_map)):
+            for (_, expansion_name), scenes_of_map in groupby(scenes, key=_map_names):
+                for sample, instances in self._with_instances(expansion_name, list(scenes_of_map)):
                     bar.update()
                     if isinstance(instances, str):
                         self.summary.add_problem(f"sample left out: {instances}", sample.token)
@@ -251,18 +251,18 @@ class _Conversion:
                     self.positions[split][sample.map_name].append(position)
 
     def _with_instances(
-        self, location: str, scenes: list[_Scene]
+        self, expansion_name: str, scenes: list[_Scene]
     ) -> Iterator[tuple[MapSample, list[MapInstance] | str]]:
         """Yield the samples of one map with their map elements, or the reason of a failure.
 
         Args:
-            location: Name of the map.
+            expansion_name: Name of the map file.
             scenes: Scenes on this map.
         """
         options = self.options
-        layers = open_layers(options.root, location, classes=options.classes)
+        layers = open_layers(options.root, expansion_name, classes=options.classes)
         for reason, count in layers.skipped.items():
-            self.summary.add_problem(f"{reason} left out", location, count=count)
+            self.summary.add_problem(f"{reason} left out", expansion_name, count=count)
         local_map = NuScenesLocalMap(
             layers,
             options.classes,

@@ -275,8 +275,24 @@ class NuScenesTables:
         return self.chain("sample", scene["first_sample_token"], step="next", origin=scene)
 
     def location_of(self, scene: dict[str, Any]) -> str:
-        """Name of the map of a scene."""
+        """Name of the map of a scene, in whose frame its poses are."""
         return self._records["log"][scene["log_token"]]["location"]
+
+    def expansion_of(self, scene: dict[str, Any]) -> str:
+        """Name of the map file of a scene.
+
+        It is the location, unless the log has another name in the field ``map_expansion``: an
+        earlier state of the map in the frame of the location.
+
+        Raises:
+            ValueError: If the name is no text.
+        """
+        log = self._records["log"][scene["log_token"]]
+        name = log.get("map_expansion", log["location"])
+        if not isinstance(name, str):
+            problem = f", record {log['token']!r}: map_expansion must be a str, got {name!r:.60}"
+            raise _table_error(self._folder, "log", problem=problem)
+        return name
 
     def _global_from_sensor(self, data: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
         """Transform from the sensor of a record to the map (4, 4), and the calibration record."""
