@@ -71,7 +71,8 @@ def lengths(changes: list[Change], kind: str, class_name: str) -> float:
 def test_the_map_of_a_town_without_passes_has_not_changed() -> None:
     nodes = town_to_map(make_town(VAL_TOWN, 3, 6), 3)["node"]
     digest = hashlib.sha256(json.dumps(nodes).encode()).hexdigest()
-    assert digest[:16] == "90dd690230b22496"  # of the first release; coordinates are rounded to 0.1 mm
+    # Of the towns before there were passes; coordinates are rounded to 0.1 mm.
+    assert digest[:16] == "90dd690230b22496"
 
 
 def test_one_pass_is_the_data_set_without_passes(tmp_path: Path, root: Path) -> None:
