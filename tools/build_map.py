@@ -14,7 +14,7 @@ import argparse
 import json
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +42,7 @@ from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.errors import InputError
 from gsmap.utils.extras import import_extra
 from gsmap.utils.files import file_names, write_text
+from gsmap.utils.inputs import require_own_file
 from gsmap.utils.split_lists import require_results_of
 from gsmap.utils.words import format_count
 from gsmap.visualization.bev_view import draw_lines
@@ -51,6 +52,9 @@ from gsmap.visualization.style import MapStyle
 
 FORMATS = ("geojson", "osm", "rrd", "mcap", "mp4", "png", "svg")
 _LON_LAT = "_lonlat"  # ends the name of a map in degrees
+_SCORES = "scores.json"
+_MARK = b"gsmap"  # in all maps
+_MARK_OF_SCORES = b'"merged"'
 EXTRAS = {"rrd": ("rerun", "viz"), "mcap": ("foxglove", "viz"), "mp4": ("av", "viz")}
 
 
@@ -141,6 +145,28 @@ def check_formats(args: argparse.Namespace, ann: AnnotationFile) -> None:
         )
     if {"osm", "geojson"} & set(args.formats) and len(unknown) < len(origins):
         import_extra("pyproj", "maps")
+
+
+def require_own_files(args: argparse.Namespace, names: Iterable[str], scored: bool) -> None:
+    """Check, before any work, that the command replaces no file of another program.
+
+    Args:
+        args: The options of the command.
+        names: Names of the files of each drive, without suffixes.
+        scored: Whether the maps are scored.
+
+    Raises:
+        ValueError: If a file in the folder has the name of an output and is no output of an
+            earlier run.
+    """
+    endings = [f".{suffix}" for suffix in args.formats]
+    if "geojson" in args.formats:
+        endings.append(f"{_LON_LAT}.geojson")
+    for name in names:
+        for ending in endings:
+            require_own_file(args.out / f"{name}{ending}", _MARK)
+    if scored:
+        require_own_file(args.out / _SCORES, _MARK_OF_SCORES)
 
 
 def find_origin(
@@ -299,7 +325,7 @@ def score(drives: list[Drive], merged: list[MapElements], ann: AnnotationFile, o
         "suppressed": map_figures(baseline, truths, drives),
     }
     print(f"\n{figures_table(figures)}\n")
-    write_text(out / "scores.json", json.dumps(figures, indent=1) + "\n")
+    write_text(out / _SCORES, json.dumps(figures, indent=1) + "\n")
     print(f"figures: {out / 'scores.json'}")
 
 
@@ -326,7 +352,10 @@ def main(argv: list[str] | None = None) -> str:
     merged = []
     processor_s = 0.0
     names = file_names(sorted(set(ann.column("scene"))), ("", _LON_LAT))
-    for scene in args.scene or names:
+    scenes = args.scene or list(names)
+    own_names = [names[scene] for scene in scenes if scene in names]
+    require_own_files(args, names=own_names, scored=has_truth(ann))
+    for scene in scenes:
         drive = confident(read_drive(ann, scene, results), args.score_thr)
         start_s = time.process_time()
         elements = merge(drive, config) if has_poses else MapElements.from_polylines()

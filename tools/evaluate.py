@@ -42,7 +42,7 @@ from gsmap.evaluation.core.file_evaluation import (
     evaluate_files,
     match_samples,
 )
-from gsmap.evaluation.core.match_files import write_matches
+from gsmap.evaluation.core.match_files import require_own_matches, write_matches
 from gsmap.evaluation.core.metric import MetricSettings, metric_class, metric_files
 from gsmap.evaluation.core.report import MetricReport, format_table, write_figures
 from gsmap.structures.classes import AREA_CLASSES
@@ -155,6 +155,7 @@ def match_shard(args: argparse.Namespace, evaluator: MapEvaluator, settings: Met
     Returns:
         A line with the number of samples and the file.
     """
+    require_own_matches(args.out, args.shard)
     results = args.results
     results_shard = args.shard.path_of(args.results)
     if args.results.exists() or not results_shard.exists():

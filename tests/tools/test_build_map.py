@@ -1,9 +1,11 @@
 """The command on a drive whose ground truth is fed as predictions."""
 
 import json
+import os
 import re
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -115,3 +117,54 @@ def test_results_of_other_samples_are_refused(files, tmp_path):
     write_results(tmp_path / "other.json", [("somewhere", [])])
     with pytest.raises(ValueError, match=r"no sample of scene 'scene' has results"):
         main([str(tmp_path / "other.json"), "--ann", str(files[1]), "--out", str(tmp_path)])
+
+
+ALL_FORMATS = ("geojson", "osm", "mcap", "mp4", "png", "svg")
+STRANGERS = (b"", b"{}", b'{"type": "FeatureCollection", "features": []}', b"x" * 300_000)
+
+
+@pytest.mark.parametrize(
+    "name", ["scene.geojson", "scene_lonlat.geojson", "scene.osm", "scores.json"]
+)
+@pytest.mark.parametrize("content", STRANGERS, ids=["empty", "object", "geojson", "large"])
+def test_no_file_of_another_program_is_replaced(files, tmp_path, name, content):
+    results, ann = files
+    (tmp_path / name).write_bytes(content)
+    words = [str(results), "--ann", str(ann), "--out", str(tmp_path), "--origin", "48", "11"]
+    with pytest.raises(ValueError, match=rf"{name} is there, and no file of this command"):
+        main([*words, "--formats", "geojson", "osm"])
+    assert (tmp_path / name).read_bytes() == content
+    assert os.listdir(tmp_path) == [name]
+
+
+def test_files_of_earlier_runs_and_links_are_replaced(files, tmp_path):
+    results, ann = files
+    words = [str(results), "--ann", str(ann), "--out", str(tmp_path / "maps")]
+    words += ["--formats", *ALL_FORMATS, "--origin", "48", "11"]
+    main(words)
+    names = set(os.listdir(tmp_path / "maps"))
+    assert names == {
+        *(f"scene.{kind}" for kind in ALL_FORMATS),
+        "scene_lonlat.geojson",
+        "scores.json",
+    }
+    (tmp_path / "precious").write_text("keep me")
+    (tmp_path / "maps/scene.osm").unlink()
+    (tmp_path / "maps/scene.osm").symlink_to(tmp_path / "precious")
+    for name in names - {"scene.osm"}:
+        os.utime(tmp_path / "maps" / name, (0, 0))
+    main(words)
+    assert (tmp_path / "precious").read_text() == "keep me"
+    for name in names:
+        assert (tmp_path / "maps" / name).lstat().st_mtime > 0
+        assert not (tmp_path / "maps" / name).is_symlink()
+
+
+def test_a_folder_or_a_pipe_under_the_name_of_a_map_is_refused(files, tmp_path):
+    results, ann = files
+    words = [str(results), "--ann", str(ann), "--out", str(tmp_path)]
+    for make in (Path.mkdir, os.mkfifo):
+        make(tmp_path / "scene.geojson")
+        with pytest.raises(ValueError, match=r"scene\.geojson is there, and no file"):
+            main(words)
+        os.rename(tmp_path / "scene.geojson", tmp_path / make.__name__)

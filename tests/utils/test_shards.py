@@ -5,8 +5,12 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from gsmap.datasets.annotations.file import write_annotations
+from gsmap.datasets.annotations.record import AnnotationMeta
+from gsmap.evaluation.core.match_files import require_own_matches
 from gsmap.utils.shards import WHOLE, Shard, find_shards, without_options
 
 
@@ -99,3 +103,33 @@ def test_what_is_missing_damaged_double_or_foreign_is_refused(damage, message, t
 def test_no_shard_at_all_says_so(tmp_path):
     with pytest.raises(FileNotFoundError, match="no shards of"):
         find_shards(tmp_path / "val.json")
+
+
+def test_no_shard_replaces_a_file_of_another_program(tmp_path):
+    target, meta = tmp_path / "val.arrow", AnnotationMeta("own", "lidar", "val")
+    path = Shard(1, 3).path_of(target)
+    manifest = path.with_name(f"{path.name}.manifest")
+    for name in (path, manifest):
+        for content in (b"", b"mine", b"ARROW1" + bytes(100_000), b'{"shard": 1}'):
+            name.write_bytes(content)
+            with pytest.raises(ValueError, match=f"{name.name} is there, and no file of this"):
+                write_annotations(target, meta, [], Shard(1, 3))
+            assert name.read_bytes() == content
+        name.unlink()
+    for _ in range(2):  # its own may be replaced
+        write_annotations(target, meta, [], Shard(1, 3))
+    target.write_bytes(b"named by the user")
+    write_annotations(target, meta, [])
+    manifest.unlink()  # as after a kill between both files
+    write_annotations(target, meta, [], Shard(1, 3))
+
+
+def test_no_shard_of_figures_replaces_a_file_of_another_program(tmp_path):
+    target, shard = tmp_path / "figures.json", Shard(0, 2)
+    path = shard.path_of(target)
+    path.write_bytes(b"mine")
+    with pytest.raises(ValueError, match="is there, and no file of this command"):
+        require_own_matches(target, shard)
+    np.savez_compressed(path.open("wb"), notes=np.array(["a"]))  # as `write_matches` writes it
+    require_own_matches(target, shard)
+    require_own_matches(path, WHOLE)

@@ -51,7 +51,8 @@ def write_geojson(
         }
         properties = {"class": name, "score": round(score, 4)}
         features.append({"type": "Feature", "properties": properties, "geometry": geometry})
-    collection: dict[str, Any] = {"type": "FeatureCollection", "crs": _CRS84 if origin else None}
+    crs = None if origin is None else _CRS84
+    collection: dict[str, Any] = {"type": "FeatureCollection", "generator": "gsmap", "crs": crs}
     if origin is None:
         collection["frame"] = "global frame of the poses, metres"
     collection["features"] = features

@@ -38,7 +38,11 @@ def write_mcap(path: str | Path, replay: Replay) -> None:
     """
     foxglove = import_extra("foxglove", "viz")
     log = _Log(foxglove.Context(), replay.colours)
-    with atomic_write(path, "wb") as file, foxglove.open_mcap(file, context=log.context):
+    options = foxglove.mcap.MCAPWriteOptions(profile="gsmap")
+    with (
+        atomic_write(path, "wb") as file,
+        foxglove.open_mcap(file, context=log.context, writer_options=options),
+    ):
         for moment in replay.moments():
             sample = moment.frame.sample
             time_ns = sample.timestamp_ns

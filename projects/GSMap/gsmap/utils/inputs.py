@@ -1,4 +1,4 @@
-"""Protection of the input files of a command from its outputs, and from pipes and devices."""
+"""Protection of input files and of files of other programs from the outputs of a command."""
 
 import os
 import stat
@@ -13,6 +13,7 @@ from gsmap.utils.errors import InputError, WorkError
 _Identity = tuple[int, int, int]  # device, inode and modification time of a file
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 _SYSTEM_FOLDERS = ("/dev/", "/proc/", "/sys/")  # pipes and devices there may be read
+_MARKED_BYTES = 1 << 16  # at the start and at the end of a file, in which its mark is searched
 
 
 class InputReplacedError(WorkError):
@@ -134,6 +135,46 @@ def require_no_input(path: Path) -> None:
         raise InputReplacedError(
             f"{path} would replace what this command reads ({_Command.inputs[identity]}): name "
             "another place for what it writes."
+        )
+
+
+def has_mark(path: Path, mark: bytes) -> bool:
+    """Whether the first or the last 64 KiB of a file contain a mark.
+
+    Args:
+        path: Plain file.
+        mark: Bytes that only the writer of a kind of files writes.
+    """
+    with path.open("rb") as file:
+        if mark in file.read(_MARKED_BYTES):
+            return True
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(0, size - _MARKED_BYTES))
+        return mark in file.read()
+
+
+def require_own_file(path: Path, mark: bytes) -> None:
+    """Require that a file whose name a command chooses is new, or was written by the command.
+
+    A link may be there: `atomic_write` replaces it, and its target does not change.
+
+    Args:
+        path: Path of the file, in a folder that the user has named.
+        mark: Bytes at the start or at the end of each such file of the command.
+
+    Raises:
+        ValueError: If another program's file, or no plain file, has this name.
+    """
+    try:
+        mode = path.lstat().st_mode
+    except FileNotFoundError:
+        return
+    if stat.S_ISLNK(mode):
+        return
+    if not stat.S_ISREG(mode) or not has_mark(path, mark):
+        raise InputError(
+            f"{path} is there, and no file of this command, which would replace it: take it away, "
+            "or give another output."
         )
 
 

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, TypeVar
 from gsmap import __version__
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import write_text
+from gsmap.utils.inputs import require_own_file
 
 Items = TypeVar("Items", bound=Sequence[Any])
 
@@ -69,6 +70,21 @@ class Shard:
             return target
         number = f"{self.index:05d}-of-{self.count:05d}"
         return target.with_name(f"{target.stem}.{number}{target.suffix}")
+
+    def require_own(self, target: Path, mark: bytes) -> None:
+        """Require that the file of this shard and its manifest replace no other program's files.
+
+        Args:
+            target: Path of the complete file; `WHOLE` replaces it, because the user names it.
+            mark: Bytes at the start or at the end of each file of this kind.
+
+        Raises:
+            ValueError: If another program's file has the name of the shard or of its manifest.
+        """
+        if self.count:
+            path = self.path_of(target)
+            require_own_file(path, mark)
+            require_own_file(_manifest_path(path), mark=b'"kind":')
 
     def seal(
         self, target: Path, kind: str, source: str, options: Mapping[str, Any], samples: int

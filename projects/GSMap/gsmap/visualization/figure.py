@@ -29,11 +29,11 @@ DPI = 220
 """Dots per inch: text of 6.5 points is legible in a picture that is displayed 800 px wide."""
 _WIDTH = 1500  # of the layout, px at DPI
 _SAVE_OPTIONS: dict[str, dict[str, Any]] = {
-    "png": {"pil_kwargs": {"compress_level": 4}},
+    "png": {"metadata": {"Software": "gsmap"}, "pil_kwargs": {"compress_level": 4}},
     "jpg": {"pil_kwargs": {"quality": 92}},
     "webp": {"pil_kwargs": {"quality": 90}},
     "pdf": {"metadata": {"CreationDate": None}},
-    "svg": {"metadata": {"Date": None}},
+    "svg": {"metadata": {"Creator": "gsmap", "Date": None}},
 }
 FORMATS = tuple(_SAVE_OPTIONS)
 _MARGIN = 26  # px at DPI, as all lengths of the layout

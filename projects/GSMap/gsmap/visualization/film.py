@@ -37,6 +37,7 @@ def write_film(path: str | Path, pictures: Iterable[np.ndarray], times_ns: Seque
     period_s = np.median(np.diff(times_ns)) / 1e9 if len(times_ns) > 1 else 0.5
     rate = Fraction(1 / np.clip(period_s, 1 / 60, 10)).limit_denominator(100)
     with atomic_write(path, "wb") as file, av.open(file, "w", format="mp4") as film:
+        film.metadata["comment"] = "gsmap"
         stream = None
         for picture in pictures:
             if stream is None:

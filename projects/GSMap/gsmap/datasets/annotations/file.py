@@ -59,6 +59,7 @@ class AnnotationWriter:
         self, path: str | Path, meta: AnnotationMeta, shard: Shard = WHOLE, source: str = ""
     ):
         self.path = shard.path_of(Path(path))
+        shard.require_own(Path(path), mark=META_KEY)
         self.meta = meta
         self._write_manifest = partial(
             shard.seal,

@@ -23,6 +23,19 @@ _LENGTHS = "/lengths"
 Arrays = Mapping[str, npt.NDArray[Any]]
 
 
+def require_own_matches(target: Path, shard: Shard) -> None:
+    """Require that the file of a shard replaces no other program's file.
+
+    Args:
+        target: File for the figures of all shards; it determines the path of the shard.
+        shard: Number of the shard and of all shards.
+
+    Raises:
+        ValueError: If another program's file has the name of the shard or of its manifest.
+    """
+    shard.require_own(target, mark=b"notes.npy")
+
+
 def write_matches(
     target: Path,
     shard: Shard,

@@ -23,6 +23,7 @@ from gsmap.structures.frames import frame_view
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import write_text
+from gsmap.utils.inputs import has_mark
 from gsmap.utils.words import format_count
 from gsmap.visualization.bev_view import display_extent
 from gsmap.visualization.page.frames import cameras_of, choose_frames, predictions_of, truth_of
@@ -39,7 +40,6 @@ from gsmap.visualization.page.tables import (
 from gsmap.visualization.style import MATCH_COLOURS, MapStyle
 
 _GENERATOR = b'<meta name="generator" content="gsmap">'
-_HEAD_BYTES = 4096  # the first bytes of a page contain the generator
 
 
 @dataclass(frozen=True)
@@ -289,8 +289,7 @@ def _digest(text: str) -> str:
 
 def is_own_page(path: Path) -> bool:
     """Whether a file was written by `write_page`."""
-    with path.open("rb") as file:
-        return _GENERATOR in file.read(_HEAD_BYTES)
+    return has_mark(path, _GENERATOR)
 
 
 def write_page(path: str | Path, data: Mapping[str, Any]) -> str:
