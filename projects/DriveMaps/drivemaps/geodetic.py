@@ -74,6 +74,32 @@ class MapOrigin:
             )
         return degrees
 
+    def points_of(self, lon_lat: FloatArray, where: str) -> FloatArray:
+        """Convert longitude and latitude to points in the global frame, the inverse of `lon_lat`.
+
+        Args:
+            lon_lat: Longitude and latitude in degrees. (n, 2)
+            where: Name of their file, for the message.
+
+        Returns:
+            Points in metres. (n, 2)
+
+        Raises:
+            ValueError: If a value is out of range, or farther than 100 km from the origin.
+        """
+        longitude_deg, latitude_deg = _require_degrees(lon_lat, where).T
+        origin = self._projection(self.longitude_deg, self.latitude_deg)
+        x, y = self._projection(longitude_deg, latitude_deg)
+        points = np.stack([x, y], axis=1) - origin
+        farthest_m = np.abs(points).max(initial=0.0)
+        if not farthest_m <= _FARTHEST_M:
+            raise InputError(
+                f"{where}: the map lies {farthest_m / 1000:.0f} km from the origin "
+                f"{self.latitude_deg:g} {self.longitude_deg:g} of the global frame: give its "
+                "origin (LAT LON), or the map of this place."
+            )
+        return points
+
 
 @dataclass(frozen=True)
 class MapGrid:
@@ -121,6 +147,37 @@ class MapGrid:
         x, y = np.asarray(points)[:, :2].T
         lon_deg, lat_deg = self._transformer.transform(x, y)
         return np.stack([lon_deg, lat_deg], axis=1)
+
+    def points_of(self, lon_lat: FloatArray, where: str) -> FloatArray:
+        """Convert longitude and latitude to points in the grid, the inverse of `lon_lat`.
+
+        Args:
+            lon_lat: Longitude and latitude in degrees. (n, 2)
+            where: Name of their file, for the message.
+
+        Returns:
+            Points in metres. (n, 2)
+
+        Raises:
+            ValueError: If a value is out of range, or not in the area of the grid.
+        """
+        longitude_deg, latitude_deg = _require_degrees(lon_lat, where).T
+        x, y = self._transformer.transform(longitude_deg, latitude_deg, direction="INVERSE")
+        points = np.stack([x, y], axis=1)
+        if not np.isfinite(points).all():
+            raise InputError(f"{where}: the map lies outside of the grid {self.crs}.")
+        return points
+
+
+def _require_degrees(lon_lat: FloatArray, where: str) -> FloatArray:
+    """Require longitudes within 180 and latitudes within 90 degrees. (n, 2)"""
+    longitude_deg, latitude_deg = lon_lat.T
+    if not (np.abs(longitude_deg).max() <= 180 and np.abs(latitude_deg).max() <= 90):
+        raise InputError(
+            f"{where} has coordinates that are no longitude and latitude: if they are metres of "
+            'the global frame, give the file the member "crs": null.'
+        )
+    return lon_lat
 
 
 def require_near(positions: FloatArray, where: str) -> None:

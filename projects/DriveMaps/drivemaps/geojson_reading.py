@@ -1,0 +1,151 @@
+"""Reading of GeoJSON maps, written by `write_geojson` or by other programs."""
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivemaps.geodetic import MapGrid, MapOrigin
+from drivemaps.map_reading import (
+    CLASS_KEY,
+    ClassRule,
+    ElementCollector,
+    MapFile,
+    finite_number,
+)
+from gsmap.structures.elements import FloatArray
+from gsmap.utils.errors import InputError
+from gsmap.utils.json_items import items_of
+
+_ADVICE = "give a GeoJSON FeatureCollection"
+_KINDS = ("LineString", "MultiLineString", "Polygon", "MultiPolygon")
+_NO_CRS = "no crs"  # in place of a value that the file lacks
+# Ends of the names of longitude and latitude on the WGS 84 ellipsoid
+_DEGREES = ("CRS84", "EPSG:4326", "EPSG::4326")
+
+
+def read_geojson(
+    path: str | Path,
+    classes: Sequence[str],
+    origin: MapOrigin | MapGrid | None = None,
+    rule: ClassRule | None = None,
+) -> MapFile:
+    """Read a FeatureCollection of lines and polygons.
+
+    Coordinates are longitude and latitude (RFC 7946). With ``"crs": null`` they are metres of the
+    global frame. Lines and polygons are used, also several in one feature; of polygons the outer
+    ring. Heights are dropped. Other features are counted.
+
+    Args:
+        path: File, which may be untrusted.
+        classes: Class names in label order.
+        origin: Position of the global frame on the Earth, for coordinates in degrees.
+        rule: Property of the class of a feature; by default ``class`` with names of classes.
+
+    Returns:
+        Elements in the global frame, and the number of features that are not used.
+
+    Raises:
+        FileNotFoundError: If the file does not exist.
+        ValueError: If the file is malformed, a number is not finite or out of range, degrees have
+            no origin, or no feature can be used.
+        RuntimeError: If coordinates are degrees and ``pyproj`` is missing.
+    """
+    path = Path(path)
+    collector = ElementCollector(path, classes, rule=rule or ClassRule(CLASS_KEY))
+    members: dict[str, Any] = {"crs": _NO_CRS}
+    for number, (feature, _) in enumerate(items_of(path, "features", _ADVICE, beside=members)):
+        try:
+            _add_feature(feature, collector)
+        except InputError as error:
+            text = str(error).rstrip(".")
+            raise InputError(f"{path}, feature {number}: {text}.") from error
+    collector.unused += Counter()  # drops counts of zero
+    crs = members["crs"]
+    if crs is None:
+        return collector.finish(origin=None)
+    _require_degrees(crs, path)
+    if origin is None:
+        raise InputError(
+            f"{path} has longitude and latitude, and the origin of the global frame is not known: "
+            'give --origin or --crs; coordinates in metres need the member "crs": null.'
+        )
+    return collector.finish(origin)
+
+
+def _require_degrees(crs: Any, path: Path) -> None:
+    """Require that a file names no coordinate system but longitude and latitude."""
+    if crs == _NO_CRS:
+        return
+    name = None
+    if isinstance(crs, dict) and isinstance(crs.get("properties"), dict):
+        name = crs["properties"].get("name")
+    if not isinstance(name, str) or not name.upper().endswith(_DEGREES):
+        raise InputError(
+            f"{path} has coordinates of {name!r:.60}: convert them to longitude and latitude, or "
+            'to metres of the global frame with "crs": null.'
+        )
+
+
+def _add_feature(feature: Any, collector: ElementCollector) -> None:
+    """Add the lines of a feature, or count it."""
+    if not isinstance(feature, dict) or feature.get("type") != "Feature":
+        raise InputError("it is no object of type Feature")
+    geometry = feature.get("geometry")
+    if geometry is None:
+        collector.unused["without geometry"] += 1
+        return
+    if not isinstance(geometry, dict) or not isinstance(geometry.get("type"), str):
+        raise InputError("its geometry is no object with a type")
+    properties = feature.get("properties")
+    if properties is not None and not isinstance(properties, dict):
+        raise InputError("its properties are no object")
+    kind = geometry["type"]
+    if kind not in _KINDS:
+        collector.unused[f"geometry {kind[:40]!r}"] += 1
+        return
+    name = collector.class_of(properties or {})
+    if name is None:
+        return
+    parts = [geometry.get("coordinates")]
+    if kind.startswith("Multi"):
+        parts = _list_of(parts[0])
+    for part in parts:
+        if kind.endswith("Polygon"):
+            rings = _list_of(part)
+            collector.add(name, _outer_ring(rings))
+            collector.unused["holes of polygons"] += len(rings) - 1
+        else:
+            collector.add(name, _line_of(part))
+
+
+def _outer_ring(rings: list[Any]) -> FloatArray:
+    """Convert the first ring of a polygon to an array. (n, 2)"""
+    if not rings:
+        raise InputError("its polygon has no ring")
+    outer = _line_of(rings[0])
+    if len(outer) < 4 or not np.array_equal(outer[0], outer[-1]):
+        raise InputError("the ring of its polygon is not closed")
+    return outer
+
+
+def _list_of(value: Any) -> list[Any]:
+    """Require a list."""
+    if not isinstance(value, list):
+        raise InputError("its coordinates are nested differently from its type")
+    return value
+
+
+def _line_of(positions: Any) -> FloatArray:
+    """Convert positions to an array without heights. (n, 2)"""
+    points = []
+    for position in _list_of(positions):
+        coordinates = _list_of(position)
+        if len(coordinates) < 2:
+            raise InputError("a position has no two coordinates")
+        x = finite_number(coordinates[0])
+        y = finite_number(coordinates[1])
+        points.append((x, y))
+    return np.array(points, dtype=np.float64).reshape(-1, 2)

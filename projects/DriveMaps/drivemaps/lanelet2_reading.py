@@ -1,0 +1,353 @@
+"""Reading of Lanelet2 maps (OSM XML), written by `write_lanelet2` or by other programs."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+from xml.parsers import expat
+
+import numpy as np
+
+from drivemaps.geodetic import MapGrid, MapOrigin
+from drivemaps.map_reading import CLASS_KEY, ClassRule, ElementCollector, MapFile
+from gsmap.structures.elements import FloatArray
+from gsmap.utils.errors import InputError
+from gsmap.utils.files import fetch_advice
+
+CLASS_OF_TYPE = {
+    "line_thin": "divider",
+    "line_thick": "divider",
+    "road_border": "boundary",
+    "curbstone": "boundary",
+    "guard_rail": "boundary",
+    "wall": "boundary",
+    "fence": "boundary",
+    "zebra_marking": "ped_crossing",
+    "pedestrian_marking": "ped_crossing",
+    "stop_line": "stop_line",
+}
+"""Class of the line strings of a Lanelet2 type. Other types may be names of classes."""
+_CROSSING = "ped_crossing"
+_BLOCK = 1 << 20  # bytes
+_DEEPEST = 20  # nested elements of XML
+_MOST_PARTS = 10_000_000  # nodes, ways, relations, and references to them
+_KINDS = ("node", "way", "relation")
+
+
+class _Node(NamedTuple):
+    """Position of a node.
+
+    Attributes:
+        degrees: Longitude and latitude in degrees, or None.
+        local: Position in the global frame in metres, or None.
+    """
+
+    degrees: tuple[float, float] | None
+    local: tuple[float, float] | None
+
+
+class _Way(NamedTuple):
+    """Line string.
+
+    Attributes:
+        nodes: IDs of its nodes.
+        tags: Untrusted tags.
+    """
+
+    nodes: list[str]
+    tags: dict[str, str]
+
+    @property
+    def ring_or_line(self) -> list[str]:
+        """IDs of its nodes; those of an area end with the first one."""
+        is_area = self.tags.get("area") == "yes"
+        if is_area and self.nodes[:1] != self.nodes[-1:]:
+            return [*self.nodes, self.nodes[0]]
+        return self.nodes
+
+
+class _Relation(NamedTuple):
+    """Lanelet, area or rule.
+
+    Attributes:
+        way_of_role: ID of a way by its role.
+        tags: Untrusted tags.
+    """
+
+    way_of_role: dict[str, str]
+    tags: dict[str, str]
+
+
+def read_lanelet2(
+    path: str | Path,
+    classes: Sequence[str],
+    origin: MapOrigin | MapGrid | None = None,
+    rule: ClassRule | None = None,
+) -> MapFile:
+    """Read the line strings, polygons and crosswalks of a Lanelet2 map.
+
+    A line string gets its class by the tag ``class``, or else by its type (`CLASS_OF_TYPE`). A
+    lanelet of the subtype ``crosswalk`` is an area of the class ``ped_crossing``. Positions are
+    ``local_x`` and ``local_y`` if all used nodes have them, and otherwise longitude and latitude.
+    Other line strings and relations are counted.
+
+    Args:
+        path: File, which may be untrusted. A document type, and so every entity, is refused.
+        classes: Class names in label order.
+        origin: Position of the global frame on the Earth, for nodes without local positions.
+        rule: Tag of the class of a line string, in place of the types.
+
+    Returns:
+        Elements in the global frame, and the number of elements that are not used.
+
+    Raises:
+        FileNotFoundError: If the file does not exist.
+        ValueError: If the file is malformed, a number is not finite or out of range, a node or a
+            way is missing, degrees have no origin, or no element can be used.
+        RuntimeError: If nodes have degrees only and ``pyproj`` is missing.
+    """
+    path = Path(path)
+    parser = _Parser(path)
+    parser.read()
+    collector = ElementCollector(path, classes, rule=rule or ClassRule(CLASS_KEY))
+    collector.unused.update(parser.num_deleted)
+    crosswalks = parser.crosswalks() if rule is None and _CROSSING in classes else {}
+    lines = []
+    bounds: set[str] = set()  # ways of crosswalks
+    for number, relation in crosswalks.items():
+        lines.append((_CROSSING, parser.ring_of(number, relation)))
+        bounds.update(relation.way_of_role.values())
+    for number, way in parser.ways.items():
+        if number in bounds:
+            continue
+        tags = way.tags if rule else _with_class(way.tags, classes)
+        name = collector.class_of(tags)
+        if name is not None:
+            lines.append((name, way.ring_or_line))
+    for number, relation in parser.relations.items():
+        if number not in crosswalks:
+            kind = relation.tags.get("type", "")
+            collector.unused[f"relation {kind[:40]!r}"] += 1
+    is_local = parser.have_local_positions([nodes for _, nodes in lines])
+    if not is_local and origin is None:
+        raise InputError(
+            f"{path} has nodes without local_x and local_y, and the origin of the global frame is "
+            "not known: give --origin or --crs."
+        )
+    for name, nodes in lines:
+        collector.add(name, parser.positions(nodes, is_local=is_local))
+    return collector.finish(None if is_local else origin)
+
+
+def _with_class(tags: Mapping[str, str], classes: Sequence[str]) -> dict[str, str]:
+    """Add the class of a Lanelet2 type to tags that name no class."""
+    kind = tags.get("type", "")
+    if tags.get(CLASS_KEY) in classes:
+        return dict(tags)
+    subtype = tags.get("subtype", "")
+    description = f"{kind}/{subtype}" if subtype else kind
+    return {CLASS_KEY: CLASS_OF_TYPE.get(kind, kind if kind in classes else description)}
+
+
+class _Parser:
+    """Nodes, ways and relations of an OSM file, read in blocks by expat.
+
+    Args:
+        path: File.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.nodes: dict[str, _Node] = {}
+        self.ways: dict[str, _Way] = {}
+        self.relations: dict[str, _Relation] = {}
+        self.num_deleted: dict[str, int] = {}
+        self._path = path
+        self._depth = 0
+        self._num_parts = 0
+        self._attributes: dict[str, str] = {}
+        self._tags: dict[str, str] = {}
+        self._references: list[str] = []
+        self._way_of_role: dict[str, str] = {}
+
+    def read(self) -> None:
+        """Read the file.
+
+        Raises:
+            ValueError: If the file is malformed.
+        """
+        parser = expat.ParserCreate()
+        parser.StartDoctypeDeclHandler = self._refuse_document_type
+        parser.StartElementHandler = self._start
+        parser.EndElementHandler = self._end
+        with self._path.open("rb") as file:
+            start = file.read(_BLOCK)
+            block = start
+            try:
+                while block:
+                    parser.Parse(block, False)
+                    block = file.read(_BLOCK)
+                parser.Parse(b"", True)
+            except (expat.ExpatError, ValueError, LookupError) as error:
+                if isinstance(error, InputError):
+                    raise
+                advice = fetch_advice(start[:200], otherwise="give a Lanelet2 map in OSM XML")
+                raise InputError(f"{self._path} is no valid XML ({error}): {advice}.") from error
+
+    def _refuse_document_type(self, *_: object) -> None:
+        raise self._error("it has a document type, which OSM files lack")
+
+    def _start(self, name: str, attributes: dict[str, str]) -> None:
+        """Read the start of an element."""
+        self._depth += 1
+        if self._depth > _DEEPEST:
+            raise self._error(f"its elements are nested deeper than {_DEEPEST}")
+        if self._depth == 1:
+            if name != "osm":
+                raise self._error(f"its root is {name!r:.40} and not 'osm'")
+            return
+        if name in (*_KINDS, "nd", "member"):
+            self._num_parts += 1
+            if self._num_parts > _MOST_PARTS:
+                raise self._error(f"it has more than {_MOST_PARTS:,} nodes and references")
+        if self._depth == 2:
+            self._attributes = attributes
+            self._tags = {}
+            self._references = []
+            self._way_of_role = {}
+        elif name == "tag":
+            key = self._required(attributes, "k", owner=name)
+            self._tags[key] = self._required(attributes, "v", owner=name)
+        elif name == "nd":
+            self._references.append(self._required(attributes, "ref", owner=name))
+        elif name == "member" and attributes.get("type") == "way":
+            role = attributes.get("role", "")
+            self._way_of_role[role] = self._required(attributes, "ref", owner=name)
+
+    def _end(self, name: str) -> None:
+        """Keep a node, a way or a relation at its end."""
+        self._depth -= 1
+        if self._depth != 1 or name not in _KINDS:
+            return
+        attributes = self._attributes
+        if attributes.get("action") == "delete" or attributes.get("visible") == "false":
+            key = f"deleted {name}"
+            self.num_deleted[key] = self.num_deleted.get(key, 0) + 1
+            return
+        number = self._required(attributes, "id", owner=name)
+        table: dict[str, _Node] | dict[str, _Way] | dict[str, _Relation]
+        if name == "node":
+            table = self.nodes
+            is_new = number not in table
+            self.nodes[number] = self._node(number, attributes)
+        elif name == "way":
+            table = self.ways
+            is_new = number not in table
+            self.ways[number] = _Way(self._references, tags=self._tags)
+        else:
+            table = self.relations
+            is_new = number not in table
+            self.relations[number] = _Relation(self._way_of_role, tags=self._tags)
+        if not is_new:
+            raise self._error(f"it has {name} {number!r:.40} twice")
+
+    def _node(self, number: str, attributes: Mapping[str, str]) -> _Node:
+        """Check the position of a node."""
+        degrees = None
+        if "lat" in attributes or "lon" in attributes:
+            latitude = self._number(attributes.get("lat", ""), number)
+            longitude = self._number(attributes.get("lon", ""), number)
+            if abs(latitude) > 90 or abs(longitude) > 180:
+                raise self._error(f"node {number!r:.40} has no latitude and longitude in degrees")
+            degrees = longitude, latitude
+        local = None
+        if "local_x" in self._tags and "local_y" in self._tags:
+            x = self._number(self._tags["local_x"], number)
+            y = self._number(self._tags["local_y"], number)
+            local = x, y
+        return _Node(degrees, local=local)
+
+    def _number(self, text: str, node: str) -> float:
+        """Convert a coordinate of a node."""
+        try:
+            number = float(text)
+        except ValueError:
+            number = math.nan
+        if not math.isfinite(number):
+            raise self._error(f"node {node!r:.40} has the coordinate {text!r:.40}")
+        return number
+
+    def _required(self, attributes: Mapping[str, str], name: str, owner: str) -> str:
+        """Return an attribute that must exist."""
+        if name not in attributes:
+            raise self._error(f"an element {owner!r} has no {name!r}")
+        return attributes[name]
+
+    def _error(self, fault: str) -> InputError:
+        return InputError(f"{self._path} is no Lanelet2 map: {fault}; write it again.")
+
+    def _nodes(self, references: Sequence[str]) -> list[_Node]:
+        """Find nodes by their IDs."""
+        found = []
+        for number in references:
+            if number not in self.nodes:
+                raise self._error(f"a line needs node {number!r:.40}, which is missing")
+            found.append(self.nodes[number])
+        return found
+
+    def have_local_positions(self, lines: Sequence[Sequence[str]]) -> bool:
+        """Whether all nodes of lines, given by their IDs, have positions in the global frame."""
+        for references in lines:
+            for node in self._nodes(references):
+                if node.local is None:
+                    return False
+        return True
+
+    def positions(self, references: Sequence[str], is_local: bool) -> FloatArray:
+        """Return the positions of nodes.
+
+        Args:
+            references: IDs of the nodes. (n,)
+            is_local: Whether to return metres of the global frame in place of degrees.
+
+        Returns:
+            x and y in metres, or longitude and latitude in degrees. (n, 2)
+        """
+        points = []
+        for node in self._nodes(references):
+            point = node.local if is_local else node.degrees
+            if point is None:
+                raise self._error("a node has no lat and lon")
+            points.append(point)
+        return np.array(points, dtype=np.float64).reshape(-1, 2)
+
+    def crosswalks(self) -> dict[str, _Relation]:
+        """Lanelets of the subtype ``crosswalk``, by their IDs."""
+        found = {}
+        for number, relation in self.relations.items():
+            if relation.tags.get("subtype") == "crosswalk":
+                found[number] = relation
+        return found
+
+    def ring_of(self, number: str, crosswalk: _Relation) -> list[str]:
+        """Join both bounds of a crosswalk to a ring.
+
+        Args:
+            number: ID of the lanelet.
+            crosswalk: The lanelet.
+
+        Returns:
+            IDs of the nodes, the first one also at the end.
+        """
+        bounds = []
+        for role in ("left", "right"):
+            way = self.ways.get(crosswalk.way_of_role.get(role, ""))
+            if way is None or not way.nodes:
+                raise self._error(f"crosswalk {number!r:.40} has no {role} bound")
+            bounds.append(way.nodes)
+        left, right = bounds
+        ends = self._nodes([left[-1], right[0], right[-1]])
+        is_local = all(node.local is not None for node in ends)
+        last, first, other = self.positions([left[-1], right[0], right[-1]], is_local=is_local)
+        if np.linalg.norm(other - last) <= np.linalg.norm(first - last):
+            right = right[::-1]
+        return [*left, *right, left[0]]

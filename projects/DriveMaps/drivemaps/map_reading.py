@@ -1,0 +1,223 @@
+"""Rules that all readers of map files share: classes of elements, bounds, counts of the rest."""
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import shapely
+
+from drivemaps.geodetic import MapGrid, MapOrigin
+from gsmap.structures.classes import AREA_CLASSES
+from gsmap.structures.elements import FloatArray, MapElements
+from gsmap.utils.errors import InputError
+
+CLASS_KEY = "class"
+"""Property of the class of an element in the files of `write_geojson` and `write_lanelet2`."""
+FARTHEST_M = 1e7
+"""Largest coordinate of a vertex in metres of the global frame."""
+_MOST_VERTICES = 5_000_000
+_SMALLEST_M2 = 0.01  # smaller areas are points or lines
+_LONGEST_NAME = 60  # characters of a value in a message
+_LISTED_REASONS = 8  # in a message
+
+
+class MapFile(NamedTuple):
+    """Map that was read from a file.
+
+    Attributes:
+        elements: Elements in metres in the global frame, with labels of the requested classes.
+        unused: Number of elements of the file that are not used, by the reason.
+    """
+
+    elements: MapElements
+    unused: Counter[str]
+
+
+@dataclass(frozen=True)
+class ClassRule:
+    """Rule that gives the elements of a file their class by a property.
+
+    Args:
+        key: Name of the property, or of the tag in a Lanelet2 file.
+        class_of: Class of each value of the property; None if the values are names of classes.
+
+    Raises:
+        ValueError: If the name is empty.
+    """
+
+    key: str
+    class_of: Mapping[str, str] | None = None
+
+    def __post_init__(self) -> None:
+        if not self.key:
+            raise InputError("the property that names the class must have a name.")
+
+    @classmethod
+    def parse(cls, words: Sequence[str], classes: Sequence[str]) -> "ClassRule":
+        """Parse ``KEY VALUE=CLASS ...``.
+
+        Args:
+            words: Name of the property, then the class of each of its values. Without values, they
+                are names of classes.
+            classes: Names of the classes.
+
+        Raises:
+            ValueError: If a word has another form, or a class does not exist.
+        """
+        key, *pairs = words
+        class_of = {}
+        for pair in pairs:
+            value, separator, name = pair.rpartition("=")
+            if not separator or not value or name not in classes:
+                raise InputError(
+                    f"a value of {key!r} and its class must be VALUE=CLASS with a class of "
+                    f"{list(classes)}, got {pair!r}."
+                )
+            class_of[value] = name
+        return cls(key, class_of or None)
+
+
+class ElementCollector:
+    """Lines of a file that have a class, and counts of the others.
+
+    Args:
+        path: File, for messages.
+        classes: Class names in label order.
+        rule: Rule of the class of an element.
+    """
+
+    def __init__(self, path: Path, classes: Sequence[str], rule: ClassRule) -> None:
+        self.unused: Counter[str] = Counter()
+        self._path = path
+        self._classes = tuple(classes)
+        self._rule = rule
+        self._lines: list[FloatArray] = []
+        self._labels: list[int] = []
+        self._num_vertices = 0
+
+    def class_of(self, values: Mapping[str, Any]) -> str | None:
+        """Find the class of an element; None, and a count, if it has none.
+
+        Args:
+            values: Untrusted properties of the element.
+        """
+        value = values.get(self._rule.key)
+        if isinstance(value, (int, float)):
+            value = str(value)
+        if not isinstance(value, str):
+            self.unused[f"without {self._rule.key!r}"] += 1
+            return None
+        name = value if self._rule.class_of is None else self._rule.class_of.get(value)
+        if name not in self._classes:
+            self.unused[f"{self._rule.key} {value[:_LONGEST_NAME]!r}"] += 1
+            return None
+        return name
+
+    def add(self, name: str, line: FloatArray) -> None:
+        """Add an element, or count it if it has no length, or an area is open or has no area.
+
+        Args:
+            name: Class of the element.
+            line: Finite vertices in degrees or metres; areas are closed. (n, 2)
+
+        Raises:
+            ValueError: If the file has too many vertices.
+        """
+        self._num_vertices += len(line)
+        if self._num_vertices > _MOST_VERTICES:
+            raise InputError(
+                f"{self._path} has more than {_MOST_VERTICES:,} vertices: cut the map to the place."
+            )
+        if len(line) < 2 or not np.ptp(line, axis=0).any():
+            self.unused[f"{name} without length"] += 1
+            return
+        is_area = name in AREA_CLASSES
+        if is_area and not np.array_equal(line[0], line[-1]):
+            self.unused[f"{name} that is an open line"] += 1
+            return
+        self._lines.append(line)
+        self._labels.append(self._classes.index(name))
+
+    def finish(self, origin: MapOrigin | MapGrid | None) -> MapFile:
+        """Convert the lines to the global frame, check them, and create the map.
+
+        Args:
+            origin: Position of the global frame on the Earth for lines in degrees; None for lines
+                in metres.
+
+        Raises:
+            ValueError: If a coordinate is out of range, or elements exist and none can be used.
+        """
+        if not self._lines and self.unused:
+            raise InputError(
+                f"{self._path} has no element of {list(self._classes)}, but {self.describe()}: "
+                "name the property of the class and its values with --map-classes."
+            )
+        lines = []
+        labels = []
+        for line, label in zip(self._lines, self._labels, strict=True):
+            points = line if origin is None else origin.points_of(line, where=str(self._path))
+            farthest_m = np.abs(points).max()
+            if not farthest_m <= FARTHEST_M:
+                raise InputError(
+                    f"{self._path} reaches {farthest_m:.3g} m from the origin of the global frame: "
+                    f"at most {FARTHEST_M:g} m are read."
+                )
+            name = self._classes[label]
+            if name in AREA_CLASSES and _area_m2(points) < _SMALLEST_M2:
+                self.unused[f"{name} without area"] += 1
+                continue
+            lines.append(points)
+            labels.append(label)
+        return MapFile(MapElements.from_polylines(lines, labels), unused=self.unused)
+
+    def describe(self) -> str:
+        """Describe the elements that are not used, the most frequent reasons first."""
+        return describe_unused(self.unused)
+
+
+def _area_m2(ring: FloatArray) -> float:
+    """Area of a closed ring in square metres. (n, 2)"""
+    if len(ring) < 4:
+        return 0.0
+    area: float = shapely.Polygon(ring).area
+    return area
+
+
+def describe_unused(unused: Counter[str]) -> str:
+    """Describe elements of a map file that are not used.
+
+    Args:
+        unused: Number of elements by the reason.
+
+    Returns:
+        Numbers and reasons, the most frequent ones first.
+    """
+    parts = []
+    for reason, count in unused.most_common(_LISTED_REASONS):
+        parts.append(f"{count} x {reason}")
+    num_others = unused.total() - sum(count for _, count in unused.most_common(_LISTED_REASONS))
+    if num_others:
+        parts.append(f"{num_others} x other reasons")
+    return ", ".join(parts)
+
+
+def finite_number(value: Any) -> float:
+    """Convert a JSON number to a finite number.
+
+    Raises:
+        ValueError: If the value is no finite number.
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise InputError(f"{value!r:.40} is no number")
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise InputError(f"{value!r:.40} is no finite number")
+    return number
