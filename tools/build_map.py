@@ -5,6 +5,8 @@ Examples:
     python tools/build_map.py results.json --ann data/minicity/gsmap_minicity_val.arrow --out maps
     python tools/build_map.py results.json --ann annotations.arrow --out maps \
         --formats geojson osm rrd mcap --origin 48.26 11.67
+    python tools/build_map.py today.json --ann today.arrow --out maps --changes maps/scene.geojson
+    python tools/build_map.py --map town.osm --ann annotations.arrow --prior town.prior
 """
 
 import gsmap  # noqa: F401 - first: Ctrl-C is one line from here on, foreign settings are kept out
@@ -14,21 +16,24 @@ import argparse
 import json
 import math
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
+from drivemaps.change import Pass
+from drivemaps.changes import find_changes, summarize_changes, write_changes
 from drivemaps.config import MergeConfig
 from drivemaps.drive import Drive, read_drive
 from drivemaps.geodetic import MapGrid, MapOrigin, known_origin, require_near
 from drivemaps.geojson import write_geojson
 from drivemaps.lanelet2 import SPEED_LIMIT_KMH, write_lanelet2
 from drivemaps.lanelets import lane_graph_of
+from drivemaps.map_files import read_map
+from drivemaps.map_reading import ClassRule, describe_unused
 from drivemaps.mcap import write_mcap
 from drivemaps.merging import confident, merge, suppress
+from drivemaps.pictures import plot_maps
 from drivemaps.replay import Replay
 from drivemaps.rerun import write_rerun
 from drivemaps.scoring import figures_table, map_figures
@@ -38,21 +43,20 @@ from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.elements import elements_of_instances
 from gsmap.evaluation.core.results_json import RESULTS_KEY, SampleFile
 from gsmap.structures.elements import MapElements
-from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.errors import InputError
 from gsmap.utils.extras import import_extra
 from gsmap.utils.files import file_names, write_text
 from gsmap.utils.inputs import require_own_file
 from gsmap.utils.split_lists import require_results_of
 from gsmap.utils.words import format_count
-from gsmap.visualization.bev_view import draw_lines
 from gsmap.visualization.figure import save_figure
-from gsmap.visualization.plots import WIDTH_IN, finish_panel, panel_grid
 from gsmap.visualization.style import MapStyle
 
 FORMATS = ("geojson", "osm", "rrd", "mcap", "mp4", "png", "svg")
 _LON_LAT = "_lonlat"  # ends the name of a map in degrees
 _SCORES = "scores.json"
+_CHANGES = "changes"  # name of the file of changes, without a suffix
 _MARK = b"gsmap"  # in all maps
 _MARK_OF_SCORES = b'"merged"'
 EXTRAS = {"rrd": ("rerun", "viz"), "mcap": ("foxglove", "viz"), "mp4": ("av", "viz")}
@@ -62,11 +66,11 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     parser = CommandParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("results", type=Path, help="results in MapTR's JSON form")
+    parser.add_argument("results", type=Path, nargs="?", help="results in MapTR's JSON form")
     parser.add_argument(
         "--ann", type=Path, required=True, help="annotation file (*.arrow) of the same samples"
     )
-    parser.add_argument("--out", type=Path, required=True, help="folder for the maps")
+    parser.add_argument("--out", type=Path, help="folder for the maps")
     parser.add_argument("--formats", nargs="+", default=["geojson"], choices=FORMATS)
     parser.add_argument("--scene", nargs="+", help="drives to merge; all by default")
     parser.add_argument("--score-thr", type=float, default=0.3, help="smallest score that counts")
@@ -113,10 +117,43 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--data-root", type=Path, help="folder of the images for rrd, mcap and mp4: that of --ann"
     )
-    return parser.parse_args(argv)
+    group = parser.add_argument_group("earlier maps")
+    group.add_argument(
+        "--changes",
+        type=Path,
+        metavar="OLD",
+        help="write what was removed, added and moved since this map of the place (GeoJSON, "
+        "Lanelet2); each drive is a pass",
+    )
+    group.add_argument(
+        "--prior", type=output_file, metavar="OUT", help="write the maps as a MapPrior to this file"
+    )
+    group.add_argument(
+        "--map", type=Path, metavar="FILE", help="add this map (GeoJSON, Lanelet2) to the --prior"
+    )
+    group.add_argument(
+        "--map-classes",
+        nargs="+",
+        metavar=("KEY", "VALUE=CLASS"),
+        help="property of the class in the map of --changes or --map, and its values",
+    )
+    args = parser.parse_args(argv)
+    if args.results is None and not args.map:
+        parser.error("give results, or a --map for a --prior")
+    if args.results is None and (args.changes or args.out):
+        parser.error("--changes and --out are for results: give them, too")
+    if args.results and not (args.out or args.prior):
+        parser.error("--out or --prior must name the output")
+    if args.changes and not args.out:
+        parser.error("--changes goes to the folder --out: give it, too")
+    if args.map and not args.prior:
+        parser.error("--map is for a prior: give --prior, too")
+    if args.map_classes and not (args.map or args.changes):
+        parser.error("--map-classes is for --map and --changes")
+    return args
 
 
-def check_formats(args: argparse.Namespace, ann: AnnotationFile) -> None:
+def check_options(args: argparse.Namespace, ann: AnnotationFile) -> None:
     """Check, before the first file is written, that each format has its package and an origin.
 
     Raises:
@@ -137,6 +174,12 @@ def check_formats(args: argparse.Namespace, ann: AnnotationFile) -> None:
     for name, origin in sorted(origins.items()):
         if origin is None:
             unknown.append(name)
+    has_poses = ann.meta.options.get("poses", True)
+    if not has_poses and (args.formats != ["mp4"] or args.prior or args.changes):
+        raise InputError(
+            f"the samples of {args.ann} have no poses, so there is no map of the drive: --formats "
+            "mp4 shows the single frames."
+        )
     if "osm" in args.formats and unknown:
         raise InputError(
             f"Lanelet2 needs longitude and latitude, and the origin of map {unknown[0]!r} is not "
@@ -162,9 +205,15 @@ def require_own_files(args: argparse.Namespace, names: Iterable[str], scored: bo
     endings = [f".{suffix}" for suffix in args.formats]
     if "geojson" in args.formats:
         endings.append(f"{_LON_LAT}.geojson")
+    paths = []
     for name in names:
         for ending in endings:
-            require_own_file(args.out / f"{name}{ending}", _MARK)
+            paths.append(args.out / f"{name}{ending}")
+    if args.changes:
+        paths.append(args.out / f"{_CHANGES}.geojson")
+        paths.append(args.out / f"{_CHANGES}{_LON_LAT}.geojson")
+    for path in paths:
+        require_own_file(path, _MARK)
     if scored:
         require_own_file(args.out / _SCORES, _MARK_OF_SCORES)
 
@@ -259,42 +308,6 @@ def draw(
     save_figure(plot_maps(maps, track, style), path)
 
 
-def plot_maps(maps: Mapping[str, MapElements], track: np.ndarray, style: MapStyle) -> Figure:
-    """Draw maps of one drive side by side, or wide maps below each other, with the driven track.
-
-    Args:
-        maps: Maps in the global frame, by title.
-        track: Positions of the vehicle in the global frame, in metres. (n, 2)
-        style: Colours and titles of the classes.
-    """
-    vertices = [elements.points[:, :2] for elements in maps.values()]
-    points = np.concatenate([track, *vertices])
-    low = points.min(axis=0) - 5
-    high = points.max(axis=0) + 5
-    width, height = high - low
-    rows = len(maps) if width > 2.5 * height else 1
-    figure, axes = panel_grid(rows, len(maps) // rows)
-    panel_width = WIDTH_IN * rows / len(maps) - 0.5  # inches, without the labels
-    panel_height = panel_width * min(height / width, 2)
-    figure.set_figheight(0.4 + rows * (panel_height + 0.5))
-    for ax, (title, elements) in zip(axes.ravel(), maps.items(), strict=True):
-        lines = [line[:, :2] - low for line in elements.polylines]
-        draw_lines(ax, lines, elements.labels, style, style.colours(elements.labels), 0.8)
-        x, y = (track - low).T
-        ax.plot(x, y, ".", color=style.ink, markersize=1.2)
-        ax.set(xlim=(0, width), ylim=(0, height), aspect="equal")
-        finish_panel(ax, title)
-        for axis in (ax.xaxis, ax.yaxis):
-            axis.set_major_formatter("{x:g} m")
-    labels = np.unique(np.concatenate([elements.labels for elements in maps.values()]))
-    handles = []
-    for label in labels.astype(int).tolist():
-        line = Line2D([], [], color=style.colour(label), lw=2, label=style.title(label))
-        handles.append(line)
-    figure.legend(handles=handles, loc="outside upper right", ncols=4, fontsize=8, frameon=False)
-    return figure
-
-
 def has_truth(ann: AnnotationFile) -> bool:
     """Whether all samples have ground truth."""
     return bool((ann.instance_counts() >= 0).all())
@@ -305,19 +318,23 @@ def read_truth(ann: AnnotationFile) -> dict[str, MapElements]:
     return {sample.token: elements_of_instances(sample.instances or []) for sample in ann}
 
 
-def score(drives: list[Drive], merged: list[MapElements], ann: AnnotationFile, out: Path) -> None:
+def score(passes: list[Pass], ann: AnnotationFile, out: Path) -> None:
     """Score the merged maps and the baseline; write ``scores.json``.
 
     Args:
-        drives: The drives.
-        merged: The merged map of each drive.
+        passes: The drives with their merged maps.
         ann: The samples, with ground truth.
         out: Folder of the figures.
     """
     instances = read_truth(ann)
+    drives = []
+    merged = []
     truths = []
     baseline = []
-    for drive in drives:
+    for one_pass in passes:
+        drive = one_pass.drive
+        drives.append(drive)
+        merged.append(one_pass.elements)
         truths.append(true_map(read_drive(ann, drive.scene, instances)))
         baseline.append(suppress(drive))
     figures = {
@@ -329,48 +346,156 @@ def score(drives: list[Drive], merged: list[MapElements], ann: AnnotationFile, o
     print(f"figures: {out / 'scores.json'}")
 
 
-def main(argv: list[str] | None = None) -> str:
-    args = parse_args(argv)
-    ann = AnnotationFile(args.ann)
-    check_formats(args, ann)
-    file = SampleFile(args.results, RESULTS_KEY, ann.meta.classes, gaussians=True)
-    results = {token: elements for token, elements, _ in file}
-    if has_truth(ann) and not args.allow_other_split:  # maps are scored
-        require_results_of(ann.meta.split_list, file.about, args.results)
-    config = MergeConfig(
+def place_of(ann: AnnotationFile, scenes: Iterable[str]) -> str:
+    """Name of the map of drives.
+
+    Raises:
+        ValueError: If they lie in different places, or do not exist.
+    """
+    chosen = set(scenes)
+    places = set()
+    for scene, place in zip(ann.column("scene"), ann.column("map_name"), strict=True):
+        if scene in chosen:
+            places.add(place)
+    if len(places) != 1:
+        raise InputError(
+            f"an earlier map or a prior is of one place, and the drives lie in {sorted(places)}: "
+            "choose the drives of one with --scene."
+        )
+    return places.pop()
+
+
+def open_map(path: Path, args: argparse.Namespace, ann: AnnotationFile, place: str) -> MapElements:
+    """Read an earlier map, and print the number of elements that are not used.
+
+    Args:
+        path: GeoJSON or Lanelet2 file.
+        args: The options of the command.
+        ann: The samples, whose classes and global frame the map gets.
+        place: Name of the map of the samples.
+    """
+    classes = ann.meta.classes
+    rule = ClassRule.parse(args.map_classes, classes) if args.map_classes else None
+    file = read_map(path, classes, origin=find_origin(args, ann, place), rule=rule)
+    print(f"{format_count(len(file.elements), 'element')}: {path}")
+    if file.unused:
+        print(f"not used: {describe_unused(file.unused)}")
+    return file.elements
+
+
+def compare(
+    args: argparse.Namespace, ann: AnnotationFile, old: MapElements, passes: list[Pass]
+) -> None:
+    """Write and print the changes since an old map.
+
+    Args:
+        args: The options of the command.
+        ann: The samples.
+        old: Old map in the global frame.
+        passes: The drives with their merged maps.
+    """
+    drive = passes[0].drive
+    found = find_changes(old, passes, merge_config(args))
+    path = args.out / f"{_CHANGES}.geojson"
+    place = drive.frames[0].sample.map_name
+    write_changes(path, found.changes, drive.classes, place=place)
+    origin = find_origin(args, ann, place)
+    if origin is not None:
+        lon_lat_path = args.out / f"{_CHANGES}{_LON_LAT}.geojson"
+        write_changes(lon_lat_path, found.changes, drive.classes, place=place, origin=origin)
+    print(f"changes: {summarize_changes(found)}: {path}")
+
+
+def write_prior(path: Path, place: str, classes: Sequence[str], maps: list[MapElements]) -> None:
+    """Write maps of a place as a prior.
+
+    Args:
+        path: File to create or replace.
+        place: Name of the map.
+        classes: Class names in label order.
+        maps: Maps in the global frame.
+    """
+    from gsmap.prior import MapPrior, PriorSettings
+
+    with MapPrior(PriorSettings(tuple(classes), place)) as prior:
+        for elements in maps:
+            prior.write_map(elements)
+        prior.save(path)
+        print(f"prior of {place}, {format_count(prior.num_tiles, 'tile')}: {path}")
+
+
+def merge_config(args: argparse.Namespace) -> MergeConfig:
+    """Parameters of merging by the options of the command."""
+    return MergeConfig(
         gaussians=not args.no_gaussians,
         min_confidence=args.min_confidence,
         min_area_confidence=args.min_area_confidence,
     )
+
+
+def merge_drives(
+    args: argparse.Namespace, ann: AnnotationFile, scenes: Sequence[str]
+) -> tuple[list[Pass], float]:
+    """Merge drives, and write and print their maps.
+
+    Args:
+        args: The options of the command.
+        ann: The samples.
+        scenes: Names of the drives.
+
+    Returns:
+        Drives with their merged maps, and the processor time of merging in seconds.
+    """
+    file = SampleFile(args.results, RESULTS_KEY, ann.meta.classes, gaussians=True)
+    results = {token: elements for token, elements, _ in file}
+    if has_truth(ann) and not args.allow_other_split:  # maps are scored
+        require_results_of(ann.meta.split_list, file.about, args.results)
     has_poses = ann.meta.options.get("poses", True)
-    if not has_poses and args.formats != ["mp4"]:
-        raise InputError(
-            f"the samples of {args.ann} have no poses, so there is no map of the drive: --formats "
-            "mp4 shows the single frames."
-        )
-    drives = []
-    merged = []
-    processor_s = 0.0
     names = file_names(sorted(set(ann.column("scene"))), ("", _LON_LAT))
-    scenes = args.scene or list(names)
-    own_names = [names[scene] for scene in scenes if scene in names]
-    require_own_files(args, names=own_names, scored=has_truth(ann))
+    if args.out:
+        own_names = [names[scene] for scene in scenes if scene in names]
+        if args.changes and _CHANGES in own_names:
+            raise InputError(f"drive {_CHANGES!r} has the name of the file of --changes.")
+        require_own_files(args, names=own_names, scored=has_truth(ann))
+    passes = []
+    processor_s = 0.0
     for scene in scenes:
         drive = confident(read_drive(ann, scene, results), args.score_thr)
         start_s = time.process_time()
-        elements = merge(drive, config) if has_poses else MapElements.from_polylines()
+        elements = merge(drive, merge_config(args)) if has_poses else MapElements.from_polylines()
         processor_s += time.process_time() - start_s
-        drives.append(drive)
-        merged.append(elements)
-        num_frames = format_count(len(drive.frames), noun="frame")
-        summary = f"{format_count(len(elements), noun='element')} of {num_frames}"
-        for path in write_map(args.out / names[scene], args, ann, drive, elements):
-            print(f"{summary}: {path}")
-    if has_truth(ann):
-        score(drives, merged, ann, args.out)
-    frames = sum(len(drive.frames) for drive in drives)
-    numbers = f"{format_count(len(drives), 'drive')}, {format_count(frames, 'frame')}"
-    return f"{numbers}, merged in {processor_s:.1f} s of processor time"
+        passes.append(Pass(drive, elements))
+        if args.out:
+            elements_text = format_count(len(elements), "element")
+            summary = f"{elements_text} of {format_count(len(drive.frames), 'frame')}"
+            for path in write_map(args.out / names[scene], args, ann, drive, elements):
+                print(f"{summary}: {path}")
+    return passes, processor_s
+
+
+def main(argv: list[str] | None = None) -> str:
+    args = parse_args(argv)
+    ann = AnnotationFile(args.ann)
+    scenes = args.scene or sorted(set(ann.column("scene")))
+    check_options(args, ann)
+    place = place_of(ann, scenes) if args.changes or args.prior else ""
+    old = open_map(args.changes, args, ann, place) if args.changes else None
+    maps = [open_map(args.map, args, ann, place)] if args.map else []
+    passes: list[Pass] = []
+    summary = f"a prior of {place}"
+    if args.results:
+        passes, processor_s = merge_drives(args, ann, scenes)
+        frames = sum(len(one_pass.drive.frames) for one_pass in passes)
+        numbers = f"{format_count(len(passes), 'drive')}, {format_count(frames, 'frame')}"
+        summary = f"{numbers}, merged in {processor_s:.1f} s of processor time"
+        maps += [one_pass.elements for one_pass in passes]
+    if old is not None:
+        compare(args, ann, old, passes)
+    if args.prior:
+        write_prior(args.prior, place, ann.meta.classes, maps)
+    if args.out and has_truth(ann):
+        score(passes, ann, args.out)
+    return summary
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ import pytest
 import shapely
 from drive_cases import CLASSES, X_RANGE, Y_RANGE, drive_of, street
 
-from drivemaps import line_merging
+from drivemaps import line_matching
 from drivemaps.area_merging import merge_areas
 from drivemaps.config import MergeConfig
 from drivemaps.drive import Drive, DriveFrame
@@ -273,7 +273,7 @@ def test_what_a_frame_sees_and_how_often_is_that_of_all_elements_looked_at():
 def test_crossings_that_are_looked_for_in_parts_are_the_same(at_once, monkeypatch):
     drive = drive_of(0.3, scored=True)
     whole = merge(drive)
-    monkeypatch.setattr(line_merging, "_CHUNK_SIZE", at_once)
+    monkeypatch.setattr(line_matching, "_CHUNK_SIZE", at_once)
     parts = merge(drive)
     np.testing.assert_array_equal(whole.points, parts.points)
     np.testing.assert_array_equal(whole.scores, parts.scores)

@@ -10,12 +10,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from drive_cases import CLASSES, drive_of
+import shapely
+import torch
+from drive_cases import CLASSES, curve, drive_of, street
 
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta, MapInstance
 from gsmap.datasets.elements import elements_of_instances
 from gsmap.evaluation.core.results_json import vectors_of, write_results
+from gsmap.prior import MapPrior, PriorSettings
+from gsmap.structures.grid import BEVGrid
 from tools.build_map import main
 
 
@@ -168,3 +172,156 @@ def test_a_folder_or_a_pipe_under_the_name_of_a_map_is_refused(files, tmp_path):
         with pytest.raises(ValueError, match=r"scene\.geojson is there, and no file"):
             main(words)
         os.rename(tmp_path / "scene.geojson", tmp_path / make.__name__)
+
+
+GRID = BEVGrid((-15, 15), (-30, 30), 200, 100)
+
+
+def read_prior(path, place):
+    """Values at a pose of the drive. (C, H, W)"""
+    settings = PriorSettings(CLASSES, place)
+    with MapPrior.load(path, settings) as prior:
+        return prior.read(drive_of().frames[8].sample.global_from_frame, GRID)
+
+
+def assert_street(values):
+    """The lines of the street, and nothing but them, are in a prior."""
+    frame = drive_of().frames[8]
+    for label, value in enumerate(values.numpy()):
+        lines = frame.elements.select(frame.elements.labels == label).polylines
+        shapes = [shapely.LineString(frame.to_frame(line)) for line in lines]
+        if CLASSES[label] == "ped_crossing":
+            shapes = [shapely.Polygon(shape) for shape in shapes]
+        centres = shapely.points(GRID.pixel_centres(dtype=torch.float64).numpy())
+        distance = shapely.distance(shapely.union_all(shapes), centres)
+        # merging may lose a metre at an end or a corner
+        assert (value[distance < 0.05] > 0.5).mean() > 0.95
+        assert not value[distance > 0.9].any()
+
+
+def test_a_prior_of_drives_and_of_their_map_hold_the_street(files, tmp_path, capsys):
+    results, ann = files
+    prior = tmp_path / "town.prior"
+    main([str(results), "--ann", str(ann), "--prior", str(prior)])
+    of_drive = read_prior(prior, "town")
+    assert_street(of_drive)
+    assert os.listdir(tmp_path) == ["town.prior"] or set(os.listdir(tmp_path)) == {
+        "town.prior", ".town.prior.lock",
+    }  # fmt: skip
+    main([str(results), "--ann", str(ann), "--out", str(tmp_path)])
+    other = tmp_path / "map.prior"
+    report = main(
+        ["--map", str(tmp_path / "scene.geojson"), "--ann", str(ann), "--prior", str(other)]
+    )
+    assert report == "a prior of town"
+    of_file = read_prior(other, "town")
+    differ = of_file != of_drive  # the file has tenths of a millimetre
+    assert differ.float().mean() < 1e-3
+    assert re.search(
+        r"6 elements: .*scene.geojson\nprior of town, \d+ tiles: ", capsys.readouterr().out
+    )
+    both = [str(results), "--map", str(tmp_path / "scene.geojson"), "--ann", str(ann)]
+    main([*both, "--prior", str(other)])
+    of_both = read_prior(other, "town")
+    assert (of_both >= of_drive).all()
+    assert of_both.max() > of_drive.max()
+
+
+def test_a_prior_is_made_of_maps_of_other_programs(files, tmp_path, capsys):
+    results, ann = files
+    origin = ["--origin", "48.26", "11.67"]
+    words = [str(results), "--ann", str(ann), "--out", str(tmp_path), *origin]
+    main([*words, "--formats", "geojson", "osm"])
+    content = json.loads((tmp_path / "scene_lonlat.geojson").read_text())
+    del content["crs"], content["generator"]
+    for feature in content["features"]:
+        feature["properties"] = {"kind": "my " + feature["properties"]["class"]}
+    content["features"].append({**feature, "properties": {"kind": "tree"}})
+    (tmp_path / "foreign.geojson").write_text(json.dumps(content))
+    rule = ["--map-classes", "kind", *(f"my {name}={name}" for name in CLASSES)]
+    capsys.readouterr()
+    for name, options in (("scene.osm", []), ("foreign.geojson", [*rule, *origin])):
+        prior = tmp_path / "town.prior"
+        main(["--map", str(tmp_path / name), "--ann", str(ann), "--prior", str(prior), *options])
+        assert_street(read_prior(prior, "town"))
+    assert "not used: 1 x kind 'tree'\n" in capsys.readouterr().out
+
+
+def test_changes_since_an_old_map_are_written(files, tmp_path, capsys):
+    """The old map has no crossing, a shorter divider, one that is gone, and one that moved."""
+    results, ann = files
+    main([str(results), "--ann", str(ann), "--out", str(tmp_path)])
+    content = json.loads((tmp_path / "scene.geojson").read_text())
+    kept = [f for f in content["features"] if f["properties"]["class"] == "boundary"]
+    for offset_m, part in ((0.0, slice(60)), (5.0, slice(10, 50)), (2.5, slice(30))):
+        line = curve(offset_m)[part].tolist()
+        geometry = {"type": "LineString", "coordinates": line}
+        kept.append({"type": "Feature", "geometry": geometry, "properties": {"class": "divider"}})
+    (tmp_path / "old.geojson").write_text(json.dumps({**content, "features": kept}))
+    capsys.readouterr()
+    words = [str(results), "--ann", str(ann), "--out", str(tmp_path), "--origin", "48", "11"]
+    main([*words, "--changes", str(tmp_path / "old.geojson")])
+    assert "changes: 1 removed, 2 added, 1 moved: " in capsys.readouterr().out
+    written = json.loads((tmp_path / "changes.geojson").read_text())
+    assert written["crs"] is None
+    assert written["generator"] == "gsmap"
+    found = {(f["properties"]["class"], f["properties"]["change"]): f for f in written["features"]}
+    assert len(found) == 4
+    for (name, kind), feature in found.items():
+        values = feature["properties"]
+        assert values["map"] == "town"
+        assert values["passes_in_view"] == 1
+        assert values["passes_not_seen" if kind == "removed" else "passes_seen"] == 1
+        assert 0.5 < values["confidence"] <= 1
+        assert feature["geometry"]["type"] == (
+            "Polygon" if name == "ped_crossing" else "LineString"
+        )
+    moved = found["divider", "moved"]
+    assert moved["properties"]["moved_m"] == pytest.approx(1.0, abs=0.02)
+    assert 0 < moved["properties"]["moved_std_m"] < 0.1
+    line = shapely.LineString(curve(-1.0))
+    assert shapely.hausdorff_distance(line & line.buffer(1), line) < 1
+    for point in moved["geometry"]["coordinates"]:
+        assert line.distance(shapely.Point(point)) < 0.05
+    gone = shapely.LineString(found["divider", "removed"]["geometry"]["coordinates"])
+    assert gone.within(shapely.LineString(curve(5.0)).buffer(0.05))
+    longer = shapely.LineString(found["divider", "added"]["geometry"]["coordinates"])
+    assert longer.within(shapely.LineString(curve(2.5)[29:40]).buffer(0.05))
+    assert longer.length == pytest.approx(25, abs=3)
+    crossing = shapely.Polygon(found["ped_crossing", "added"]["geometry"]["coordinates"][0])
+    assert crossing.intersection(shapely.Polygon(street()[5][1])).area > 0.95 * crossing.area
+    degrees = json.loads((tmp_path / "changes_lonlat.geojson").read_text())
+    assert degrees["crs"]["properties"]["name"].endswith("CRS84")
+    main([*words, "--changes", str(tmp_path / "old.geojson")])  # its own files may be replaced
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ([], "give results, or a --map for a --prior"),
+        (["--map", "a.osm"], "--map is for a prior"),
+        (["--map", "a.osm", "--out", "b"], "--changes and --out are for results"),
+        (["r.json"], "--out or --prior must name the output"),
+        (["r.json", "--prior", "p", "--changes", "a.osm"], "--changes goes to the folder --out"),
+        (["r.json", "--out", "b", "--map-classes", "a"], "--map-classes is for"),
+    ],
+)
+def test_words_that_do_not_belong_together_are_named(options, message, capsys):
+    with pytest.raises(SystemExit):
+        main([*options, "--ann", "a.arrow"])
+    assert message in capsys.readouterr().err
+
+
+def test_earlier_maps_of_two_places_and_maps_of_none_are_refused(files, tmp_path):
+    results, ann = files
+    samples = list(AnnotationFile(ann))
+    samples[0] = replace(samples[0], map_name="village", scene="other")
+    write_annotations(tmp_path / "two.arrow", AnnotationMeta("own", "lidar", "val"), samples)
+    words = [str(results), "--ann", str(tmp_path / "two.arrow"), "--prior", str(tmp_path / "p")]
+    with pytest.raises(ValueError, match=r"the drives lie in \['town', 'village'\]: .*--scene"):
+        main(words)
+    main([*words, "--scene", "scene"])
+    with pytest.raises(ValueError, match=r"the drives lie in \[\]"):
+        main([*words, "--scene", "nowhere"])
+    with pytest.raises(ValueError, match="is no map: its name must end in"):
+        main([*words, "--scene", "scene", "--map", str(results.with_suffix(".arrow"))])

@@ -9,7 +9,7 @@ import shapely
 
 from drivemaps.geodetic import MapGrid, MapOrigin
 from gsmap.structures.classes import AREA_CLASSES
-from gsmap.structures.elements import MapElements
+from gsmap.structures.elements import FloatArray, MapElements
 from gsmap.utils.files import write_text
 
 # Longitude and latitude. RFC 7946 allows no other system and has dropped the member ``crs``, but
@@ -37,23 +37,43 @@ def write_geojson(
     """
     features = []
     for line, label, score in elements.rows:
-        name = classes[label]
+        features.append((line, {"class": classes[label], "score": round(score, 4)}))
+    write_features(path, features, origin=origin)
+
+
+def write_features(
+    path: str | Path,
+    features: Sequence[tuple[FloatArray, dict[str, Any]]],
+    origin: MapOrigin | MapGrid | None,
+) -> None:
+    """Write lines and rings with properties as GeoJSON.
+
+    Args:
+        path: File to write.
+        features: Vertices in metres in the global frame, (n, >= 2), and properties of each element;
+            ``class`` is its class. Closed elements of area classes become polygons.
+        origin: Position of the global frame on the Earth, or None for metres.
+
+    Raises:
+        RuntimeError: If an origin is given and ``pyproj`` is missing.
+    """
+    entries = []
+    for line, properties in features:
         if origin is None:
             points = line.round(4).tolist()  # a tenth of a millimetre
         else:
             points = origin.lon_lat(line).round(9).tolist()  # a tenth of a millimetre
-        is_area = name in AREA_CLASSES and points[0] == points[-1]
+        is_area = properties["class"] in AREA_CLASSES and points[0] == points[-1]
         if is_area and not shapely.is_ccw(shapely.LineString(line)):
             points.reverse()
         geometry = {
             "type": "Polygon" if is_area else "LineString",
             "coordinates": [points] if is_area else points,
         }
-        properties = {"class": name, "score": round(score, 4)}
-        features.append({"type": "Feature", "properties": properties, "geometry": geometry})
+        entries.append({"type": "Feature", "properties": properties, "geometry": geometry})
     crs = None if origin is None else _CRS84
     collection: dict[str, Any] = {"type": "FeatureCollection", "generator": "gsmap", "crs": crs}
     if origin is None:
         collection["frame"] = "global frame of the poses, metres"
-    collection["features"] = features
+    collection["features"] = entries
     write_text(path, json.dumps(collection, indent=1, allow_nan=False) + "\n")

@@ -1,0 +1,263 @@
+"""Changes of the areas of one class."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+
+from drivemaps.change import (
+    ADDED,
+    MIN_VIEWS,
+    MOVED,
+    REMOVED,
+    Change,
+    Pass,
+    Shift,
+    on_known_ground,
+    smooth_share,
+    views_of_passes,
+)
+from drivemaps.config import MergeConfig
+from drivemaps.drive import Drive, DriveFrame
+from drivemaps.truth import polygons_of
+from gsmap.structures.elements import BoolArray, FloatArray, MapElements
+
+_MIN_OVERLAP = 0.3  # smallest shared part, of the smaller area, of two areas of one object
+_MIN_SHARE = 0.8  # of the outline of an area that is in view
+_MIN_MOVE_M = 0.75
+_MIN_FRAMES = 3  # with a detection of an area that has moved
+_STEP_M = 1.0  # largest distance of points of an outline
+
+
+@dataclass(frozen=True, eq=False)
+class _Detections:
+    """Areas that a frame predicts.
+
+    Args:
+        drive: Drive of the frame.
+        frame: The frame.
+        areas: Polygons in the global frame.
+        scores: Score of each area, in [0, 1].
+        variances: Mean variance of the vertices of each area, in square metres.
+    """
+
+    drive: Drive
+    frame: DriveFrame
+    areas: list[shapely.Geometry]
+    scores: list[float]
+    variances: list[float]
+
+
+def area_changes(
+    old: MapElements, passes: list[Pass], label: int, config: MergeConfig
+) -> list[Change]:
+    """Find the changes of the areas of one class.
+
+    Args:
+        old: Old map in the global frame.
+        passes: Drives past the place.
+        label: Index of the class.
+        config: Parameters of merging, for the variances of predictions.
+
+    Returns:
+        Removed, moved and added areas.
+    """
+    old_areas = _areas_of(old, label)
+    new_areas = [_areas_of(one_pass.elements, label) for one_pass in passes]
+    detections = _detections(passes, label=label, config=config)
+    changes = []
+    for area in old_areas:
+        outline = _outline(area)
+        in_view = _passes_in_view(outline, passes)
+        is_seen = np.array([_overlaps(area, areas) for areas in new_areas])
+        num_in_view = int(in_view.sum())
+        num_missing = int((in_view & ~is_seen).sum())
+        views, found = _views_of(outline, area=area, detections=detections)
+        if 2 * num_missing > num_in_view:
+            num_without = views - sum(score for _, score, _ in found)
+            change = Change(
+                REMOVED,
+                label,
+                line=shapely.get_coordinates(area.exterior),
+                confidence=smooth_share(num_without, views),
+                passes_in_view=num_in_view,
+                num_passes=num_missing,
+            )
+            changes.append(change)
+        elif num_in_view and len(found) >= _MIN_FRAMES:
+            new_area = _largest_overlap(area, new_areas)
+            shift = _shift_of(area, found)
+            if new_area is None or not shift.exceeds(_MIN_MOVE_M):
+                continue
+            share = smooth_share(sum(score for _, score, _ in found), views)
+            change = Change(
+                MOVED,
+                label,
+                line=shapely.get_coordinates(new_area.exterior),
+                confidence=share * shift.probability(_MIN_MOVE_M),
+                passes_in_view=num_in_view,
+                num_passes=num_in_view - num_missing,
+                moved_m=shift.mean_m,
+                moved_std_m=shift.std_m,
+            )
+            changes.append(change)
+    return changes + _added(old, passes, label=label, new_areas=new_areas)
+
+
+def _added(
+    old: MapElements, passes: list[Pass], label: int, new_areas: list[list[shapely.Polygon]]
+) -> list[Change]:
+    """Find areas in the maps of the passes that the old map does not have.
+
+    Args:
+        old: Old map in the global frame.
+        passes: Drives past the place.
+        label: Index of the class.
+        new_areas: Areas of the class in the map of each pass.
+    """
+    known_areas = _areas_of(old, label)
+    changes = []
+    for one_pass in passes:
+        elements = one_pass.elements.select(one_pass.elements.labels == label)
+        for line, _, score in elements.rows:
+            for area in _polygons([line]):
+                outline = _outline(area)
+                if _overlaps(area, known_areas) or not on_known_ground(outline, old).any():
+                    continue
+                in_view = _passes_in_view(outline, passes)
+                is_seen = np.array([_overlaps(area, areas) for areas in new_areas])
+                num_seen = int((in_view & is_seen).sum())
+                if 2 * num_seen <= in_view.sum():
+                    continue
+                views = float(views_of_passes(outline, passes).sum(axis=0).mean())
+                change = Change(
+                    ADDED,
+                    label,
+                    line=shapely.get_coordinates(area.exterior),
+                    confidence=smooth_share(score * views, views),
+                    passes_in_view=int(in_view.sum()),
+                    num_passes=num_seen,
+                )
+                changes.append(change)
+                known_areas.append(area)
+    return changes
+
+
+def _polygons(rings: list[FloatArray]) -> list[shapely.Polygon]:
+    """Convert rings to valid polygons, the parts of a ring that crosses itself apart."""
+    polygons = []
+    for part in shapely.get_parts(np.array(polygons_of(rings), dtype=object)):
+        if isinstance(part, shapely.Polygon):
+            polygons.append(part)
+    return polygons
+
+
+def _areas_of(elements: MapElements, label: int) -> list[shapely.Polygon]:
+    """Areas of one class of a map."""
+    lines = elements.select(elements.labels == label).polylines
+    return _polygons([line[:, :2] for line in lines])
+
+
+def _outline(area: shapely.Polygon) -> FloatArray:
+    """Points of the outline of an area, at most 1 m apart. (n, 2)"""
+    return shapely.get_coordinates(shapely.segmentize(area.exterior, _STEP_M))
+
+
+def _overlaps(area: shapely.Polygon, others: list[shapely.Polygon]) -> bool:
+    """Whether an area and any other one are one object."""
+    return bool(_shared_shares(area, others).max(initial=0.0) >= _MIN_OVERLAP)
+
+
+def _shared_shares(area: shapely.Polygon, others: list[shapely.Polygon]) -> FloatArray:
+    """Shared part of the smaller area with each other area. (n,)"""
+    shapes = np.array(others, dtype=object)
+    shared_m2 = shapely.area(shapely.intersection(area, shapes))
+    smaller_m2 = np.minimum(area.area, shapely.area(shapes))
+    shares: FloatArray = shared_m2 / np.maximum(smaller_m2, 1e-9)
+    return shares
+
+
+def _largest_overlap(
+    area: shapely.Polygon, areas_of_passes: list[list[shapely.Polygon]]
+) -> shapely.Polygon | None:
+    """Area of the passes with the largest shared part; None if none is the same object."""
+    best = None
+    largest_share = _MIN_OVERLAP
+    for areas in areas_of_passes:
+        for other, share in zip(areas, _shared_shares(area, areas).tolist(), strict=True):
+            if share >= largest_share:
+                best = other
+                largest_share = share
+    return best
+
+
+def _passes_in_view(outline: FloatArray, passes: list[Pass]) -> BoolArray:
+    """Whether each pass has an outline in view. (n, 2) -> (passes,)"""
+    is_in_view = views_of_passes(outline, passes) >= MIN_VIEWS
+    in_view: BoolArray = is_in_view.mean(axis=1) >= _MIN_SHARE
+    return in_view
+
+
+def _detections(passes: list[Pass], label: int, config: MergeConfig) -> list[_Detections]:
+    """Areas that the frames of all passes predict."""
+    detections = []
+    for one_pass in passes:
+        for frame in one_pass.drive.frames:
+            elements = frame.elements
+            vertex_variances = config.variances(frame)
+            areas = []
+            scores = []
+            variances = []
+            for index in np.flatnonzero(elements.labels == label).tolist():
+                vertices = slice(elements.offsets[index], elements.offsets[index + 1])
+                for area in polygons_of([elements.points[vertices]]):
+                    areas.append(area)
+                    scores.append(float(elements.confidence[index]))
+                    variances.append(float(vertex_variances[vertices].mean()))
+            entry = _Detections(
+                one_pass.drive, frame, areas=areas, scores=scores, variances=variances
+            )
+            detections.append(entry)
+    return detections
+
+
+Found = tuple[FloatArray, float, float]
+"""Centre of a detection, its score and its variance."""
+
+
+def _views_of(
+    outline: FloatArray, area: shapely.Polygon, detections: list[_Detections]
+) -> tuple[int, list[Found]]:
+    """Count the frames that have a whole area in range, and find their detections of it.
+
+    Args:
+        outline: Points of the outline. (n, 2)
+        area: The area.
+        detections: Predicted areas of all frames of the passes.
+
+    Returns:
+        Number of frames, and the best detection of each frame with one.
+    """
+    views = 0
+    found = []
+    for entry in detections:
+        if not entry.drive.sees(entry.frame, outline).all():
+            continue
+        views += 1
+        shares = _shared_shares(area, entry.areas)
+        if shares.max(initial=0.0) >= _MIN_OVERLAP:
+            best = int(shares.argmax())
+            centre = shapely.get_coordinates(entry.areas[best].centroid)[0]
+            found.append((centre, entry.scores[best], entry.variances[best]))
+    return views, found
+
+
+def _shift_of(area: shapely.Polygon, found: list[Found]) -> Shift:
+    """Mean shift of the centres of detections from the centre of an area."""
+    centre = shapely.get_coordinates(area.centroid)[0]
+    shifts = np.array([position for position, _, _ in found]) - centre  # (F, 2)
+    variances = np.array([variance for _, _, variance in found])
+    weights = np.array([score for _, score, _ in found]) / variances
+    mean = weights @ shifts / weights.sum()
+    direction = mean / max(float(np.linalg.norm(mean)), 1e-9)
+    return Shift.of_frames(shifts @ direction, variances=variances, weights=weights)

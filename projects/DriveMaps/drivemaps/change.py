@@ -1,0 +1,161 @@
+"""Changes of a place between an old map and later drives, and rules of all their kinds."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import shapely
+from scipy.special import ndtr
+
+from drivemaps.drive import Drive
+from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
+
+REMOVED = "removed"
+ADDED = "added"
+MOVED = "moved"
+KINDS = (REMOVED, ADDED, MOVED)
+"""Kinds of changes."""
+MIN_VIEWS = 5
+"""Smallest number of frames of a pass that have a point in range, for the point to be in view."""
+_NEW_GROUND_M = 30.0  # distance from all elements of the old map
+_PRIOR_VIEWS = 2.0  # pseudo-count of frames against a change
+_MAP_SIGMA_M = 0.2  # error of a map that all frames share
+_MOST_SIGMAS = 3.0  # smallest shift in standard errors
+
+
+@dataclass(frozen=True, eq=False)
+class Pass:
+    """A drive past a place.
+
+    Args:
+        drive: Frames with their predictions.
+        elements: Map of the drive in the global frame.
+    """
+
+    drive: Drive
+    elements: MapElements
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """An element, or a part of a line, that differs from the old map.
+
+    Args:
+        kind: ``removed``, ``added`` or ``moved``.
+        label: Index of the class.
+        line: Vertices in metres in the global frame, closed for areas: of the old map for
+            ``removed``, otherwise the new position. (n, 2)
+        confidence: Confidence in [0, 1].
+        passes_in_view: Number of passes that have the place in view.
+        num_passes: Number of these passes that do not see a removed element, or see another one.
+        moved_m: Distance in metres by which it moved, across a line or of the centre of an area;
+            None for other kinds.
+        moved_std_m: Standard error of the distance in metres, or None.
+    """
+
+    kind: str
+    label: int
+    line: FloatArray
+    confidence: float
+    passes_in_view: int
+    num_passes: int
+    moved_m: float | None = None
+    moved_std_m: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Changes:
+    """Changes of a place.
+
+    Args:
+        changes: Changes by class, then by kind.
+        num_on_new_ground: Number of elements of the passes that are far from the old map, by class.
+            They are no changes.
+        num_not_in_view: Number of elements of the old map without a part in view, by class.
+    """
+
+    changes: list[Change]
+    num_on_new_ground: dict[str, int] = field(default_factory=dict)
+    num_not_in_view: dict[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Shift:
+    """Mean distance between new and old positions.
+
+    Args:
+        mean_m: Mean over the frames, weighted by score over variance, in metres.
+        std_m: Standard error in metres: the larger one of the error by the variances of the
+            frames and of the error by their scatter. Both take frames as independent.
+    """
+
+    mean_m: float
+    std_m: float
+
+    @classmethod
+    def of_frames(
+        cls, distances: FloatArray, variances: FloatArray, weights: FloatArray
+    ) -> "Shift":
+        """Compute the mean over frames and its error.
+
+        Args:
+            distances: Distance in each frame, in metres. (F,)
+            variances: Variance of each distance in square metres. (F,)
+            weights: Weight of each frame. (F,)
+        """
+        shares = weights / weights.sum()
+        mean_m = float(shares @ distances)
+        by_variances = float(shares**2 @ variances)
+        by_scatter = float(shares**2 @ (distances - mean_m) ** 2)
+        return cls(mean_m, std_m=max(by_variances, by_scatter) ** 0.5)
+
+    def exceeds(self, smallest_m: float) -> bool:
+        """Whether the shift is larger than a distance and than three standard errors."""
+        return abs(self.mean_m) >= max(smallest_m, _MOST_SIGMAS * self.std_m)
+
+    def probability(self, smallest_m: float) -> float:
+        """Probability that the shift exceeds a distance, with an error that all frames share."""
+        sigma = float(np.hypot(self.std_m, _MAP_SIGMA_M))
+        return float(ndtr((abs(self.mean_m) - smallest_m) / sigma))
+
+
+def smooth_share(support: float, views: float) -> float:
+    """Share of the frames that support a change, with two frames against it as a prior."""
+    return float(np.clip(support / (views + _PRIOR_VIEWS), 0, 1))
+
+
+def views_of_passes(points: FloatArray, passes: list[Pass]) -> IntArray:
+    """Count the frames of each pass that have points in range. (M, 2) -> (passes, M)"""
+    if not len(points):
+        return np.zeros((len(passes), 0), np.int64)
+    counts = []
+    for one_pass in passes:
+        counts.append(one_pass.drive.times_seen(points))
+    return np.stack(counts)
+
+
+def near_lines(points: FloatArray, lines: list[FloatArray], within_m: float) -> BoolArray:
+    """Find the points near any line.
+
+    Args:
+        points: Points in metres. (M, 2)
+        lines: Vertices of lines or rings in metres. N x (n, >= 2)
+        within_m: Largest distance in metres.
+
+    Returns:
+        True for points within the distance. (M,)
+    """
+    shapes = []
+    for line in lines:
+        if len(line) > 1:
+            shapes.append(shapely.LineString(line[:, :2]))
+    is_near = np.zeros(len(points), dtype=np.bool_)
+    if shapes and len(points):
+        tree = shapely.STRtree(shapes)
+        pairs = tree.query(shapely.points(points), predicate="dwithin", distance=within_m)
+        is_near[pairs[0]] = True
+    return is_near
+
+
+def on_known_ground(points: FloatArray, old: MapElements) -> BoolArray:
+    """Find the points within 30 m of an element of the old map. (M, 2) -> (M,)"""
+    return near_lines(points, old.polylines, within_m=_NEW_GROUND_M)

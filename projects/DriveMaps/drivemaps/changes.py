@@ -1,0 +1,136 @@
+"""Changes of a place between an old map and later drives, and their file.
+
+Each drive is a pass. A point is in view of a pass if at least five frames have it in range, and an
+element of the old map is seen if the map of the pass has an element of its class there. A change
+needs more than half of the passes that have it in view.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from drivemaps.area_changes import area_changes
+from drivemaps.change import (
+    KINDS,
+    MIN_VIEWS,
+    MOVED,
+    REMOVED,
+    Change,
+    Changes,
+    Pass,
+    on_known_ground,
+    views_of_passes,
+)
+from drivemaps.config import MergeConfig
+from drivemaps.geodetic import MapGrid, MapOrigin
+from drivemaps.geojson import write_features
+from drivemaps.line_changes import line_changes
+from gsmap.structures.classes import AREA_CLASSES
+from gsmap.structures.elements import MapElements
+
+
+def find_changes(
+    old: MapElements, passes: Sequence[Pass], config: MergeConfig | None = None
+) -> Changes:
+    """Find the elements of a place that were removed, added or moved.
+
+    * Removed: a part of at least 5 m of an old line, or an old area, that most passes in view do
+      not see.
+    * Added: such a part of a line, or an area, in the map of a pass, of which the old map has no
+      element of the class within 1.5 m, or no area that shares 30 percent. The old map must have an
+      element of any class within 30 m.
+    * Moved: such a part of an old line whose predictions lie at least 0.5 m beside it on one side,
+      or an old area whose centre moved by at least 0.75 m, and by at least three standard errors.
+
+    Args:
+        old: Old map in the global frame.
+        passes: Drives past the place with their maps, with equal classes.
+        config: Parameters of merging; ``MergeConfig()`` by default.
+
+    Returns:
+        Changes, and numbers of elements that are not compared.
+    """
+    config = config or MergeConfig()
+    passes = list(passes)
+    classes = passes[0].drive.classes
+    changes: list[Change] = []
+    for label, name in enumerate(classes):
+        changes_of_class = area_changes if name in AREA_CLASSES else line_changes
+        changes += changes_of_class(old, passes, label, config)
+    changes.sort(key=lambda change: (change.label, KINDS.index(change.kind), -change.confidence))
+    num_on_new_ground: Counter[str] = Counter()
+    for one_pass in passes:
+        for line, label, _ in one_pass.elements.rows:
+            if not on_known_ground(line, old).any():
+                num_on_new_ground[classes[label]] += 1
+    num_not_in_view: Counter[str] = Counter()
+    views = views_of_passes(old.points[:, :2], passes).max(axis=0)
+    for index, label in enumerate(old.labels.tolist()):
+        vertices = slice(old.offsets[index], old.offsets[index + 1])
+        if views[vertices].max(initial=0) < MIN_VIEWS:
+            num_not_in_view[classes[label]] += 1
+    return Changes(changes, dict(num_on_new_ground), num_not_in_view=dict(num_not_in_view))
+
+
+def write_changes(
+    path: str | Path,
+    changes: Sequence[Change],
+    classes: Sequence[str],
+    place: str,
+    origin: MapOrigin | MapGrid | None = None,
+) -> None:
+    """Write changes as GeoJSON, a feature each.
+
+    The properties of a feature are ``class``, ``change`` (``removed``, ``added`` or ``moved``),
+    ``map``, ``confidence``, ``passes_in_view``, and ``passes_not_seen`` of removed or ``passes_seen`` of
+    other changes. Moved elements have ``moved_m`` and its standard error ``moved_std_m``.
+
+    Args:
+        path: File to write.
+        changes: Changes in the global frame.
+        classes: Class names in label order.
+        place: Name of the map, which is the property ``map``.
+        origin: Position of the global frame on the Earth; without one, coordinates are metres.
+
+    Raises:
+        RuntimeError: If an origin is given and ``pyproj`` is missing.
+    """
+    features = []
+    for change in changes:
+        counted = "passes_not_seen" if change.kind == REMOVED else "passes_seen"
+        properties: dict[str, Any] = {
+            "class": classes[change.label],
+            "change": change.kind,
+            "map": place,
+            "confidence": round(change.confidence, 4),
+            "passes_in_view": change.passes_in_view,
+            counted: change.num_passes,
+        }
+        if change.kind == MOVED and change.moved_m is not None and change.moved_std_m is not None:
+            properties["moved_m"] = round(change.moved_m, 4)
+            properties["moved_std_m"] = round(change.moved_std_m, 4)
+        features.append((change.line, properties))
+    write_features(path, features, origin=origin)
+
+
+def summarize_changes(found: Changes) -> str:
+    """Describe the number of changes of each kind, and of the elements that are not compared.
+
+    Args:
+        found: Changes of a place.
+
+    Returns:
+        One line, such as ``2 removed, 0 added, 1 moved (not compared: 3 on new ground)``.
+    """
+    counts = Counter(change.kind for change in found.changes)
+    text = ", ".join(f"{counts[kind]} {kind}" for kind in KINDS)
+    apart = []
+    for names, reason in (
+        (found.num_on_new_ground, "on new ground"),
+        (found.num_not_in_view, "of the old map not in view"),
+    ):
+        if names:
+            numbers = ", ".join(f"{count} {name}" for name, count in sorted(names.items()))
+            apart.append(f"{numbers} {reason}")
+    return f"{text} (not compared: {'; '.join(apart)})" if apart else text
