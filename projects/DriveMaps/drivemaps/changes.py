@@ -84,7 +84,8 @@ def write_changes(
 
     The properties of a feature are ``class``, ``change`` (``removed``, ``added`` or ``moved``),
     ``map``, ``confidence``, ``passes_in_view``, and ``passes_not_seen`` of removed elements or
-    ``passes_seen`` of others. Moved elements have ``moved_m`` and its standard error ``moved_std_m``.
+    ``passes_seen`` of others. Moved elements have ``moved_m`` and its standard error
+    ``moved_std_m``.
 
     Args:
         path: File to write.
