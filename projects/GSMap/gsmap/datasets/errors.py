@@ -28,7 +28,8 @@ _CONTENT_ERRORS = (
 def explain_errors(subject: object, remedy: str) -> Iterator[None]:
     """Context manager that adds the name of a file and a remedy to errors about its content.
 
-    Errors of the system, such as a lack of memory, and errors with the name pass unchanged.
+    Errors of the system, such as a lack of memory, and errors whose message contains the name pass
+    unchanged.
 
     Args:
         subject: Path or name of the data, the beginning of the message.
@@ -41,9 +42,10 @@ def explain_errors(subject: object, remedy: str) -> Iterator[None]:
         yield
     except Exception as error:
         from_devkit = type(error) is Exception  # nuScenes' devkit raises no subclass
-        from_arrow = type(error) is OSError and error.errno is None
-        about_content = isinstance(error, _CONTENT_ERRORS) or from_devkit or from_arrow
-        if is_of_the_machine(error) or not about_content or str(subject) in str(error):
+        from_arrow = type(error) is OSError and error.errno is None  # Arrow, for a damaged file
+        is_about_content = isinstance(error, _CONTENT_ERRORS) or from_devkit or from_arrow
+        has_name = str(subject) in str(error)
+        if has_name or not is_about_content or is_of_the_machine(error):
             raise
         reason = str(error)
         if isinstance(error, KeyError):

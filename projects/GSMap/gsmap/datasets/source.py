@@ -166,7 +166,8 @@ def change_frame(
     Args:
         sample: Sample.
         frame: Annotation frame of the sample, ``lidar`` or ``ego``.
-        wanted: Annotation frame of the result, with the usual place in the vehicle for a name.
+        wanted: Annotation frame of the result. A name, ``lidar`` or ``ego``, stands for a frame at
+            the usual place in the vehicle.
         ground_z_m: Height of the road in ``frame`` in metres, as in ``AnnotationMeta``.
 
     Returns:

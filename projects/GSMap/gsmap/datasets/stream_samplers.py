@@ -96,8 +96,8 @@ class StreamTrainSampler(Sampler[int]):
         single_frame_iters: Number of iterations with single frames.
         pieces: Number of pieces that a scene is cut into.
         late_switch: Whether a scene switches to pieces only after all of its single frames, as in
-            the released code. Half of the samples then continue a piece at 1.6 times
-            ``single_frame_iters`` iterations.
+            the released code of StreamMapNet. The scenes then switch at different times: after 1.6
+            times ``single_frame_iters`` iterations, half of the samples come from pieces.
         seed: Seed of the random numbers, equal on all ranks; None for 0.
 
     Raises:
@@ -139,7 +139,7 @@ class StreamTrainSampler(Sampler[int]):
 
     def __iter__(self) -> Iterator[int]:
         start = self.epoch * self.iters_per_epoch
-        # The streams are replayed from the first epoch, so that no state has to be saved.
+        # All batches of earlier epochs are drawn again, so that no state has to be saved.
         for batch in islice(self.batches(), start, start + self.iters_per_epoch):
             yield from batch
 
@@ -167,7 +167,10 @@ class StreamTrainSampler(Sampler[int]):
             yield [queue.popleft() for queue in queues]
 
     def _scene_order(self, stream: int) -> Iterator[int]:
-        """Yield the numbers of the scenes of a stream; a number that repeats is skipped once."""
+        """Yield the numbers of the scenes of a stream.
+
+        A scene that would follow itself, at the border of two permutations, is skipped once.
+        """
         previous = -1
         num_streams = self.slots * self.num_ranks
         for number in islice(self._permutations(), stream, None, num_streams):

@@ -110,7 +110,12 @@ class VectorizedMapDataset(BaseDataset):
             raise InputError("broken_samples='skip' is for training: a test must see every sample.")
         if indices is not None and not indices:
             raise InputError(f"indices must leave at least one sample, got {indices!r}.")
-        extent = None if grid is None else BEVGrid(**grid)
+        x_range = None
+        y_range = None
+        if grid is not None:
+            extent = BEVGrid(**grid)
+            x_range = extent.x_range
+            y_range = extent.y_range
         self.cameras = None if cameras is None else tuple(cameras)
         self.broken_samples = broken_samples
         self.broken_tokens: dict[str, str] = {}
@@ -121,11 +126,11 @@ class VectorizedMapDataset(BaseDataset):
         self._broken_in_a_row = 0
         self._expected = {
             "classes": None if classes is None else tuple(classes),
-            "x_range": extent and extent.x_range,
-            "y_range": extent and extent.y_range,
+            "x_range": x_range,
+            "y_range": y_range,
             "split": split,
             "frame": frame,
-            "dim": 3 if dim == 3 else None,
+            "dim": 3 if dim == 3 else None,  # for dim 2, heights in the file are left out
             "crossings": crossings,
         }
         self._dim = dim
@@ -197,7 +202,11 @@ class VectorizedMapDataset(BaseDataset):
         for camera in cameras:
             if self.cameras is not None and camera.name not in self.cameras:
                 continue
-            fx, fy, cx, cy = camera.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+            matrix = camera.intrinsics.tolist()
+            fx = matrix[0][0]
+            fy = matrix[1][1]
+            cx = matrix[0][2]
+            cy = matrix[1][2]
             rig[camera.name] = [float(camera.width), float(camera.height), fx, fy, cx, cy]
         return rig
 

@@ -95,7 +95,8 @@ class GaussianMetric(BaseMetric):
             vertices = torch.from_numpy(line[None, :, :2].astype(np.float32))
             gt_masks.append(draw_polylines(vertices, grid, width_m=LINE_WIDTH_M))
         iou = pairwise_soft_iou(masks, torch.cat(gt_masks)).numpy()
-        return iou[linear_sum_assignment(-iou)]
+        pred_index, gt_index = linear_sum_assignment(-iou)
+        return iou[pred_index, gt_index]
 
     def compute_metrics(self, results: list[tuple[str, Any]]) -> dict[str, float]:
         """Average over all samples and log a table.

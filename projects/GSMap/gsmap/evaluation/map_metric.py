@@ -132,6 +132,7 @@ class MapMetric(BaseMetric):
         Returns:
             Figures by their flat keys.
         """
+        # Samples that fill the last batch of a rank are repetitions: the first record counts.
         unique = {record["token"]: record for record in reversed(results)}
         records = [unique[token] for token in sorted(unique)]
         if len(records) != self._size:

@@ -89,7 +89,8 @@ def fit_piece(points: Points, degree: int) -> Float:
         Control points in metres. (degree + 1, D)
     """
     controls = _inverse(degree) @ resample(points, SAMPLES)
-    controls[[0, -1]] = points[[0, -1]]
+    controls[0] = points[0]
+    controls[-1] = points[-1]
     return controls
 
 
@@ -144,16 +145,17 @@ def _fit_test(degree: int, max_error_m: float, deviation: Deviation) -> Callable
         curve = curve_points(fit_piece(part, degree), degree)
         return deviation(part, curve) < max_error_m
 
-    def fits_compiled(part: Float) -> bool:
-        error_m = deviation_of_fit(_in_plane(part), inverse, weights=weights, enough=max_error_m)
-        return bool(error_m < max_error_m)
-
     if deviation is not largest_deviation:
         return fits
     from gsmap.structures.curve_kernels import deviation_of_fit
 
     inverse = _inverse(degree)
     weights = bernstein(degree)
+
+    def fits_compiled(part: Float) -> bool:
+        error_m = deviation_of_fit(_in_plane(part), inverse, weights=weights, enough=max_error_m)
+        return bool(error_m < max_error_m)
+
     return fits_compiled
 
 
@@ -193,13 +195,13 @@ def fit_joints(
     joints = [0]
     while joints[-1] < last:
         start = joints[-1]
-        end = last
+        end = last  # the longest piece is tried first
         while end > start + 1 and work > 0:
             work -= end - start + SAMPLES
             if fits(points[start : end + 1]):
                 break
             end -= 1
-        if work <= 0:
+        if work <= 0:  # the limit is reached: double the length instead
             end = start + 1
             farther = min(start + 2, last)
             while end < farther and fits(points[start : farther + 1]):
@@ -221,8 +223,11 @@ def controls_between(points: Points, joints: Sequence[int], degree: int) -> Floa
         Control points in metres. (k * degree + 1, D)
     """
     points = np.asarray(points, dtype=np.float64)
-    pieces = [fit_piece(points[a : b + 1], degree)[1:] for a, b in pairwise(joints)]
-    return np.concatenate([points[:1], *pieces])
+    controls = [points[:1]]
+    for start, end in pairwise(joints):
+        piece = fit_piece(points[start : end + 1], degree)
+        controls.append(piece[1:])  # the first control point is the end of the previous piece
+    return np.concatenate(controls)
 
 
 def fit_pieces(

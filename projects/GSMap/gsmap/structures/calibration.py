@@ -119,6 +119,11 @@ def _frame_from_ground(ego_from_frame: NDArray[np.floating[Any]]) -> NDArray[np.
 
     (4, 4) -> (4, 4)
     """
+    # With the third row (a, b, c, d), the plane is a x + b y + c z + d = 0 in the annotation frame,
+    # that is z = -(a x + b y + d) / c. The height above it is added to this z.
+    a, b, c, d = ego_from_frame[2]
     transform = np.eye(4)
-    transform[2, [0, 1, 3]] = -ego_from_frame[2, [0, 1, 3]] / ego_from_frame[2, 2]
+    transform[2, 0] = -a / c
+    transform[2, 1] = -b / c
+    transform[2, 3] = -d / c
     return transform

@@ -44,26 +44,27 @@ def largest_distance(points: Float, line: Float, enough: float) -> float:
     Returns:
         Largest distance in metres, or a distance of at least ``enough``.
     """
-    largest = 0.0
+    largest_squared = 0.0
     for p in range(len(points)):
         x = points[p, 0]
         y = points[p, 1]
-        nearest = np.inf
+        nearest_squared = np.inf
         for s in range(len(line) - 1):
             along_x = line[s + 1, 0] - line[s, 0]
             along_y = line[s + 1, 1] - line[s, 1]
             to_x = x - line[s, 0]
             to_y = y - line[s, 1]
-            length = along_x * along_x + along_y * along_y
-            share = (to_x * along_x + to_y * along_y) / length if length > 0.0 else 0.0
+            squared = along_x * along_x + along_y * along_y
+            # Position of the nearest point of the segment, from 0 at its start to 1 at its end.
+            share = (to_x * along_x + to_y * along_y) / squared if squared > 0.0 else 0.0
             share = min(max(share, 0.0), 1.0)
-            to_x = to_x - share * along_x
-            to_y = to_y - share * along_y
-            nearest = min(nearest, to_x * to_x + to_y * to_y)
-        largest = max(largest, nearest)
-        if largest >= enough * enough:
+            off_x = to_x - share * along_x
+            off_y = to_y - share * along_y
+            nearest_squared = min(nearest_squared, off_x * off_x + off_y * off_y)
+        largest_squared = max(largest_squared, nearest_squared)
+        if largest_squared >= enough * enough:
             break
-    return math.sqrt(largest)
+    return math.sqrt(largest_squared)
 
 
 @njit(cache=True)

@@ -209,8 +209,9 @@ class MapElements:
         rows = np.flatnonzero(index) if index.dtype == np.bool_ else np.asarray(index)
         counts = self.num_points[rows]
         offsets = np.append(0, np.cumsum(counts))
+        # The vertices of a selected element move from ``self.offsets`` to ``offsets``.
         shifts = np.repeat(self.offsets[rows] - offsets[:-1], counts)
-        vertices = shifts + np.arange(offsets[-1])
+        vertices = shifts + np.arange(offsets[-1])  # indices of the selected vertices
         return MapElements(
             points=self.points[vertices],
             offsets=offsets,

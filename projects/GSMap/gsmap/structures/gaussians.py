@@ -185,21 +185,23 @@ class GaussianSpace:
         )
         stretch = scales / start
         theta = reference[..., -1:]
-        ratio = (cell_m[0] / cell_m[1], cell_m[1] / cell_m[0])
+        # Factors of the entries off the diagonal, for offsets in cells that are not square.
+        x_per_y = cell_m[0] / cell_m[1]
+        y_per_x = cell_m[1] / cell_m[0]
         along_x = self.grid.forward == "x"
         if invariant:
             cos, sin = self._double_angle(theta).split(1, dim=-1)
             middle = (stretch[..., :1] + stretch[..., 1:]) / 2
             half = (stretch[..., :1] - stretch[..., 1:]) / 2
             cross = half * sin
-            entries = [middle + half * cos, cross * ratio[1], cross * ratio[0], middle - half * cos]
+            entries = [middle + half * cos, cross * y_per_x, cross * x_per_y, middle - half * cos]
             return torch.cat(entries, dim=-1).unflatten(-1, (2, 2))
         # Theta is the angle from the direction of travel. The products of both stretches with its
         # cosine and sine are the entries of R D, and a constant matrix rotates and scales them.
         turn = _cos_and_sin(theta, factor=1.0, shift_rad=0.0)
         products = (stretch[..., :, None] * turn[..., None, :]).flatten(-2)
-        first = [(1, 0, 0, 0), (0, 0, ratio[0], 0)]
-        second = [(0, 0, 0, 1), (0, -ratio[1], 0, 0)]
+        first = [(1, 0, 0, 0), (0, 0, x_per_y, 0)]
+        second = [(0, 0, 0, 1), (0, -y_per_x, 0, 0)]
         rows = [*first, *second] if along_x else [*second, *first]
         return (products @ constant(products, rows)).unflatten(-1, (2, 2))
 
@@ -253,6 +255,8 @@ def with_covariances(means: Tensor, covariances: Tensor, near: Tensor) -> Gaussi
     near = near.detach()  # the covariance does not depend on it
     frame = _rotation_matrices(near)
     local = frame.transpose(-1, -2) @ covariances @ frame
+    # The matrix [[middle + half, cross], [cross, middle - half]] has the eigenvalues
+    # middle + radius and middle - radius, and its first axis is at half the angle of (half, cross).
     middle = (local[..., 0, 0] + local[..., 1, 1]) / 2
     half = (local[..., 0, 0] - local[..., 1, 1]) / 2
     cross = (local[..., 0, 1] + local[..., 1, 0]) / 2
@@ -285,6 +289,7 @@ def move_gaussians(
     Returns:
         Gaussians in the other frame. (B, ...)
     """
+    # Values of each sample are repeated over the other dimensions of the Gaussians.
     shape = (-1, *[1] * (gaussians.rotations.dim() - 1))
     turn = motion[:, :2, :2].to(gaussians.means).view((*shape, 2, 2))
     shift = motion[:, :2, 3].to(gaussians.means).view((*shape, 2))
@@ -317,8 +322,10 @@ def fuse_gaussians(first: Gaussians, second: Gaussians) -> Gaussians:
     total = covariance_1 + covariance_2
     a, b = total[..., 0, :].unbind(-1)
     c, d = total[..., 1, :].unbind(-1)
+    # The inverse of a matrix is its adjugate divided by its determinant.
     adjugate = torch.stack([d, -b, -c, a], dim=-1).unflatten(-1, (2, 2))
-    gain = covariance_1 @ adjugate / (a * d - b * c)[..., None, None]
+    determinant = a * d - b * c
+    gain = covariance_1 @ adjugate / determinant[..., None, None]
     offset = (second.means - first.means)[..., None]
     means = first.means + (gain @ offset)[..., 0]
     return with_covariances(means, gain @ covariance_2, near=second.rotations)
@@ -395,6 +402,7 @@ def stretch_along_line(gaussians: Gaussians, factors: Tensor) -> Gaussians:
     cos = (gaussians.rotations - angles).cos()
     sin = (gaussians.rotations - angles).sin()
     first, second = gaussians.scales.square().unbind(-1)
+    # In the directions along and across, the covariance is [[along, both], [both, across]].
     both = factors.prod(-1) * (first - second) * sin * cos
     along = factors[..., 0].square() * (first * cos.square() + second * sin.square())
     across = factors[..., 1].square() * (first * sin.square() + second * cos.square())
@@ -429,12 +437,16 @@ def line_errors(points: Tensor, targets: Tensor, lines: Tensor | None = None) ->
     steps = lines.diff(dim=-2)[..., None, :, :]  # (..., 1, S - 1, 2)
     offsets = points[..., None, :] - lines[..., None, :-1, :]  # (..., P, S - 1, 2)
     lengths = steps.square().sum(-1)
+    # Position of the nearest place on each segment: 0 at its start and 1 at its end.
     place = (offsets * steps).sum(-1) / lengths.clamp(min=_TINY)
+    # It is clamped to the segment, but may lie before the first or behind the last segment of an
+    # open line.
     closed = (lines[..., :1, :] == lines[..., -1:, :]).all(-1, keepdim=True)  # (..., 1, 1)
     beyond = torch.where(closed, 0.0, torch.inf)
     inner = torch.zeros_like(lengths[..., 1:])
     low = torch.cat([-beyond, inner], dim=-1)
     high = torch.cat([inner, beyond], dim=-1) + 1
-    squared = (offsets - place.clamp(low, high)[..., None] * steps).square().sum(-1)
+    nearest = place.clamp(low, high)[..., None] * steps
+    squared = (offsets - nearest).square().sum(-1)
     across = squared.amin(-1).clamp(min=_TINY).sqrt()
     return torch.stack([along, across], dim=-1)

@@ -43,7 +43,8 @@ def nearest_places(points: Tensor, lines: Tensor) -> LinePlaces:
     offsets = points[..., None] - starts  # (K, 2, P, Q - 1)
     shares = (offsets * steps).sum(1) / steps.square().sum(1).clamp(min=_SHORT)
     clamped = shares.clamp(0.0, 1.0)
-    squares, segments = (offsets - clamped[:, None] * steps).square().sum(1).min(-1)
+    squared = (offsets - clamped[:, None] * steps).square().sum(1)  # (K, P, Q - 1)
+    squares, segments = squared.min(-1)
     share = shares.gather(-1, segments[..., None])[..., 0]
     clamped = clamped.gather(-1, segments[..., None])[..., 0]
     before = (segments == 0) & (share < 0)
@@ -54,7 +55,11 @@ def nearest_places(points: Tensor, lines: Tensor) -> LinePlaces:
 def _candidate_pairs(
     now: Gaussians, labels: Tensor, known: Gaussians, known_labels: Tensor, gate_m: float
 ) -> tuple[Tensor, ...]:
-    """Find the pairs of one class whose boxes are closer than the gate. (K,), (K,)"""
+    """Find the pairs of one class whose bounding boxes are closer than ``gate_m``.
+
+    Returns:
+        Index of the element (K,) and of the known line (K,) of each pair.
+    """
     low, high = now.means.aminmax(dim=1)
     known_low, known_high = known.means.aminmax(dim=1)
     gaps = torch.maximum(low[:, None] - known_high, known_low - high[:, None]).amax(-1)  # (N, M)
@@ -94,8 +99,10 @@ def update_from_known_lines(
     places = nearest_places(now.means[rows], known.means[cols])
     count = places.beside.sum(-1)
     mean = (places.distances * places.beside).sum(-1) / count.clamp(min=1)  # (K,)
+    is_far = (count < 2) | (mean >= gate_m)
     distances = mean.new_full((len(labels), len(known_labels)), torch.inf)  # (N, M)
-    distances[rows, cols] = mean.masked_fill((count < 2) | (mean >= gate_m), torch.inf)
+    distances[rows, cols] = mean.masked_fill(is_far, torch.inf)
+    # Number of the pair of each element and line, to look up the nearest line of an element.
     pairs = torch.zeros_like(distances, dtype=torch.long)
     pairs[rows, cols] = torch.arange(len(rows), device=rows.device)
     nearest, line = distances.min(1)
@@ -106,15 +113,17 @@ def update_from_known_lines(
     line = line[:, None]
     starts = known.means[line, segments]
     ends = known.means[line, segments + 1]
-    line_covariance = covariances(known)
+    vertex_covariances = covariances(known)
     line_covariance = torch.lerp(
-        line_covariance[line, segments], line_covariance[line, segments + 1], shares[..., None]
+        vertex_covariances[line, segments],
+        vertex_covariances[line, segments + 1],
+        shares[..., None],
     )
     along = torch.nn.functional.normalize(ends - starts, dim=-1)
     normal = torch.stack([-along[..., 1], along[..., 0]], dim=-1)[..., None]  # (N, P, 2, 1)
     offset = torch.lerp(starts, ends, shares) - now.means
     covariance = covariances(now)
-    toward = covariance @ normal
+    toward = covariance @ normal  # Sigma n, (N, P, 2, 1)
     gain = toward / (normal.mT @ (toward + line_covariance @ normal))
     means = now.means + (gain @ (normal.mT @ offset[..., None]))[..., 0]
     updated = with_covariances(means, covariance - gain @ toward.mT, near=now.rotations)

@@ -77,7 +77,10 @@ def pad_lines(
         Lines. (K, P, D)
     """
     length = length or max(map(len, lines), default=2)
-    rows = [np.pad(line, ((0, length - len(line)), (0, 0)), mode) for line in lines]
+    rows = []
+    for line in lines:
+        missing = length - len(line)
+        rows.append(np.pad(line, ((0, missing), (0, 0)), mode))
     return np.array(rows) if rows else np.zeros((0, length, 2))
 
 
@@ -101,8 +104,13 @@ def parts_inside(
     if len(points) < 2:
         return []
     box = shapely.box(x_range[0], y_range[0], x_range[1], y_range[1])
-    parts = shapely.get_parts(shapely.LineString(points).intersection(box))
-    return [part for part in map(shapely.get_coordinates, parts) if len(part) > 1]
+    inside = shapely.LineString(points).intersection(box)
+    parts = []
+    for part in shapely.get_parts(inside):
+        vertices = shapely.get_coordinates(part)
+        if len(vertices) > 1:  # a line that touches the box leaves a point
+            parts.append(vertices)
+    return parts
 
 
 def resample(points: Points, num_points: int) -> NDArray[np.float64]:
@@ -140,8 +148,10 @@ def resample_all(
     resampled = np.zeros((len(counts), num_points, points.shape[1]))
     if not counts.any():
         return resampled
-    vertex = np.minimum(np.arange(counts.max()), counts[:, None] - 1) + offsets[:-1, None]
-    vertices = points[vertex.clip(0)]  # (N, n, D), the last vertex repeated
+    # All polylines get the length n of the longest: the last vertex is repeated.
+    place = np.minimum(np.arange(counts.max()), counts[:, None] - 1)  # in the polyline, (N, n)
+    vertex = place + offsets[:-1, None]
+    vertices = points[vertex.clip(0)]  # (N, n, D); -1 belongs to a polyline without vertices
     steps = np.linalg.norm(np.diff(vertices[..., :2], axis=1), axis=-1)
     along = np.zeros(vertex.shape)
     np.cumsum(steps, axis=1, out=along[:, 1:])
@@ -190,8 +200,10 @@ def equivalent_orders(
         rolls = rng.choice(count, slots, replace=False)
     twice = np.concatenate([points, points[1:]])  # a second lap, so that no distance wraps around
     along = arc_lengths(twice)
-    laps = along[-rolls % count, None] + np.linspace(0.0, along[count], num_points)
-    orders[: len(rolls)] = np.stack([np.interp(laps, along, column) for column in twice.T], axis=-1)
+    starts = along[-rolls % count, None]  # distance of the first point of each order
+    distances = starts + np.linspace(0.0, along[count], num_points)
+    columns = [np.interp(distances, along, column) for column in twice.T]
+    orders[: len(rolls)] = np.stack(columns, axis=-1)
     return orders
 
 
@@ -245,15 +257,17 @@ def shortest_orders(lines: Points, least_gain_m: float = 1e-3) -> NDArray[np.int
     active = np.arange(count if size > 2 else 0)  # lines that a reversal may shorten
     while len(active):
         rows = orders[active]
+        # Distances between the points at all pairs of places in the order, (m, P, P).
         paths = apart[active[:, None, None], rows[:, :, None], rows[:, None]]
         paths = np.pad(paths, ((0, 0), (1, 1), (1, 1)))  # no step before the start, after the end
         step = paths.diagonal(1, 1, 2)  # from the point before to each point, (m, P + 1)
-        # gain[i, j]: steps to point i and from point j, minus these steps with i to j reversed
-        gain = step[:, :-1, None] + step[:, None, 1:] - paths[:, :-2, 1:-1] - paths[:, 1:-1, 2:]
+        # A reversal of the points i to j replaces the steps to point i and from point j.
+        replaced = step[:, :-1, None] + step[:, None, 1:]
+        gain = replaced - paths[:, :-2, 1:-1] - paths[:, 1:-1, 2:]
         gain[is_ring[active], 0] = 0.0
         gain[is_ring[active], :, -1] = 0.0
         gain = np.triu(gain, 1).reshape(len(active), -1)
-        best = gain.argmax(1)
+        best = gain.argmax(1)  # i * P + j
         improves = gain[np.arange(len(active)), best] > least_gain_m
         active = active[improves]
         first, last = np.divmod(best[improves, None], size)
@@ -327,8 +341,13 @@ def clip_to_box(
     is_joined = (np.diff(hits) == 1) & (leave[hits[:-1]] == 1.0) & (enter[hits[1:]] == 0.0)
     breaks = np.flatnonzero(~is_joined) + 1
     ends = [0, *breaks.tolist(), len(hits)]
-    pieces = [np.concatenate([first[a : a + 1], last[a:b]]) for a, b in pairwise(ends)]
-    runs_through = hits[0] == 0 and hits[-1] == len(start) - 1 and enter[0] == 0 and leave[-1] == 1
-    if len(pieces) > 1 and runs_through and is_closed(points):
-        pieces[0] = np.concatenate([pieces.pop(), pieces[0][1:]])
+    pieces = []
+    for a, b in pairwise(ends):
+        piece = np.concatenate([first[a : a + 1], last[a:b]])
+        pieces.append(piece)
+    starts_inside = hits[0] == 0 and enter[0] == 0
+    ends_inside = hits[-1] == len(start) - 1 and leave[-1] == 1
+    if len(pieces) > 1 and starts_inside and ends_inside and is_closed(points):
+        last_piece = pieces.pop()
+        pieces[0] = np.concatenate([last_piece, pieces[0][1:]])
     return pieces

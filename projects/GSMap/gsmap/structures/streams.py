@@ -232,7 +232,8 @@ class MapStream(Scenes):
     @property
     def last(self) -> Frame | None:
         """Last frame of the stream, or None before the first one."""
-        return next((state.frame for state in self.states.values()), None)
+        states = list(self.states.values())  # at most one
+        return states[0].frame if states else None
 
     def previous(self, frames: Sequence[Frame]) -> list[StreamState | None]:
         """Look up the states that frames continue.
@@ -246,9 +247,11 @@ class MapStream(Scenes):
         Raises:
             ValueError: If a frame is of another scene, or is not later than the previous frame.
         """
-        last = self.last or next(iter(frames), None)
+        last = self.last
         for frame in frames:
-            if last is not None and frame.scene != last.scene:
+            if last is None:
+                last = frame
+            if frame.scene != last.scene:
                 raise InputError(
                     f"frame {frame} is of another scene than {last}, where the stream is: "
                     "start a new stream for each scene."

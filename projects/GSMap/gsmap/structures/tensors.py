@@ -108,7 +108,7 @@ def upload(tensors: Sequence[Tensor], device: torch.device) -> list[Tensor]:
         size = tensor.numel() * tensor.element_size()
         if tensor.device.type == "cpu" and 0 < size < _LARGE:
             ranges[index] = slice(end, end + size)
-            end += -(-size // _ALIGNMENT) * _ALIGNMENT
+            end += -(-size // _ALIGNMENT) * _ALIGNMENT  # rounded up to the alignment
             copies.append(tensor)  # replaced by a view of the block
             continue
         source = tensor.pin_memory() if pinned and size else tensor

@@ -62,6 +62,7 @@ def motion_signals(
         Signals in the layout of `pose_signals`. (18,)
     """
     time, pose = now
+    # At the start and the end of a drive, the pose itself takes the place of the missing one.
     start, first = before or now
     end, last = after or now
     values = pose_signals(pose)
@@ -69,8 +70,10 @@ def motion_signals(
     acceleration = _GRAVITY
     if end > start:
         rotation = Quaternion(matrix=first[:3, :3].T @ last[:3, :3], atol=1e-6, rtol=1e-6)
-        values[10:13] = rotation.axis * rotation.radians / (end - start)
-        values[13:16] = ego_from_global @ (last - first)[:3, 3] / (end - start)
+        rotation_rate = rotation.axis * rotation.radians / (end - start)
+        values[10:13] = rotation_rate
+        velocity = ego_from_global @ (last - first)[:3, 3] / (end - start)
+        values[13:16] = velocity
     if end > time > start:
         velocity_before = (pose - first)[:3, 3] / (time - start)
         velocity_after = (last - pose)[:3, 3] / (end - time)

@@ -154,14 +154,14 @@ def _legend_lines(
     lines = []
     for label in sorted(labels):
         lines.append(Line2D([], [], color=style.colour(label), lw=2.6, label=style.title(label)))
-    outcomes: list[str] = []  # results of the matching: "hit", "false", or of truths
+    outcomes: list[str] = []  # "hit" and "false" of predictions, "found" and "missed" of truths
     for panel in panels:
         for panel_outcomes in panel.outcomes:
             outcomes += panel_outcomes
     for outcome, colour in MATCH_COLOURS.items():
         if outcome not in outcomes:
             continue
-        is_truth = outcome in TRUTH_OPACITY
+        is_truth = outcome in TRUTH_OPACITY  # the outcomes of ground truths alone have an opacity
         title = f"truth {outcome}" if is_truth else outcome
         line = Line2D([], [], color=colour, label=f"{title} ({outcomes.count(outcome)})")
         line.set(linewidth=1.8, linestyle=FALSE_DASHES if outcome == "false" else "-")

@@ -35,7 +35,8 @@ def write_film(path: str | Path, pictures: Iterable[np.ndarray], times_ns: Seque
     """
     av = import_extra("av", "viz")
     period_s = np.median(np.diff(times_ns)) / 1e9 if len(times_ns) > 1 else 0.5
-    rate = Fraction(1 / np.clip(period_s, 1 / 60, 10)).limit_denominator(100)
+    period_s = np.clip(period_s, 1 / 60, 10)
+    rate = Fraction(1 / period_s).limit_denominator(100)  # pictures per second
     with atomic_write(path, "wb") as file, av.open(file, "w", format="mp4") as film:
         film.metadata["comment"] = "gsmap"
         stream = None
@@ -102,8 +103,8 @@ def write_drive_film(
         result_frames = drive_frames(Path(result_path), file, file.meta.classes)
         drives[name] = [frame for frame in result_frames if frame.scene == scene]
     row_of_token = {token: row for row, token in enumerate(file.column("token"))}
-    frames = next(iter(drives.values()))[:max_frames]
-    rows = [row_of_token[frame.token] for frame in frames]
+    first_drive = next(iter(drives.values()))  # the drives of all results have equal samples
+    rows = [row_of_token[frame.token] for frame in first_drive[:max_frames]]
     all_times_ns = file.column("timestamp_ns")
     times_ns = [all_times_ns[row] for row in rows]
     root = Path(annotations).parent if data_root is None else data_root

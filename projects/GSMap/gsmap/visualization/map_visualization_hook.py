@@ -1,5 +1,6 @@
 """Hook that draws samples in validation and testing."""
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -113,5 +114,5 @@ class MapVisualizationHook(Hook):
             metrics: Metrics of the test.
         """
         if self._num_samples:
-            count = -(-self._num_samples // self.interval)
+            count = math.ceil(self._num_samples / self.interval)
             runner.logger.info(f"{count} pictures of predictions are in {self.test_out_dir}.")

@@ -136,7 +136,10 @@ class MapVisualizer(Visualizer):
         meta = self.dataset_meta or {}
         rows, columns = RASTER_SIZE
         return BEVGrid(
-            meta.get("x_range", (-15.0, 15.0)), meta.get("y_range", (-30.0, 30.0)), rows, columns
+            x_range=meta.get("x_range", (-15.0, 15.0)),
+            y_range=meta.get("y_range", (-30.0, 30.0)),
+            height=rows,
+            width=columns,
         )
 
     @property
@@ -266,12 +269,14 @@ class MapVisualizer(Visualizer):
 
     def _render_masks(self, elements: MapElements) -> np.ndarray:
         """Render the Gaussians of each element to occupancy in [0, 1] (GSMap Eq. 6). (N, H, W)"""
-        means, scales, rotations = (
-            torch.as_tensor(values, dtype=torch.float32).unflatten(0, (len(elements), -1))
-            for values in (elements.points[:, :2], elements.scales, elements.rotations)
-        )
+        tensors = []
+        for values in (elements.points[:, :2], elements.scales, elements.rotations):
+            flat = torch.as_tensor(values, dtype=torch.float32)  # of the vertices of all elements
+            tensors.append(flat.unflatten(0, (len(elements), -1)))
+        means, scales, rotations = tensors
         with torch.no_grad():
-            return render_gaussians(means, scales, rotations, grid=self.grid).numpy()
+            masks = render_gaussians(means, scales=scales, rotations=rotations, grid=self.grid)
+        return masks.numpy()
 
     def draw_sample(
         self,

@@ -100,6 +100,7 @@ def plot_result(reports: Sequence[MetricReport]) -> Figure:
             colour = style.colour(label)
             num_thresholds = len(detections.thresholds)
             for index, threshold in enumerate(detections.thresholds):
+                # From 1 for the strictest threshold; thresholds are in rising order.
                 rank = index + 1 if report.by_distance else num_thresholds - index
                 ap = 100 * report.metrics[f"{report.name}/{name}/AP@{threshold}"]
                 recall, precision = precision_recall(detections.hits[:, index], detections.num_gts)

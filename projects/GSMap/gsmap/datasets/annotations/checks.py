@@ -108,7 +108,7 @@ def _are_pinholes(arrays: pa.FixedSizeListArray, *_: object) -> np.ndarray:
     """Test which intrinsics are valid pinhole matrices."""
     entries = np.ascontiguousarray(matrices_of(arrays, (9,)).T)  # (9, items), contiguous entries
     are_finite = np.isfinite(entries.sum(0))
-    have_focal_lengths = (entries[[0, 4]] > 0).all(0)
+    have_focal_lengths = (entries[0] > 0) & (entries[4] > 0)  # fx and fy
     have_last_row = (entries[6] == 0) & (entries[7] == 0) & (entries[8] == 1)
     return are_finite & have_focal_lengths & have_last_row
 
@@ -142,7 +142,8 @@ def _are_names(names: pa.StringArray, *_: object) -> np.ndarray:
 def _are_camera_names(names: pa.StringArray, rows: np.ndarray, _: AnnotationMeta) -> np.ndarray:
     """Test which names of cameras are unique in their sample and safe as parts of a path."""
     encoded = names.dictionary_encode()
-    keys = rows * len(encoded.dictionary) + encoded.indices.to_numpy()  # of sample and name
+    # One number for each pair of a sample and a name.
+    keys = rows * len(encoded.dictionary) + encoded.indices.to_numpy()
     are_unique = np.bincount(keys)[keys] == 1
     return are_unique & _are_inside(names)
 
@@ -155,7 +156,7 @@ def _are_labels(labels: pa.Int32Array, _: np.ndarray, meta: AnnotationMeta) -> n
 
 def _are_polylines(lists: pa.ListArray, _: np.ndarray, meta: AnnotationMeta) -> np.ndarray:
     """Test which polylines have two or more points, all finite and within the limit."""
-    counts = np.diff(lists.offsets.to_numpy())
+    counts = np.diff(lists.offsets.to_numpy())  # coordinates of each polyline
     are_good = (counts % meta.dim == 0) & (counts >= 2 * meta.dim)
     are_near = np.abs(lists.values.to_numpy(zero_copy_only=False)) <= FARTHEST_M  # False for NaN
     if not are_near.all():

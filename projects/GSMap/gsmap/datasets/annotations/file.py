@@ -239,7 +239,7 @@ class AnnotationFile(Sequence[MapSample]):
                 "docs/data.md)."
             )
         try:
-            check_input(self.path)
+            check_input(self.path)  # refuses pipes and outputs of the command
             self._map = pa.memory_map(str(self.path))
             self._state = self._current_state()
             self._content = self._map.read_buffer()
@@ -272,6 +272,7 @@ class AnnotationFile(Sequence[MapSample]):
         self._decoders = []
         for batch in self._batches:
             self._decoders.append(decoder_of(batch.to_struct_array(), dim=self.meta.dim))
+        # Index of the first sample of each batch, and number of all samples.
         self._starts = np.cumsum([0, *map(len, self._batches)])
 
     def _check_content(self, seal: bytes | None) -> None:
@@ -294,7 +295,8 @@ class AnnotationFile(Sequence[MapSample]):
     def _current_state(self) -> tuple[int, int, int]:
         """Return size and time of the file, and the process id.
 
-        Size and time change with a write. A forked process checks the file again.
+        Size and time change when the file is written. The process id changes in a forked process,
+        which then checks the file again.
         """
         status = os.fstat(self._map.fileno())
         return status.st_size, status.st_mtime_ns, os.getpid()
@@ -402,7 +404,8 @@ class AnnotationFile(Sequence[MapSample]):
         index %= len(self)
         number = int(np.searchsorted(self._starts, index, side="right")) - 1
         self._require_intact(number)
-        return self._decoders[number](index - int(self._starts[number]))
+        decode = self._decoders[number]
+        return decode(index - int(self._starts[number]))
 
     def column(self, name: str) -> list[Any]:
         """Return ``token``, ``scene``, ``map_name`` or ``timestamp_ns`` of all samples."""
@@ -435,7 +438,8 @@ class AnnotationFile(Sequence[MapSample]):
 
 def _meta_of(schema: pa.Schema) -> AnnotationMeta:
     """Read and check the metadata and the format version of a file."""
-    values = json.loads((schema.metadata or {}).get(META_KEY, b"null"))
+    metadata = schema.metadata or {}
+    values = json.loads(metadata.get(META_KEY, b"null"))
     if not isinstance(values, dict):
         raise InputError("it holds Arrow's data, but it is not an annotation file")
     version = values.get("format_version")

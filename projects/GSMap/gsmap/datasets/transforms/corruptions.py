@@ -29,6 +29,7 @@ from gsmap.utils.errors import InputError
 SEVERITIES = (1, 2, 3, 4, 5)
 Image = NDArray[np.uint8]
 
+# Each tuple has one value for each of the five severities.
 _TURNS_DEG = (0.25, 0.5, 1.0, 2.0, 4.0)
 _SHIFTS_M = (0.02, 0.05, 0.1, 0.2, 0.4)
 _VISIBILITY_M = (200.0, 100.0, 60.0, 40.0, 25.0)  # in fog
@@ -38,7 +39,9 @@ _NIGHT_NOISE = 12.0  # standard deviation in grey levels without any light
 _BLUR_LENGTHS = (0.01, 0.02, 0.03, 0.045, 0.06)  # relative to the width of the image
 _JPEG_QUALITIES = (25, 18, 15, 10, 7)  # as in ImageNet-C
 _FOG_GREY = 200.0  # grey level of fog
-_MAX_FOG_DISTANCE_M = 60.0  # of a pixel, also above the horizon
+_MAX_FOG_DISTANCE_M = 60.0  # distance of pixels above the horizon, and limit for all others
+_STREAK_GREY = 210  # grey level of a streak of rain
+_STREAK_OPACITY = 0.4
 
 
 def generator(seed: int, token: str) -> np.random.Generator:
@@ -158,7 +161,7 @@ def fog(results: dict[str, Any], view: int, visibility_m: float) -> NDArray[Any]
     ego_from_cam = results["lidar2ego"] @ invert_rigid(results["lidar2cam"][view])
     rays = ego_from_cam[:3, :3] @ np.linalg.solve(intrinsics, pixels.reshape(3, -1))  # (3, H * W)
     slopes = rays[2] / np.linalg.norm(rays, axis=0)  # rise per metre of distance
-    slopes = np.minimum(slopes, -1e-6)
+    slopes = np.minimum(slopes, -1e-6)  # rays above the horizon would never reach the ground
     camera_height_m = np.maximum(ego_from_cam[2, 3], 0.1)
     distance_m = np.minimum(camera_height_m / -slopes, _MAX_FOG_DISTANCE_M)
     contrast = np.exp(np.log(0.05) / visibility_m * distance_m).reshape(height, width, 1)
@@ -182,10 +185,10 @@ def rain(image: Image, level: int, rng: np.random.Generator) -> Image:
     bottom = (length * 3 // 5, length - 1)  # nearly vertical
     cv2.line(streak, top, bottom, color=(1.0,))
     streaks = cv2.filter2D(drops, ddepth=-1, kernel=streak)
-    opacity = np.clip(streaks, 0, 1)[..., None] * 0.4
+    opacity = np.clip(streaks, 0, 1)[..., None] * _STREAK_OPACITY
     greyness = 0.04 * (level + 1)
     grey_image = image * (1 - greyness) + 128 * greyness
-    return _grey_levels(grey_image * (1 - opacity) + 210 * opacity)
+    return _grey_levels(grey_image * (1 - opacity) + _STREAK_GREY * opacity)
 
 
 def night(image: Image, level: int, rng: np.random.Generator) -> Image:

@@ -31,7 +31,11 @@ class ImageStep(Protocol):
         """Transform images with torch. (V, 3, H, W) -> (V, 3, H', W')"""
 
     def join(self, others: "Sequence[Any]") -> "ImageStep | None":
-        """Join with the steps of other samples to one step; None if that is not possible."""
+        """Join with the steps of the other samples of a batch to one step for all of their images.
+
+        Returns:
+            The joint step, or None if the steps cannot be joined.
+        """
 
 
 def take_step(results: dict[str, Any], step: ImageStep) -> None:
@@ -197,7 +201,7 @@ def _distortion_row(numbers: tuple[Any, ...]) -> list[float]:
     """Return the parameters of `distort_images`, which are neutral for flags that are not set."""
     mode, has_brightness, has_contrast, has_saturation, has_hue, has_order = numbers[:6]
     brightness, contrast, saturation, hue, order = numbers[6:]
-    contrast_first = mode == 1
+    contrast_first = mode == 1  # otherwise the contrast changes after the colours
     return [
         brightness if has_brightness else 0.0,
         contrast if has_contrast and contrast_first else 1.0,
@@ -224,6 +228,7 @@ def distort_images(images: Tensor, numbers: Tensor) -> Tensor:
     brightness, early_contrast, saturation, hue, late_contrast = factors.unbind(1)  # (N, 1, 1)
     images = (images.float() + brightness[:, None]) * early_contrast[:, None]
     blue, green, red = images.unbind(1)  # (N, H, W)
+    # From BGR to hue, saturation and value (HSV):
     value = images.amax(1)
     spread = value - images.amin(1)
     new_saturation = spread / (value.abs() + _EPSILON) * saturation
@@ -234,6 +239,7 @@ def distort_images(images: Tensor, numbers: Tensor) -> Tensor:
     hue_not_near_red = torch.where(value == green, hue_near_green, hue_near_blue)
     angle = torch.where(value == red, hue_near_red, hue_not_near_red)
     angle = torch.where(angle < 0, angle + 360.0, angle) + hue  # degrees
+    # Back to BGR:
     chroma = value * new_saturation
     channels = []
     for sector in (1.0, 3.0, 5.0):  # blue, green, red

@@ -35,10 +35,14 @@ def bev_cells(instance: MapInstance, results: dict[str, Any], size: tuple[int, i
     Returns:
         Cells (column, row), int32. (n, 2)
     """
-    low, high = np.array([results["x_range"], results["y_range"]]).T
-    scale = np.array(size[::-1]) / (high - low)
+    ranges = np.array([results["x_range"], results["y_range"]])
+    low, high = ranges.T
+    num_rows, num_columns = size
+    # Columns run along x and rows along y.
+    cells_per_metre = np.array([num_columns, num_rows]) / (high - low)
     points = instance.points[:, :2].astype(np.float64)
-    return ((points - low) * scale).astype(np.int32)
+    cells = (points - low) * cells_per_metre
+    return cells.astype(np.int32)
 
 
 @TRANSFORMS.register_module()
@@ -131,7 +135,9 @@ class MakeInstanceMasks(BaseTransform):
         for number, label in enumerate(labels):
             later_masks = masks[number + 1 :]
             later_labels = labels[number + 1 :]
-            blocked = np.concatenate([later_masks[later_labels == label], gaps[labels > label]])
+            later_of_class = later_masks[later_labels == label]
+            gaps_of_higher_labels = gaps[labels > label]
+            blocked = np.concatenate([later_of_class, gaps_of_higher_labels])
             masks[number] &= ~blocked.any(0)
         masks = masks[..., ::-1] if self.mirrored else masks
         results["gt_instances_3d"].masks = torch.from_numpy(masks.astype(bool))
@@ -213,7 +219,8 @@ class MakePVMask(BaseTransform):
         for view_masks, lidar2img in zip(masks, matrices, strict=True):
             feature_from_frame = feature_from_img @ lidar2img
             for channel, line in lines:
-                u, v, depth = (line @ feature_from_frame.T)[:, :3].T
+                projected = line @ feature_from_frame.T  # (200, 4)
+                u, v, depth = projected[:, :3].T
                 is_ahead = depth > 0
                 pixels = np.stack([u[is_ahead], v[is_ahead]], axis=-1)
                 pixels /= depth[is_ahead, None] + _MIN_DEPTH

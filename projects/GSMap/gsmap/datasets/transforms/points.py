@@ -183,14 +183,17 @@ class MakeDepthMap(BaseTransform):
         min_depth, max_depth = self.depth_range
         depths = np.zeros((len(results["lidar2img"]), height, width), dtype=np.float32)
         for view, lidar2img in enumerate(results["lidar2img"]):
-            u, v, depth = (homogeneous @ lidar2img.T)[:, :3].T
+            projected = homogeneous @ lidar2img.T  # (n, 4)
+            u, v, depth = projected[:, :3].T
             in_range = (depth >= min_depth) & (depth < max_depth)
             depth = depth[in_range]
             col = np.round(u[in_range] / depth)
             row = np.round(v[in_range] / depth)
-            img_scale = results["img_aug_matrix"][view][[1, 0], [1, 0]]
-            num_rows, num_cols = np.round(results["raw_shapes"][view] * img_scale)
-            # Without the padding at the bottom and right:
+            # Size of the resized image without its padding at the bottom and right:
+            raw_height, raw_width = results["raw_shapes"][view]
+            img_aug_matrix = results["img_aug_matrix"][view]
+            num_rows = np.round(raw_height * img_aug_matrix[1, 1])
+            num_cols = np.round(raw_width * img_aug_matrix[0, 0])
             is_inside = (col >= 0) & (col < num_cols) & (row >= 0) & (row < num_rows)
             depth = depth[is_inside]
             col = col[is_inside].astype(int)

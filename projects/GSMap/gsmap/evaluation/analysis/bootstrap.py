@@ -38,10 +38,13 @@ class Interval:
 
 
 class Weights(Protocol):
-    """Random weights of parts of the data set (such as its scenes), in each of B resamples."""
+    """Interface of resamples: each of B resamples has copies of parts of the data set.
+
+    The parts are, for example, its scenes.
+    """
 
     def draw_copies(self, tokens: Sequence[str]) -> tuple[IntArray, FloatArray]:
-        """Draw the weights.
+        """Draw the numbers of copies.
 
         Args:
             tokens: Tokens of the samples. (S,)
@@ -148,7 +151,7 @@ def _aps(
     hit_rows: IntArray,
     ends: IntArray,
     scene: IntArray,
-    drawn: FloatArray,
+    scene_copies: FloatArray,
     gts: FloatArray,
     interpolated: bool,
 ) -> FloatArray:
@@ -158,23 +161,23 @@ def _aps(
         hit_rows: Indices of the predictions that match, for one threshold after the other. (H,)
         ends: End of each threshold in ``hit_rows``. (T,)
         scene: Scene of each prediction. (N,)
-        drawn: Number of copies of each scene. (B, S)
+        scene_copies: Number of copies of each scene. (B, S)
         gts: Number of ground truths of each scene. (S,)
         interpolated: Whether AP is the mean at 101 recalls; the area otherwise.
 
     Returns:
         AP; NaN without ground truths. (B, T)
     """
-    aps = np.full((len(drawn), len(ends)), np.nan)
+    aps = np.full((len(scene_copies), len(ends)), np.nan)
     copies = np.empty(len(scene))
     ranks = np.empty(len(scene))
-    for b in range(len(drawn)):
-        total = (drawn[b] * gts).sum()
+    for b in range(len(scene_copies)):
+        total = (scene_copies[b] * gts).sum()
         if not total > 0:
             continue
         sum_of_copies = 0.0
         for i in range(len(scene)):
-            copies[i] = drawn[b, scene[i]]
+            copies[i] = scene_copies[b, scene[i]]
             sum_of_copies += copies[i]
             ranks[i] = sum_of_copies
         start = 0
@@ -188,14 +191,14 @@ def _aps(
 
 
 def resampled_aps(
-    hits: BoolArray, scene: IntArray, drawn: FloatArray, gts: FloatArray, interpolated: bool
+    hits: BoolArray, scene: IntArray, scene_copies: FloatArray, gts: FloatArray, interpolated: bool
 ) -> FloatArray:
     """Compute the AP of each resample at each threshold.
 
     Args:
         hits: Whether each prediction matches, in descending order of score. (N, T)
         scene: Scene of each prediction. (N,)
-        drawn: Number of copies of each scene. (B, S)
+        scene_copies: Number of copies of each scene. (B, S)
         gts: Number of ground truths of each scene. (S,)
         interpolated: Whether AP is the mean at 101 recalls; the area otherwise.
 
@@ -204,7 +207,14 @@ def resampled_aps(
     """
     ends = np.cumsum(hits.sum(axis=0))
     hit_rows = np.nonzero(hits.T)[1]  # ordered by threshold, then by score
-    return _aps(hit_rows, ends=ends, scene=scene, drawn=drawn, gts=gts, interpolated=interpolated)
+    return _aps(
+        hit_rows,
+        ends=ends,
+        scene=scene,
+        scene_copies=scene_copies,
+        gts=gts,
+        interpolated=interpolated,
+    )
 
 
 def resampled_figures(report: MetricReport, resamples: Weights) -> dict[str, FloatArray]:
@@ -212,7 +222,7 @@ def resampled_figures(report: MetricReport, resamples: Weights) -> dict[str, Flo
 
     Args:
         report: Report of the metric over all samples.
-        resamples: Weights of the samples in each of B resamples.
+        resamples: Resamples of the samples, B in number.
 
     Returns:
         AP by its flat key, NaN where it does not exist (B,); empty for a metric that ranks no
@@ -220,19 +230,21 @@ def resampled_figures(report: MetricReport, resamples: Weights) -> dict[str, Flo
     """
     if not report.detections:
         return {}
-    scenes, drawn = resamples.draw_copies(report.tokens)
+    scenes, scene_copies = resamples.draw_copies(report.tokens)
     interpolated = not report.by_distance  # AP_chamfer is an area, AP_raster a mean at 101 recalls
     class_aps: dict[str, FloatArray] = {}
     figures: dict[str, FloatArray] = {}
     for name, ranked in report.detections.items():
         if report.sample_aps:
-            aps = _mean_of_samples(report.sample_aps[name], scenes=scenes, drawn=drawn)
+            aps = _mean_of_samples(
+                report.sample_aps[name], scenes=scenes, scene_copies=scene_copies
+            )
         else:
-            gts = np.bincount(scenes, weights=ranked.gts_of_sample, minlength=drawn.shape[1])
+            gts = np.bincount(scenes, weights=ranked.gts_of_sample, minlength=scene_copies.shape[1])
             aps = resampled_aps(
                 ranked.hits,
                 scene=scenes[ranked.samples],
-                drawn=drawn,
+                scene_copies=scene_copies,
                 gts=gts.astype(np.float64),
                 interpolated=interpolated,
             )
@@ -243,6 +255,7 @@ def resampled_figures(report: MetricReport, resamples: Weights) -> dict[str, Flo
             figures[f"{name}/AP@{threshold}"] = aps[:, t]
         figures[f"{name}/AP"] = aps.mean(axis=1)
     for group, names in report.groups.items():
+        # AP_chamfer has one group, all classes, whose keys have no prefix.
         prefix = f"{group}/" if interpolated else ""
         means = _mean([class_aps[name] for name in names])
         for t, threshold in enumerate(report.detections[names[0]].thresholds):
@@ -253,25 +266,25 @@ def resampled_figures(report: MetricReport, resamples: Weights) -> dict[str, Flo
     return {f"{report.name}/{key}": values for key, values in figures.items()}
 
 
-def _mean_of_samples(aps: FloatArray, scenes: IntArray, drawn: FloatArray) -> FloatArray:
+def _mean_of_samples(aps: FloatArray, scenes: IntArray, scene_copies: FloatArray) -> FloatArray:
     """Compute the mean AP over the samples of each resample.
 
     Args:
         aps: AP of each sample, NaN where it does not count. (S, T)
         scenes: Scene of each sample. (S,)
-        drawn: Number of copies of each scene. (B, scenes)
+        scene_copies: Number of copies of each scene. (B, scenes)
 
     Returns:
         Mean AP; NaN if no sample of the resample counts. (B, T)
     """
     is_known = ~np.isnan(aps)
-    num_scenes = drawn.shape[1]
+    num_scenes = scene_copies.shape[1]
     sums = np.zeros((num_scenes, aps.shape[1]))
     counts = np.zeros((num_scenes, aps.shape[1]))
     np.add.at(sums, scenes, np.where(is_known, aps, 0.0))
     np.add.at(counts, scenes, is_known)
     with np.errstate(invalid="ignore"):  # 0 / 0 is NaN
-        return np.asarray((drawn @ sums) / (drawn @ counts))
+        return np.asarray((scene_copies @ sums) / (scene_copies @ counts))
 
 
 def _mean(values: Sequence[FloatArray]) -> FloatArray:

@@ -21,8 +21,9 @@ from gsmap.utils.model_facts import LAW_NAMES
 AXES = ("along", "across")
 DISTANCES_M = (0.0, 10.0, 20.0, np.inf)  # limits of the bands of distance from the vehicle
 LEVELS = np.linspace(0.05, 0.95, num=19)  # of central intervals
-_STANDARD = (stats.norm(), stats.laplace(scale=0.5**0.5))  # of variance 1
+_STANDARD = (stats.norm(), stats.laplace(scale=0.5**0.5))
 LAWS = dict(zip(LAW_NAMES, _STANDARD, strict=True))
+"""Laws of errors (probability distributions) of variance 1, by name."""
 COVERED = (2 * stats.norm.cdf([1.0, 2.0]) - 1).tolist()  # within one and two sigma of a normal law
 _FEWEST = 100  # vertices of a class to fit its factors
 _COLUMNS = (
@@ -96,7 +97,8 @@ def _vertices_of_sample(sample: Sample, config: ChamferConfig) -> Iterator[Verti
 
     matches = match_chamfer(predictions, truth, config=config, token=token)
     gt_lines = truth.polylines
-    for row, gt in zip(matches.pred_index, matches.matched_gt[:, -1], strict=True):
+    matched_gt = matches.matched_gt[:, -1]  # at the loosest threshold; -1 without a match
+    for row, gt in zip(matches.pred_index, matched_gt, strict=True):
         if gt < 0:
             continue
         span = slice(predictions.offsets[row], predictions.offsets[row + 1])

@@ -2,7 +2,8 @@
 
 The rules are the rules of MapTracker's released tools. They differ from AP_chamfer in four ways:
 predictions with a score of 0.4 or less are left out, a frame without ground truth of a class does
-not count for the class, lines have 200 points, and strips need not touch.
+not count for the class, lines have 200 points, and the 4 m wide strips around a matched pair of
+lines need not touch.
 """
 
 from collections.abc import Iterable, Sequence
@@ -197,7 +198,8 @@ def partners(
         grid=config.grid,
     )
     pairs = {}
-    for i, j in zip(*linear_sum_assignment(-ious), strict=True):
+    now_indices, then_indices = linear_sum_assignment(-ious)
+    for i, j in zip(now_indices, then_indices, strict=True):
         if ious[i, j] > min_iou:
             pairs[int(rows[i])] = int(columns[j])
     return pairs

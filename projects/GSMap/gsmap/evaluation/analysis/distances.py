@@ -106,6 +106,8 @@ def _cut_positions(points: FloatArray) -> FloatArray:
     start = points[:-1]
     step = np.diff(points, axis=0)
     radii = np.array(DISTANCES_M[1:-1])[:, None]
+    # A point start + share * step is on a circle if
+    # a * share**2 + 2 * b * share + |start|**2 - radius**2 is zero.
     a = (step**2).sum(axis=1)
     b = (start * step).sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):  # NaN where a line misses a circle
@@ -136,9 +138,10 @@ def cut_area(points: FloatArray) -> Iterator[tuple[int, FloatArray]]:
     """
     if len(np.unique(points, axis=0)) < 3:
         return
-    # an outline that crosses itself becomes a collection of areas and lines
+    # An outline that crosses itself becomes a collection of areas, multi-areas and lines.
     collection = shapely.make_valid(shapely.Polygon(points))
-    parts = shapely.get_parts(shapely.get_parts(collection))
+    members = shapely.get_parts(collection)
+    parts = shapely.get_parts(members)
     for area in parts[shapely.area(parts) > 0]:
         for band, band_area in enumerate(_BAND_AREAS):
             for piece in shapely.get_parts(area & band_area):

@@ -49,7 +49,7 @@ def _read_frames(samples: SampleFile, annotations: AnnotationFile) -> list[Drive
     results = samples.path
     predictions: dict[str, MapElements] = {}
     track_ids: dict[str, IntArray | None] = {}
-    last_token: dict[bool, str] = {}  # of the samples with and without tracks
+    last_token: dict[bool, str] = {}  # last sample with tracks (True) and without (False)
     items = items_of(results, RESULTS_KEY, "give a result file")
     # samples come first, because they describe a malformed file
     for (token, elements, _), (item, _) in zip(samples, items, strict=True):
@@ -108,7 +108,8 @@ def _convert_tracks(values: list[object], results: Path, token: str) -> IntArray
 def _check_tracks(ids: IntArray, elements: MapElements, results: Path, token: str) -> None:
     """Raise ValueError if two elements of a class have equal tracks."""
     pairs, counts = np.unique([elements.labels, ids], axis=1, return_counts=True)
-    repeated = pairs[1, (counts > 1) & (pairs[1] >= 0)]
+    tracks = pairs[1]
+    repeated = tracks[(counts > 1) & (tracks >= 0)]
     if len(repeated):
         raise InputError(
             f"{results}, sample {token!r}: two elements of a class have {TRACK_KEY} {repeated[0]}: "

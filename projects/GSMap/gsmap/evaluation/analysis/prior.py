@@ -4,6 +4,7 @@ A network that uses its images must be better than this baseline. The elements a
 constant; they are chosen greedily for AP_chamfer on the training set.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -76,9 +77,8 @@ class _ClassFit:
             if len(frame):
                 self.frames.append(frame)
                 lines.append(resample_all(frame.points, frame.offsets, num_points=_NUM_POINTS))
-        self.first = np.cumsum(
-            [0, *map(len, self.frames)]
-        )  # first ground truth of each frame, (F + 1,)
+        # Index of the first ground truth of each frame, and their total number. (F + 1,)
+        self.first = np.cumsum([0, *map(len, self.frames)])
         self.points = np.concatenate(lines)  # (K, P, 2 or 3)
         self.is_taken = np.zeros((len(self.thresholds), len(self.points)), dtype=np.bool_)
         order = np.random.default_rng(0).permutation(len(self.points))
@@ -109,6 +109,7 @@ class _ClassFit:
         """Count the free ground truths that each line matches, averaged over thresholds. (N,)"""
         hits = []
         for t, threshold in enumerate(self.thresholds):
+            # Without a ground truth in reach, ``nearest`` is -1 and the distance infinite.
             is_new = (distance <= threshold) & ~self.is_taken[t][nearest]
             hits.append(is_new.sum(axis=-1))
         return np.asarray(np.mean(hits, axis=0))
@@ -225,7 +226,7 @@ def evaluate_prior(
         if metric.name == "chamfer" and isinstance(metric, ChamferConfig):
             chamfer = metric
     all_train, _ = read_ground_truth(train_path, evaluator.classes)
-    step = max(1, -(-len(all_train) // _MAX_TRAINING_SAMPLES))
+    step = max(1, math.ceil(len(all_train) / _MAX_TRAINING_SAMPLES))
     train = dict(list(all_train.items())[::step])
     truth, _ = read_ground_truth(truth_path, evaluator.classes)
     prior = fit_prior(list(train.values()), chamfer=chamfer, max_elements=max_elements)

@@ -60,6 +60,7 @@ def interpolated_ap(hits: BoolArray, num_gts: int) -> float:
     # COCO adds the spacing of 1 to the denominator, so a perfect class gives 1 - 2e-16
     precision = true_positives / (np.arange(1, len(true_positives) + 1) + np.spacing(1.0))
     envelope = np.maximum.accumulate(precision[::-1])[::-1]
+    # First prediction that reaches each recall; beyond all of them, the precision is 0.
     ranks = np.searchsorted(true_positives / num_gts, _RECALL_POINTS, side="left")
     return float(np.append(envelope, 0.0)[ranks].mean())
 
@@ -80,6 +81,7 @@ def ten_point_ap(hits: BoolArray, num_gts: int) -> float:
     _, precision = precision_recall(hits, num_gts)
     envelope = np.maximum.accumulate(precision[::-1])[::-1]
     min_true_positives = -(-np.arange(1, 11) * num_gts // 10)  # rounded up
+    # First prediction that reaches each recall; beyond all of them, the precision is 0.
     ranks = np.searchsorted(np.cumsum(hits), min_true_positives, side="left")
     return float(np.append(envelope, 0.0)[ranks].mean())
 

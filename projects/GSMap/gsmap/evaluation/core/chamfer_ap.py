@@ -138,6 +138,7 @@ def _line(lines: kernels.Lines, index: int) -> FloatArray:
 
 def _strips_touch(first: FloatArray, second: FloatArray) -> bool:
     """Whether the 4 m wide strips around two lines intersect; ends are flat, corners mitred."""
+    # A point beside a segment is inside the strip of that segment, and on its own line.
     if kernels.beside_a_segment(first, second, STRIP_HALF_WIDTH_M):
         return True
     import shapely  # only a handful of pairs per thousand frames reach this line
@@ -233,8 +234,9 @@ def _match(sample: Sample, config: ChamferConfig) -> FrameMatches:
     except ValueError as error:
         raise InputError(f"sample {token!r}, AP_chamfer of dim {config.dim}: {error}") from error
     rows = ranked_predictions(predictions, num_classes=num_classes)
+    # Only the nearest ground truth has a quality; without one, index -1 is the last column.
     quality = np.full((len(rows), len(ground_truth) + 1), -np.inf)
-    quality[np.arange(len(rows)), nearest[rows]] = -distance[rows]  # last column: no nearest
+    quality[np.arange(len(rows)), nearest[rows]] = -distance[rows]
     min_quality = np.tile(np.negative(config.thresholds), reps=(len(rows), 1))
     matched_gt = assign(quality, thresholds=min_quality)
     is_match = (matched_gt >= 0).any(axis=1)

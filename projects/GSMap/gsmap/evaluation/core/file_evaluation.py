@@ -48,10 +48,14 @@ class AnnotatedTruth:
         missing = [name for name in classes if name not in names]
         if missing:
             raise InputError(f"{path} has the classes {names}, not {missing}.")
-        labels = [classes.index(name) if name in classes else -1 for name in names]
-        self._labels = np.array(labels)
+        # Label in ``classes`` by the label in the file.
+        self._labels = np.full(len(names), fill_value=-1)
+        for label, name in enumerate(names):
+            if name in classes:
+                self._labels[label] = classes.index(name)
         self._rows = shard.part(range(len(self._file)))
-        self.ignored = Counter({THREE_D: len(self._file) * (self._file.meta.dim == 3)})
+        has_heights = self._file.meta.dim == 3
+        self.ignored = Counter({THREE_D: len(self._file) if has_heights else 0})
 
     def __iter__(self) -> Iterator[tuple[str, MapElements, int]]:
         """Yield token, elements and row of each sample."""
@@ -214,7 +218,7 @@ class SamplePairs:
             FileNotFoundError: If a file does not exist.
             ValueError: If a file is malformed or the samples differ.
         """
-        # samples whose partner is missing so far: their elements, or their places in the file
+        # Samples whose partner is missing so far: their elements, or their places in the file.
         pending_results: dict[str, Any] = {}
         pending_truth: dict[str, Any] = {}
         results = self._items_of_shard(self._results)
@@ -349,9 +353,17 @@ def match_samples(
     Yields:
         Records of each sample.
     """
-    stream = iter(pairs)
-    chunks = iter(lambda: list(islice(stream, CHUNK)), [])
     with Progress(unit="samples") as bar:
-        for matches in ordered_map(evaluator.match_all, chunks, num_workers):
+        for matches in ordered_map(evaluator.match_all, _chunks(pairs), num_workers):
             yield from matches
             bar.update(len(matches))
+
+
+def _chunks(pairs: Iterable[Sample]) -> Iterator[list[Sample]]:
+    """Yield lists of up to ``CHUNK`` consecutive samples."""
+    stream = iter(pairs)
+    while True:
+        chunk = list(islice(stream, CHUNK))
+        if not chunk:
+            return
+        yield chunk

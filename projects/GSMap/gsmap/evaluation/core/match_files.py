@@ -17,7 +17,8 @@ from gsmap.utils.files import DAMAGED_ZIP, atomic_write
 from gsmap.utils.shards import Shard, ShardFile
 
 SHARD_KIND = "matches"
-_FAULTS = KeyError, TypeError, ValueError, IndexError, ArithmeticError, AttributeError
+# Errors of code that reads a manifest or arrays of another form than expected.
+_FAULTS = (KeyError, TypeError, ValueError, IndexError, ArithmeticError, AttributeError)
 _TOKENS = "/tokens"
 _LENGTHS = "/lengths"
 Arrays = Mapping[str, npt.NDArray[Any]]
@@ -60,9 +61,10 @@ def write_matches(
         Path of the file.
     """
     arrays = {"notes": np.array(notes, dtype=str)}
-    for metric in matches[0] if matches else ():
-        records = [sample[metric] for sample in matches]
-        arrays |= _join_records(metric, records=records)
+    for metric in evaluator.metrics:
+        records = [sample[metric.name] for sample in matches]
+        if records:
+            arrays |= _join_records(metric.name, records=records)
     with atomic_write(shard.path_of(target), mode="wb") as file:
         np.savez_compressed(file, **arrays)
     rules = {

@@ -51,7 +51,7 @@ class FrameMatches:
     num_gts: IntArray
     class_iou: FloatArray | None = None
 
-    def if_two_sided(self) -> "FrameMatches":
+    def empty_if_one_sided(self) -> "FrameMatches":
         """Return these matches, or the matches of an empty sample if a side has no element."""
         if len(self.labels) and self.num_gts.any():
             return self
@@ -227,6 +227,7 @@ class MatchTable:
         num_thresholds = len(next(iter(thresholds.values())))
         order = self._order
 
+        # Rows of the columns, with the samples in the order of their tokens.
         lengths = columns["length"]
         starts = np.cumsum(lengths) - lengths  # first row of each sample in the columns
         sorted_lengths = lengths[order]
@@ -242,7 +243,8 @@ class MatchTable:
         detections = {}
         for label, (name, class_thresholds) in enumerate(thresholds.items()):
             places = np.flatnonzero(labels == label)
-            first_of_sample = np.searchsorted(samples[places], samples[places])
+            samples_of_class = samples[places]  # ascending
+            first_of_sample = np.searchsorted(samples_of_class, samples_of_class)
             ranks = np.arange(len(places)) - first_of_sample
             by_score = np.argsort(-scores[places], kind="stable")
             places = places[by_score]

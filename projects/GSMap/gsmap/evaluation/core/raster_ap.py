@@ -189,14 +189,16 @@ def match_raster(
     )  # (N, K)
     class_thresholds = np.array(list(config.thresholds.values()))
     matched = assign(ious, thresholds=class_thresholds[pred_labels])  # (N, T)
-    padded_ious = np.full((len(rows), len(gt_index) + 1), fill_value=np.nan)  # column -1: no match
+    # Without a match, ``matched`` is -1, the index of the last entry.
+    padded_gt_index = np.append(gt_index, -1)
+    padded_ious = np.full((len(rows), len(gt_index) + 1), fill_value=np.nan)
     padded_ious[:, :-1] = ious
     return FrameMatches(
         token=token,
         pred_index=rows,
         labels=pred_labels,
         scores=predictions.confidence[rows],
-        matched_gt=np.append(gt_index, -1)[matched],
+        matched_gt=padded_gt_index[matched],
         quality=padded_ious[np.arange(len(rows)), matched[:, 0]],
         num_gts=np.bincount(gt_labels, minlength=num_classes),
         class_iou=kernels.class_ious(pred_masks, gt_masks, pred_labels, gt_labels, num_classes),
@@ -214,8 +216,10 @@ def _class_figures(ranked: ClassDetections, ious: FloatArray) -> dict[str, float
     aps = [interpolated_ap(hits, num_gts=ranked.num_gts) for hits in ranked.hits.T]
     figures = class_figures(ranked, aps=aps, absent=UNDEFINED)
     for limit in RECALL_LIMITS:
-        hits = ranked.hits[ranked.ranks < limit].sum(axis=0)
-        figures[f"AR@{limit}"] = _mean(hits / ranked.num_gts if ranked.num_gts else ())
+        figures[f"AR@{limit}"] = UNDEFINED
+        if ranked.num_gts:
+            hits = ranked.hits[ranked.ranks < limit].sum(axis=0)
+            figures[f"AR@{limit}"] = _mean(hits / ranked.num_gts)
     figures["mIoU"] = _mean(ious[~np.isnan(ious)])
     return figures
 
@@ -247,8 +251,8 @@ def raster_report(matches: MatchTable, config: RasterConfig) -> MetricReport:
         for key in figures[names[0]]:
             if key.startswith(_GROUP_FIGURES):
                 metrics[f"{group}/{key}"] = _mean(figures[name][key] for name in names)
-    metrics["mAP"] = _mean(of_class["AP"] for of_class in figures.values())
-    metrics["mIoU"] = _mean(of_class["mIoU"] for of_class in figures.values())
+    metrics["mAP"] = _mean(values["AP"] for values in figures.values())
+    metrics["mIoU"] = _mean(values["mIoU"] for values in figures.values())
     metrics["num_absent_classes"] = float(len(config.classes) - num_present)
     metrics["num_samples"] = float(len(matches))
     return MetricReport(

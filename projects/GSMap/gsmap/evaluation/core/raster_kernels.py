@@ -43,7 +43,9 @@ def _stamp(mask: WordArray, width: int, row: int, left: int, right: int, radius:
 @njit(cache=True)
 def _side(value: int, limit: int) -> int:
     """Return -1 below 0, 1 above the limit, and 0 between."""
-    return -1 if value < 0 else (1 if value > limit else 0)
+    if value < 0:
+        return -1
+    return 1 if value > limit else 0
 
 
 @njit(cache=True)
@@ -93,15 +95,19 @@ def _draw_segment(mask: WordArray, width: int, start: IntArray, end: IntArray, r
     error = major - 2 * minor
     left = x  # first pixel of the current row
     for _ in range(major):
-        steps_aside = error < 0
-        error += (2 * major if steps_aside else 0) - 2 * minor
-        if is_steep or steps_aside:
+        steps_aside = error < 0  # a step along the shorter axis, too
+        error -= 2 * minor
+        if steps_aside:
+            error += 2 * major
+        changes_row = is_steep or steps_aside
+        changes_column = not is_steep or steps_aside
+        if changes_row:
             _stamp(mask, width, row=y, left=left, right=x, radius=radius)
             y += row_step
-            x += 1 if (steps_aside or not is_steep) else 0
-            left = x
-        else:
+        if changes_column:
             x += 1
+        if changes_row:
+            left = x
     _stamp(mask, width, row=y, left=left, right=x, radius=radius)
 
 
@@ -141,7 +147,8 @@ def _fill(
             high[i] = max(a[1], b[1])
             upper = first if a[1] < b[1] else last
             x_start[i] = upper[0] * _PER_PIXEL + (low[i] - upper[1]) * slope[i]
-            x_start[i] += 0 if cut[i] else _PER_PIXEL // 2
+            if not cut[i]:
+                x_start[i] += _PER_PIXEL // 2
     crossings = np.zeros(num_edges, dtype=np.int64)
     for row in range(max(0, low.min()), min(height, high.max())):
         count = 0
@@ -178,7 +185,7 @@ def draw(
     masks = np.zeros((len(filled), height, num_words), dtype=np.uint64)
     for i in range(len(masks)):
         corners = pixels[offsets[i] : offsets[i + 1]]
-        num_edges = len(corners) - (0 if filled[i] else 1)
+        num_edges = len(corners) if filled[i] else len(corners) - 1  # a polygon is closed
         edges = np.zeros((max(num_edges, 0), 2, 2), dtype=np.int64)
         cut = np.zeros(len(edges), dtype=np.bool_)
         for j in range(len(edges)):

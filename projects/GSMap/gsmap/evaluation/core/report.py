@@ -174,7 +174,8 @@ def _group_lines(report: MetricReport, group: str) -> list[str]:
         for cell, title in zip(cells, titles, strict=False):  # the means have no details
             line += cell.rjust(max(len(title), 6) + 2)
         lines.append(line)
-    lines.insert(1, "-" * len(lines[-2]))
+    last_class_line = lines[-2]
+    lines.insert(1, "-" * len(last_class_line))
     return lines
 
 

@@ -103,7 +103,7 @@ class SampleFile:
         """
         tokens = set()
         form = f'{{"{self._key}": [{{"sample_token": ..., "vectors": [...]}}, ...]}}'
-        other_entries: dict[str, Any] = {"meta": None}
+        other_entries: dict[str, Any] = {"meta": None}  # `items_of` fills it
         for item, place in items_of(self.path, self._key, f"it must be {form}", other_entries):
             token, elements = self._convert(item, self.ignored)
             if token in tokens:
@@ -201,10 +201,11 @@ def read_vectors(
     if has_heights:
         ignored[THREE_D] += 1
     gaussian_fields = {}
-    for name in _GAUSSIAN_FIELDS if gaussians and vectors else ():
-        key = f"gaussian_{name}"
-        if all(key in vector for vector in vectors):
-            gaussian_fields[name] = [vector[key] for vector in vectors]
+    if gaussians and vectors:
+        for name in _GAUSSIAN_FIELDS:
+            key = f"gaussian_{name}"
+            if all(key in vector for vector in vectors):
+                gaussian_fields[name] = [vector[key] for vector in vectors]
     elements = MapElements.from_polylines(
         polylines,
         labels=labels,
@@ -226,11 +227,12 @@ def _check_lengths(elements: MapElements) -> None:
         return
     max_coordinate = np.abs(points).max()
     max_step = 2 * float(max_coordinate) * points.shape[1] ** 0.5
-    if max_step * len(points) <= FARTHEST_M:
+    if max_step * len(points) <= FARTHEST_M:  # a bound on the length of all lines
         return
     steps = np.linalg.norm(np.diff(points, axis=0, prepend=points[:1]), axis=1)
     starts = elements.offsets[:-1]
-    steps[starts[starts < len(steps)]] = 0.0
+    first_vertices = starts[starts < len(steps)]  # a last line may have no vertex
+    steps[first_vertices] = 0.0
     total = steps.sum()
     if max_coordinate > FARTHEST_M or total > FARTHEST_M:
         lengths = [steps[start:end].sum() for start, end in pairwise(elements.offsets)]

@@ -280,7 +280,7 @@ def line_distances(
     from_pred = _mean_distances(
         gt.mask, is_near=is_near, rows=pred.rows, columns=pred.columns, owners=pred.owners
     ).T  # (n, k)
-    is_near = from_pred * PIXEL_M / 2 < limit_m
+    is_near = from_pred * PIXEL_M / 2 < limit_m  # one direction is half of the distance
     from_gt = _mean_distances(
         pred.mask, is_near=is_near, rows=gt.rows, columns=gt.columns, owners=gt.owners
     )
@@ -381,7 +381,8 @@ def sample_aps(detections: ClassDetections) -> FloatArray:
     ends = np.cumsum(num_preds)
     starts = ends - num_preds
     for t, hits in enumerate(detections.hits.T):
-        sorted_hits = hits[np.lexsort((~hits, scores, samples))]
+        order = np.lexsort((~hits, scores, samples))  # by sample, then score, then matches first
+        sorted_hits = hits[order]
         hits_of_sample = np.bincount(samples, weights=hits, minlength=num_samples)
         for s in np.flatnonzero(hits_of_sample > 0).tolist():
             hits_in_sample = sorted_hits[starts[s] : ends[s]]

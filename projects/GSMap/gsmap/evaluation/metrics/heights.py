@@ -66,7 +66,7 @@ class Heights(Metric):
         matches = match_chamfer(predictions, truth, config=rules, token=token)
         pred_lines = self._resample(predictions)
         gt_lines = self._resample(truth)
-        matched_gt = matches.matched_gt[:, -1]
+        matched_gt = matches.matched_gt[:, -1]  # at the loosest threshold; -1 without a match
         rows = np.flatnonzero(matched_gt >= 0)
         errors = np.empty((len(rows), 2, self.num_points))  # height, distance in the plane
         for index, row in enumerate(rows.tolist()):
@@ -99,7 +99,9 @@ class Heights(Metric):
         figures: dict[str, float] = {}
         for label, name in enumerate(self.classes):
             is_class = labels == label
-            heights, distances = errors[is_class].transpose(1, 0, 2).reshape(2, -1)
+            class_errors = errors[is_class]
+            heights = class_errors[:, 0].ravel()
+            distances = class_errors[:, 1].ravel()
             figures[f"{name}/height_error_m"] = _mean(abs(heights))
             figures[f"{name}/height_bias_m"] = _mean(heights)
             figures[f"{name}/plane_error_m"] = _mean(distances)

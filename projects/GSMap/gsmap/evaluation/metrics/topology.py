@@ -183,5 +183,5 @@ def count_folds(line: FloatArray, is_area: bool) -> int:
 
 def _lines(elements: MapElements, chosen: BoolArray) -> list[FloatArray]:
     """Return the vertices of the chosen elements of two points or more."""
-    lines = elements.polylines
-    return [lines[i] for i in np.flatnonzero(chosen & (elements.num_points >= 2)).tolist()]
+    is_line = elements.num_points >= 2
+    return elements.select(chosen & is_line).polylines

@@ -43,7 +43,7 @@ class VectorMapNetAP(ChamferConfig):
 
     def match(self, sample: Sample) -> FrameMatches:
         """Match one sample; the matches are empty without predictions or without ground truth."""
-        return super().match(sample).if_two_sided()
+        return super().match(sample).empty_if_one_sided()
 
 
 @register_metric

@@ -48,6 +48,7 @@ def choose_frames(
         f1 = []
         for result in results:
             f1.append(np.array([result.f1(token, score_thr) for token in tokens]))
+        # The samples with the lowest values are chosen.
         ranking = f1[0] if len(f1) == 1 else -abs(f1[0] - f1[1])
         num_chosen = len(chosen) + max_frames - num_even
         for index in np.argsort(ranking, kind="stable").tolist():
@@ -177,7 +178,8 @@ def cameras_of(
         entries = []
         for index, camera in enumerate(row):
             matrix = _img_from_display(camera, view)
-            looks_ahead = not rows and index == len(row) // 2
+            is_front_row = not rows
+            looks_ahead = is_front_row and index == len(row) // 2  # the middle camera
             largest_px = 2 * width_px if looks_ahead else width_px
             entry = {
                 "title": camera_title(camera.name),
