@@ -48,7 +48,7 @@ def main() -> str:
     with building(cfg):
         dataset = DATASETS.build(cfg[f"{args.split}_dataloader"].dataset)
     if args.web:
-        options = PageOptions(Path(dataset.data_root), args.num)
+        options = PageOptions(data_root=Path(dataset.data_root), max_frames=args.num)
         return write_page(args.web, page_data(dataset.ann_file, {}, options))
     visualizer = MapVisualizer("browse", show_order=args.order)
     visualizer.dataset_meta = dataset.metainfo

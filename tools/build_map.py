@@ -9,7 +9,7 @@ Examples:
     python tools/build_map.py --map town.osm --ann annotations.arrow --prior town.prior
 """
 
-import gsmap  # noqa: F401 - first: Ctrl-C is one line from here on, foreign settings are kept out
+import gsmap  # noqa: F401 - first: it handles Ctrl-C during imports and bars foreign settings
 
 # isort: split
 import argparse

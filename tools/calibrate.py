@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from gsmap.datasets.annotations.file import AnnotationFile
-from gsmap.evaluation.analysis.calibration import LAWS, fitted_factors, matched_vertices
+from gsmap.evaluation.analysis.calibration import LAWS, fit_factors, matched_vertices
 from gsmap.evaluation.core.chamfer_ap import ChamferConfig
 from gsmap.evaluation.core.file_evaluation import SamplePairs
 from gsmap.utils.cli import CommandParser, output_file, run_command
@@ -105,7 +105,7 @@ def main() -> str:
                 f"{args.results} was made with another checkpoint than {args.checkpoint}: give "
                 "this one's predictions (tools/test.py --out)."
             )
-        factors = fitted_factors(vertices, classes, args.sigmas, args.law)
+        factors = fit_factors(vertices, classes, args.sigmas, args.law)
         cfg.model.map_head.temperatures = factors.round(4).tolist()
     meta = {
         MODEL_SETTINGS: json.dumps(plain(cfg.model.to_dict())),

@@ -13,7 +13,7 @@ Examples:
     python tools/compare.py --list --tables 'GSMap Table 5*'
 """
 
-import gsmap  # noqa: F401 - first: Ctrl-C is one line from here on, foreign settings are kept out
+import gsmap  # noqa: F401 - first: it handles Ctrl-C during imports and bars foreign settings
 
 # isort: split
 import argparse
@@ -141,14 +141,14 @@ def listing(tables: list[dict[str, Any]]) -> Iterator[str]:
 
 
 def slurm_commands(runs: list[Run], partition: str) -> str:
-    """Commands for the unfinished runs, one per line."""
+    """Commands for the unfinished runs, one per line: this command with ``--only``."""
     slurm_option = argparse.ArgumentParser(add_help=False)
     slurm_option.add_argument("--slurm")
     _, other_words = slurm_option.parse_known_args()
     launch = ["srun", f"--partition={partition}", "--gres=gpu:1", "--ntasks=1", "--cpus-per-task=5"]
     commands = []
     for run in runs:
-        if not run.done:
+        if not run.is_done:
             words = [*launch, f"--job-name={run.label}", sys.executable, sys.argv[0], *other_words]
             commands.append(f"{shlex.join(words)} --only {run.label}")
     return "\n".join(commands)
@@ -218,7 +218,7 @@ def main() -> str:
     if not args.rescore:
         train(chosen)
     tables = "" if args.only else tabulate(runs, args)
-    failed = [run.label for run in chosen if not run.done]
+    failed = [run.label for run in chosen if not run.is_done]
     if failed:
         sys.stdout.write(f"{tables}\n")
         raise WorkError(f"{', '.join(failed)} did not end: the table says why.")

@@ -53,22 +53,26 @@ def convert(source: Path, target: Path, allow_changes: bool = False) -> str:
         ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError,
     ) as error:  # fmt: skip
         raise InputError(f"{source} cannot be converted: {error}") from error
-    of_model = []
-    others = []
+    model_settings = []  # without a counterpart, as the others
+    other_settings = []
     for setting in conversion.unplaced:
-        settings = of_model if setting.startswith("model.") else others
-        settings.append(setting)
-    if of_model and not allow_changes:
+        if setting.startswith("model."):
+            model_settings.append(setting)
+        else:
+            other_settings.append(setting)
+    if model_settings and not allow_changes:
+        examples = ", ".join(model_settings[:3])[:300]
         raise InputError(
-            f"{source} would become another model: {len(of_model)} of its settings have no "
-            f"counterpart, {', '.join(of_model[:3])[:300]}... --allow-changes leaves them out."
+            f"{source} would become another model: {len(model_settings)} of its settings have no "
+            f"counterpart, {examples}... --allow-changes leaves them out."
         )
     write_text(target, text)
     lines = [f"{target} is written: configs/{conversion.base} with the settings of {source}"]
-    for title, settings in (("another model, without", of_model), ("not placed", others)):
-        if settings:
+    unplaced = {"another model, without": model_settings, "not placed": other_settings}
+    for title, names in unplaced.items():
+        if names:
             lines.append(f"{title}, see docs/migration.md:")
-            lines += [f"  {setting}" for setting in settings]
+            lines += [f"  {name}" for name in names]
     return "\n".join(lines)
 
 

@@ -27,7 +27,8 @@ from gsmap.utils.parallel import die_with_parent
 from gsmap.utils.shipped import shipped_path
 from gsmap.utils.words import markdown_table
 
-MODELS = {"GSMap": "gsmap_r18_minicity", "MapTR": "maptr_r18_minicity"}  # that ship
+MODELS = {"GSMap": "gsmap_r18_minicity", "MapTR": "maptr_r18_minicity"}
+"""Names of the models that ship with the library, by the title of their method."""
 NEXT = """
 To go on in this environment:
     source {activate}
@@ -387,7 +388,8 @@ def main() -> None:
                 work = folder / f"shipped_{name.lower()}"
                 print(f"\n{minutes:.1f} min: predictions of the {name} that ships:")
                 print(f"{first_picture(work)}\n{work / 'report.html'}\n", flush=True)
-    summary = table(folder, dict.fromkeys([*args.models, "MapTR"]), runs)
+    shipped_names = dict.fromkeys([*args.models, "MapTR"])  # without repetitions
+    summary = table(folder, shipped_names, runs)
     print(f"\nAP in percent on MiniCity's validation towns\n\n{summary}\n")
     write_text(folder / "summary.md", summary + "\n")
     for training in runs:

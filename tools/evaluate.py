@@ -13,7 +13,7 @@ import os
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")  # idle threads would only stand in the workers' way
 
-import gsmap  # noqa: F401 - first: Ctrl-C is one line from here on, foreign settings are kept out
+import gsmap  # noqa: F401 - first: it handles Ctrl-C during imports and bars foreign settings
 
 # isort: split
 import argparse
@@ -49,12 +49,12 @@ from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.cli import run_command
 from gsmap.utils.errors import InputError
-from gsmap.utils.faults import nearest
+from gsmap.utils.faults import suggestion
 from gsmap.utils.ray_shards import run_on_ray
 from gsmap.utils.shards import digest, digest_of_common, read_shard
 from gsmap.utils.words import format_count
 
-PRINTED = ("intervals", "by", "uncertainty")  # reports whose analysis has printed them
+PRINTED = ("intervals", "by", "uncertainty")  # reports that their analyses print themselves
 
 
 def metric_settings(args: argparse.Namespace) -> MetricSettings:
@@ -68,16 +68,18 @@ def metric_settings(args: argparse.Namespace) -> MetricSettings:
         x_range = meta.x_range
         y_range = meta.y_range
     classes = tuple(args.classes or classes)
-    for name in set(args.polygon_classes) - {*classes, *AREA_CLASSES}:
-        raise InputError(f"--polygon-classes: there is no class {name!r}{nearest(name, classes)}")
+    for name in args.polygon_classes:
+        if name not in classes and name not in AREA_CLASSES:
+            hint = suggestion(name, classes)
+            raise InputError(f"--polygon-classes: there is no class {name!r}{hint}")
     if args.range:
         x_min, y_min, x_max, y_max = args.range
         x_range = (x_min, x_max)
         y_range = (y_min, y_max)
     thresholds = HARD_CHAMFER_THRESHOLDS if args.hard else args.thresholds
     return MetricSettings(
-        classes,
-        tuple(thresholds) if thresholds else None,
+        classes=classes,
+        thresholds=tuple(thresholds) if thresholds else None,
         dim=args.dim,
         resample_predictions=not args.keep_pred_points,
         resample_ground_truth=not args.keep_gt_points,
@@ -96,7 +98,8 @@ def build_evaluator(args: argparse.Namespace, settings: MetricSettings) -> MapEv
     for module in args.custom_imports:
         import_module(module)
     evaluator = MapEvaluator.from_names(args.eval, settings, args.gt_points)
-    if args.min_score is not None and not any(m.takes_min_score for m in evaluator.metrics):
+    uses_min_score = any(metric.takes_min_score for metric in evaluator.metrics)
+    if args.min_score is not None and not uses_min_score:
         takers = [name for name in metric_files() if metric_class(name).takes_min_score]
         raise InputError(f"--min-score is of {', '.join(takers)}: leave it out.")
     if args.pr_curves and not any(metric.has_curves for metric in evaluator.metrics):
@@ -138,9 +141,9 @@ def evaluate_input(args: argparse.Namespace, evaluator: MapEvaluator) -> Evaluat
     return evaluate_prior(
         args.prior,
         args.ground_truth,
-        evaluator,
-        args.prior_elements,
-        args.allow_other_split,
+        evaluator=evaluator,
+        max_elements=args.prior_elements,
+        allow_other_split=args.allow_other_split,
     )
 
 
@@ -156,6 +159,7 @@ def match_shard(args: argparse.Namespace, evaluator: MapEvaluator, settings: Met
         A line with the number of samples and the file.
     """
     require_own_matches(args.out, args.shard)
+    # The results are one file for all shards, or have a shard of their own for this one.
     results = args.results
     results_shard = args.shard.path_of(args.results)
     if args.results.exists() or not results_shard.exists():
@@ -167,7 +171,15 @@ def match_shard(args: argparse.Namespace, evaluator: MapEvaluator, settings: Met
     matches = list(match_samples(pairs, evaluator, args.workers))
     notes = pairs.notes(evaluator.counts_heights)
     source += digest(args.ground_truth)
-    path = write_matches(args.out, args.shard, matches, notes, evaluator, settings, source)
+    path = write_matches(
+        args.out,
+        args.shard,
+        matches=matches,
+        notes=notes,
+        evaluator=evaluator,
+        settings=settings,
+        source=source,
+    )
     return f"{format_count(len(matches), 'sample')} matched: {path}"
 
 
@@ -207,20 +219,20 @@ def main(argv: list[str] | None = None) -> str:
     groups = read_groups(args)  # faults of these files end the command before it scores
     resamples = read_resamples(args)
     reports, notes = evaluate_input(args, evaluator)
-    ranked = []
-    counts = []
+    ranked = []  # reports of metrics with an AP
+    unranked = []
     for report in reports:
         if report.detections:
             ranked.append(report)
         else:
-            counts.append(report)
+            unranked.append(report)
     analyses = []
     if resamples is not None:
         others = evaluate_results(args.against, args, evaluator) if args.against else None
         analyses.append(interval_report((ranked, notes), others, resamples, args))
     if args.by:
         analyses.append(group_report(ranked, groups, args, evaluator))
-    analyses.extend(counts)
+    analyses.extend(unranked)
     if args.consistency:
         analyses.append(consistency_report(args))
     if args.uncertainty:

@@ -8,7 +8,7 @@ Examples:
 The config sets the cameras. The image size is that of its test samples, or ``--size``.
 """
 
-import gsmap  # noqa: F401 - first: Ctrl-C is one line from here on, foreign settings are kept out
+import gsmap  # noqa: F401 - first: it handles Ctrl-C during imports and bars foreign settings
 
 # isort: split
 import argparse
@@ -124,13 +124,14 @@ def write_model(inferencer: MapInferencer, args: argparse.Namespace) -> OnnxInfe
         write(args.out)
         return OnnxInferencer(args.out)
     with tempfile.TemporaryDirectory(prefix="gsmap-") as folder:
-        single = Path(folder, "fp32.onnx")
-        write(single)
+        single_precision = Path(folder, "fp32.onnx")
+        write(single_precision)
         if args.fp16:
-            halve_onnx(single, args.out)
+            halve_onnx(single_precision, args.out)
         else:
-            samples = calibration_samples(inferencer, OnnxInferencer(single), args)
-            quantize_onnx(single, args.out, samples)
+            exported = OnnxInferencer(single_precision)
+            samples = calibration_samples(inferencer, exported, args)
+            quantize_onnx(single_precision, args.out, samples)
     return OnnxInferencer(args.out)
 
 
@@ -148,7 +149,8 @@ def calibration_samples(
         Arrays of one sample, by the name of the input.
     """
     dataset = open_samples(inferencer, args, args.calibration, split="train")
-    chosen = select_samples(dataset.annotations.column("token"), None, args.calibration_samples)
+    tokens = dataset.annotations.column("token")
+    chosen = select_samples(tokens, max_num=args.calibration_samples)
     for _, inputs in graph_inputs(exported, dataset, chosen):
         yield inputs
 
@@ -165,7 +167,7 @@ def check(inferencer: MapInferencer, exported: OnnxInferencer, args: argparse.Na
         A sentence with the largest differences.
     """
     dataset = open_samples(inferencer, args, args.samples, split="test")
-    chosen = select_samples(dataset.annotations.column("token"), None, args.check)
+    chosen = select_samples(dataset.annotations.column("token"), max_num=args.check)
     unfolded = exported.metadata.get("unfold_classes", [])
     in_torch = inferencer.predict(dataset, chosen)
     samples = graph_inputs(exported, dataset, chosen)

@@ -23,7 +23,7 @@ from gsmap.engine.arguments import add_config_options
 from gsmap.evaluation.core.results_json import SHARD_KIND as RESULTS
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.errors import InputError
-from gsmap.utils.files import own_folder, write_bytes
+from gsmap.utils.files import register_folder, write_bytes
 from gsmap.utils.model_facts import CALIBRATION, CHECKPOINT
 from gsmap.utils.progress import Progress
 from gsmap.utils.ray_shards import run_on_ray
@@ -48,9 +48,10 @@ if TYPE_CHECKING:  # slow to import
     from gsmap.apis.frame_loader import BrokenFrame
     from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
 
-_ONE_SAMPLE_HZ = 1e-4
+_ONE_SAMPLE_HZ = 1e-4  # rate at which a drive has one sample
 _SAMPLES = ".arrow"  # suffix of the file with the samples, in place of the one of --out
-SKIPPED = DOUBTFUL = 1  # exit code when frames were broken, or a calibration is implausible
+SKIPPED = 1  # exit code after broken frames
+DOUBTFUL = 1  # exit code for an implausible calibration
 
 
 def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
@@ -167,8 +168,8 @@ def read_input(args: argparse.Namespace, frames: Path | None = None) -> Source:
     rate_hz = _ONE_SAMPLE_HZ
     if frames is None:
         rate_hz = args.rate
-        place = args.out.with_suffix("") if args.out else (args.show_dir or Path()) / "input"
-        frames = own_folder(place.with_name(f"{place.name}_frames"))
+        stem = args.out.with_suffix("") if args.out else (args.show_dir or Path()) / "input"
+        frames = register_folder(stem.with_name(f"{stem.name}_frames"))
     options = InputOptions(
         data_root=args.data_root,
         allow_missing_cameras=args.allow_missing_cameras,
@@ -342,9 +343,15 @@ def predict(
             if results and frame.token not in done:
                 results.add_broken(frame.token, frame.reason)
 
-        for sample in inferencer.predict(
-            dataset, chosen, args.batch_size, args.workers, args.allow_missing_cameras, skip
-        ):
+        samples = inferencer.predict(
+            dataset,
+            chosen,
+            batch_size=args.batch_size,
+            num_workers=args.workers,
+            allow_missing_cameras=args.allow_missing_cameras,
+            on_broken=skip,
+        )
+        for sample in samples:
             token = str(sample.metainfo["token"])
             if args.show_dir:
                 draw(args, inferencer, dataset, sample)
@@ -416,7 +423,13 @@ def main(argv: list[str] | None = None) -> str | None:
             raise no_usable_frame(broken, source.notes)
         if results:
             count = results.finish(result_header(args, dataset.metainfo))
-            args.shard.seal(args.out, RESULTS, samples_digest, settings, count)
+            args.shard.write_manifest(
+                args.out,
+                kind=RESULTS,
+                source=samples_digest,
+                options=settings,
+                samples=count,
+            )
     print_summary(args, source, dataset.ann_file, len(chosen), broken)
     return None
 
@@ -441,8 +454,12 @@ def print_summary(
         count: Number of samples of the run.
         broken: Reasons of broken frames, by token.
     """
-    out = args.out and args.shard.path_of(args.out)
-    written = " and ".join(str(path) for path in (out, args.show_dir) if path)
+    outputs = []
+    if args.out:
+        outputs.append(str(args.shard.path_of(args.out)))
+    if args.show_dir:
+        outputs.append(str(args.show_dir))
+    written = " and ".join(outputs)
     print(f"{count - len(broken)} of {format_count(count, 'sample')} predicted: {written}")
     if args.out and not isinstance(source.samples, AnnotationFile):
         annotations = args.out.with_suffix(_SAMPLES)

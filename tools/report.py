@@ -74,20 +74,21 @@ def parse_args() -> argparse.Namespace:
     )
     parser.add_argument("--scene", help="drive of a film; default: the first one of --ann")
     args = parser.parse_args()
-    film = args.out.suffix.lower() == ".mp4"
-    if film and (args.by or args.allow_mismatch or args.image_width is not None):
+    is_film = args.out.suffix.lower() == ".mp4"
+    if is_film and (args.by or args.allow_mismatch or args.image_width is not None):
         parser.error("--by, --allow-mismatch and --image-width are of pages: leave them out")
-    if film and (args.allow_other_split or args.law):
+    if is_film and (args.allow_other_split or args.law):
         parser.error("--allow-other-split and --law are of pages: leave them out")
-    if args.scene and not film:
+    if args.scene and not is_film:
         parser.error("--scene is of films: give --out NAME.mp4; a page has a field for the scene")
     return args
 
 
 def main() -> str:
-    foreign = _PAGE.exists() and not is_own_page(_PAGE)
+    # Read before `parse_args`, which declares the page as an output that must not be read.
+    is_foreign = _PAGE.exists() and not is_own_page(_PAGE)
     args = parse_args()
-    if args.out is _PAGE and foreign:
+    if args.out is _PAGE and is_foreign:
         raise FileExistsError(f"{_PAGE} is there, and no page of this command: give --out PAGE.")
     paths = [args.results]
     if args.compare:
@@ -95,7 +96,7 @@ def main() -> str:
     names = args.names or [f"{path.resolve().parent.name}/{path.stem}" for path in paths]
     if len(names) != len(paths) or len(set(names)) != len(names):
         raise InputError(f"--names must give {len(paths)} different names, got {names}.")
-    named = dict(zip(names, paths, strict=True))
+    results = dict(zip(names, paths, strict=True))
     if args.no_images:
         image_width_px = 0
     elif args.image_width is not None:
@@ -105,13 +106,13 @@ def main() -> str:
     if args.out.suffix.lower() == ".mp4":
         return write_drive_film(
             args.out,
-            args.ann,
-            named,
-            args.scene,
-            args.data_root,
-            args.score_thr,
-            not args.no_images,
-            args.max_frames,
+            annotations=args.ann,
+            results=results,
+            scene=args.scene,
+            data_root=args.data_root,
+            score_thr=args.score_thr,
+            images=not args.no_images,
+            max_frames=args.max_frames,
         )
     options = PageOptions(
         data_root=args.data_root,
@@ -123,7 +124,7 @@ def main() -> str:
         allow_other_split=args.allow_other_split,
         law=args.law,
     )
-    data = page_data(args.ann, named, options)
+    data = page_data(args.ann, results, options)
     return write_page(args.out, data)
 
 

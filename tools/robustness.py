@@ -8,7 +8,7 @@ Example:
     python tools/robustness.py gsmap_r18_minicity --data-root data/minicity --samples 50 --out r
 """
 
-import gsmap  # noqa: F401 - first: Ctrl-C is one line from here on, foreign settings are kept out
+import gsmap  # noqa: F401 - first: it handles Ctrl-C during imports and bars foreign settings
 
 # isort: split
 import argparse
@@ -61,7 +61,9 @@ def parse_args() -> argparse.Namespace:
 
 
 def add_corruption(settings: Any, kind: str, severity: int, seed: int) -> dict[str, Any]:
-    """Settings of a data set, with a corruption beside the loading of images in its pipeline.
+    """Settings of a data set with a corruption in its pipeline.
+
+    A delay of cameras comes before the loading of images, other corruptions come after it.
 
     Args:
         settings: Settings of the data set in a config.
@@ -212,7 +214,7 @@ def main() -> str:
 
     checkpoint = checkpoint_for(args.config, args.checkpoint)
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    model = load_model(args.config, checkpoint, device, args.cfg_options)
+    model = load_model(args.config, checkpoint, device=device, cfg_options=args.cfg_options)
     if not args.allow_other_split:
         require_own_split(checkpoint, model.cfg.test_dataloader.dataset)
     if model.temporal is not None and args.samples:
@@ -233,7 +235,7 @@ def main() -> str:
             aps = average_precisions(model, settings, args.samples)
             measured.setdefault(kind, []).append(aps)
             bar.update(1)
-            if kind == CLEAN:
+            if kind == CLEAN:  # the first case: a fault ends the command before the others
                 others = other_figures(earlier, measured[CLEAN], args)
         measured.update(others)
         figures = {kind: measured[kind] for kind in (CLEAN, *KINDS) if kind in measured}

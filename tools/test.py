@@ -4,7 +4,7 @@
 Or give the name of a model that ships: ``python tools/test.py gsmap_r18_minicity``.
 """
 
-import gsmap  # noqa: F401 - first: Ctrl-C is one line from here on, foreign settings are kept out
+import gsmap  # noqa: F401 - first: it handles Ctrl-C during imports and bars foreign settings
 
 # isort: split
 import argparse
@@ -62,13 +62,13 @@ def parse_args() -> argparse.Namespace:
 def apply_options(cfg: Config, args: argparse.Namespace) -> None:
     """Apply the options of this command to the config."""
     cfg.resume = False
-    cfg.test_evaluator = {
+    map_metric = {
         "type": "MapMetric",
         **(cfg.get("test_evaluator") or {}),
         "eval": args.eval,
-        "out_file": args.out and str(args.out),
+        "out_file": str(args.out) if args.out else None,
     }
-    cfg.test_evaluator = [cfg.test_evaluator, {"type": "GaussianMetric"}]
+    cfg.test_evaluator = [map_metric, {"type": "GaussianMetric"}]
     if args.allow_other_split:
         cfg.default_hooks.checkpoint.allow_other_split = True
     if args.show_dir:
@@ -105,4 +105,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main, heed_kill=False)
+    run_command(main, clean_up_on_kill=False)

@@ -1,7 +1,7 @@
 #!/usr/bin/env python
 """Train a model: ``python tools/train.py CONFIG``."""
 
-import gsmap  # noqa: F401 - first: Ctrl-C is one line from here on, foreign settings are kept out
+import gsmap  # noqa: F401 - first: it handles Ctrl-C during imports and bars foreign settings
 
 # isort: split
 import argparse
@@ -64,7 +64,7 @@ def choose_start(cfg: Config, resume: str | None) -> None:
     cfg.load_from = resume or cfg.get("load_from")
     if cfg.load_from and "://" not in str(cfg.load_from):
         cfg.load_from = str(find_checkpoint(cfg.load_from))
-        read_weights(cfg.load_from)
+        read_weights(cfg.load_from)  # raises an error for a file that cannot be loaded
         if not cfg.resume and Path(cfg.load_from).resolve().parent == Path(cfg.work_dir).resolve():
             raise InputError(
                 f"{cfg.load_from}, from which this run is to start, lies in its work folder, whose "
@@ -106,10 +106,11 @@ def main() -> None:
         cfg.auto_scale_lr.enable = True
     with lock_work_dir(cfg.work_dir):
         choose_start(cfg, args.resume)
-        runner = RUNNERS.get(cfg.runner_type) if "runner_type" in cfg else MapRunner
+        runner_type = RUNNERS.get(cfg.runner_type) if "runner_type" in cfg else MapRunner
         with building(cfg):
-            runner.from_cfg(cfg).train()
+            runner = runner_type.from_cfg(cfg)
+            runner.train()
 
 
 if __name__ == "__main__":
-    run_command(main, heed_kill=False)
+    run_command(main, clean_up_on_kill=False)

@@ -5,7 +5,7 @@ Plugins of other packages are left out. The plugin of open3d, which mmdet3d inst
 usual command on machines without libusb.
 """
 
-import gsmap  # noqa: F401 - first: Ctrl-C is one line from here on, foreign settings are kept out
+import gsmap  # noqa: F401 - first: it handles Ctrl-C during imports and bars foreign settings
 
 # isort: split
 from absl import app
@@ -26,4 +26,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main, heed_kill=False)
+    run_command(main, clean_up_on_kill=False)

@@ -6,7 +6,7 @@ from scipy import stats
 
 from gsmap.evaluation.analysis.calibration import (
     Vertices,
-    fitted_factors,
+    fit_factors,
     format_uncertainty,
     matched_vertices,
     sparsification,
@@ -105,10 +105,10 @@ def test_fitted_factors_bring_the_errors_within_their_sigmas():
     parts = [drawn(20000, label, along=2.0, across=0.5) for label in (0, 1, 2)]
     joined = Vertices(*map(np.concatenate, zip(*parts, strict=True)))
     for num_sigmas in (1, 2):
-        found = fitted_factors(joined, CLASSES, num_sigmas)
+        found = fit_factors(joined, CLASSES, num_sigmas)
         np.testing.assert_allclose(found, [[2.0, 0.5]] * 3, rtol=0.03)
     with pytest.raises(ValueError, match="class 'boundary' has 0 matched vertices, 100 are needed"):
-        fitted_factors(parts[0]._replace(labels=np.arange(20000) % 2), CLASSES)
+        fit_factors(parts[0]._replace(labels=np.arange(20000) % 2), CLASSES)
 
 
 def test_long_tails_get_the_coverage_of_the_interval_that_is_fitted():
@@ -116,11 +116,11 @@ def test_long_tails_get_the_coverage_of_the_interval_that_is_fitted():
     rng = np.random.default_rng(0)
     errors = rng.exponential(size=(50000, 2))
     tailed = Vertices(np.zeros(50000, int), errors, np.ones_like(errors), np.ones(50000))
-    one, two = (fitted_factors(tailed, CLASSES[:1], k)[0, 1] for k in (1, 2))
+    one, two = (fit_factors(tailed, CLASSES[:1], k)[0, 1] for k in (1, 2))
     assert one == pytest.approx(1.148, rel=0.02)
     assert two == pytest.approx(3.090 / 2, rel=0.02)
     with pytest.raises(ValueError, match=r"num_sigmas must be in \(0, 3\], got 0"):
-        fitted_factors(tailed, CLASSES[:1], 0)
+        fit_factors(tailed, CLASSES[:1], 0)
 
 
 def test_the_law_of_the_errors_decides_intervals_and_likelihood():
@@ -144,7 +144,7 @@ def test_the_law_of_the_errors_decides_intervals_and_likelihood():
     for key in ("sigma_m", "rank_correlation", "sparsification_error"):
         assert laplace[f"across/{key}"] == normal[f"across/{key}"]
     for num_sigmas in (1, 2):  # both intervals fit one sigma
-        found = fitted_factors(tailed, CLASSES[:1], num_sigmas, "laplace")
+        found = fit_factors(tailed, CLASSES[:1], num_sigmas, "laplace")
         np.testing.assert_allclose(found, [[1.0, 1.0]], rtol=0.02)
 
 

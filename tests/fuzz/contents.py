@@ -167,7 +167,7 @@ def write_shards(
             write_annotations(target, meta, [own], shard)
         elif kind == RESULTS:
             write_results(shard.path_of(target), results[shard.index :: count])
-            shard.seal(target, kind, "", {"model": "m"}, 1)
+            shard.write_manifest(target, kind, "", {"model": "m"}, 1)
         else:
             predicted = replace(elements, scores=np.ones(len(elements)))
             matches = [evaluator.match(own.token, predicted, elements)]

@@ -16,7 +16,7 @@ import torch
 from fuzz import mutations
 from gsmap.datasets.annotations.record import MapSample
 from gsmap.structures.elements import MapElements
-from gsmap.utils.faults import in_words
+from gsmap.utils.faults import user_message
 
 _RUNS = ("os.system", "os.exec", "os.posix_spawn", "os.fork", "subprocess.Popen", "pty.spawn")
 _CHANGES = {"os.rename": 2, "os.mkdir": 1, "os.remove": 1, "os.rmdir": 1, "os.symlink": 2}
@@ -76,7 +76,7 @@ class Reader:
         try:
             result = self.read()
         except Exception as error:
-            text = in_words(error)
+            text = user_message(error)
             if text is None:
                 return "traceback", f"{type(error).__name__}: {error}"
             names = self.path.name, str(self.path.parent), "sample '", "record "

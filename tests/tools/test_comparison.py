@@ -20,7 +20,7 @@ from comparison.results import (
     rescore,
 )
 
-from gsmap.utils.faults import in_words
+from gsmap.utils.faults import user_message
 
 CLASSES = ("divider", "boundary")
 
@@ -209,7 +209,7 @@ def test_a_runs_notes_of_another_kind_are_named(content, tiny_config, protocol, 
     (folder / "settings.json").write_text(content)
     with pytest.raises((ValueError, RecursionError)) as raised:
         plan(entries(tiny_config, "a=CONFIG"), protocol)
-    assert "seed_0/settings.json" in in_words(raised.value)
+    assert "seed_0/settings.json" in user_message(raised.value)
 
 
 def test_results_of_different_ground_truth_are_refused(tmp_path):

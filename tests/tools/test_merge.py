@@ -154,7 +154,7 @@ def test_a_sample_in_two_shards_is_refused(tmp_path):
     target = tmp_path / "map.json"
     for index in (0, 1):
         write_results(Shard(index, 2).path_of(target), [("a", []), (f"b{index}", [])])
-        Shard(index, 2).seal(target, "results", "", {}, 2)
+        Shard(index, 2).write_manifest(target, "results", "", {}, 2)
     with pytest.raises(ValueError, match="sample 'a' twice"):
         merge([str(target)])
     assert not target.exists()

@@ -298,7 +298,7 @@ def command():
         raise InputError("sample 'a' is broken")
     dist.barrier()  # rank 0 waits for ever
 
-run_command(command, heed_kill=False)
+run_command(command, clean_up_on_kill=False)
 """
 
 

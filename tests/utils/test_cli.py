@@ -220,8 +220,8 @@ cli.run_command(command)
 
 
 @pytest.mark.faults
-@pytest.mark.parametrize(("heed_kill", "code", "left"), [(True, 143, 0), (False, -15, 1)])
-def test_kill_runs_the_clean_up_where_that_is_wanted(heed_kill, code, left, tmp_path):
+@pytest.mark.parametrize(("clean_up_on_kill", "code", "left"), [(True, 143, 0), (False, -15, 1)])
+def test_kill_runs_the_clean_up_where_that_is_wanted(clean_up_on_kill, code, left, tmp_path):
     program = f"""
 import time
 from gsmap.utils.cli import output_file, run_command
@@ -232,7 +232,7 @@ def command():
         print("ready", flush=True)
         while True:
             time.sleep(0.05)
-run_command(command, heed_kill={heed_kill})
+run_command(command, clean_up_on_kill={clean_up_on_kill})
 """
     with subprocess.Popen(
         [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE
@@ -278,7 +278,7 @@ def command():
     print("ready", flush=True)  # by the parent: Python ignores what is raised at the end of a fork
     while True:
         time.sleep(0.05)
-run_command(command, heed_kill=False)
+run_command(command, clean_up_on_kill=False)
 """
     for rank, said in (("0", b"interrupted: nothing half-written is left\n"), ("1", b"")):
         with subprocess.Popen(

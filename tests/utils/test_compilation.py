@@ -7,17 +7,17 @@ from pathlib import Path
 import numba
 from numba.core import caching
 
-from gsmap.utils.compilation import place_for_kernels
+from gsmap.utils.compilation import make_kernel_folder
 
 
 def test_a_read_only_installation_without_a_home_compiles_for_the_run(monkeypatch, caplog):
-    assert place_for_kernels() is None
+    assert make_kernel_folder() is None
     user_provided = caching.UserProvidedCacheLocator
     monkeypatch.setattr(caching.CompileResultCacheImpl, "_locator_classes", [user_provided])
     monkeypatch.setattr(numba.config, "CACHE_DIR", "")
     monkeypatch.setenv("NUMBA_CACHE_DIR", "")
     with caplog.at_level(logging.WARNING, "gsmap"):
-        folder = place_for_kernels()
+        folder = make_kernel_folder()
     assert "set NUMBA_CACHE_DIR to a folder that stays" in caplog.text
     assert os.environ["NUMBA_CACHE_DIR"] == folder.name
     assert os.stat(folder.name).st_mode & 0o777 == 0o700  # compiled kernels are code

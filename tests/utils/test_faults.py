@@ -17,7 +17,7 @@ from gsmap.checkpoints.building import building
 from gsmap.checkpoints.reading import refusing
 from gsmap.datasets.errors import explain_errors
 from gsmap.utils.errors import InputError, WorkError
-from gsmap.utils.faults import in_words, is_of_the_machine
+from gsmap.utils.faults import is_machine_error, user_message
 
 PARTS = Registry("part")
 
@@ -44,7 +44,7 @@ def said(command) -> str | None:
     try:
         command()
     except Exception as error:
-        return in_words(error)
+        return user_message(error)
     raise AssertionError("nothing failed")
 
 
@@ -109,13 +109,13 @@ def test_an_error_of_a_part_names_the_config_once(error, raised, text, bike):
     with pytest.raises(raised) as caught, building(bike), building(bike):
         PARTS.build({"type": "Spoke", "error": error})
     assert type(caught.value) is raised
-    assert in_words(caught.value).startswith(text)
+    assert user_message(caught.value).startswith(text)
 
 
 def test_a_bug_beside_the_parts_stays_a_bug():
     with pytest.raises(ValueError, match="could not convert") as caught, building(Config()):
         float("x")
-    assert in_words(caught.value) is None
+    assert user_message(caught.value) is None
 
 
 def test_a_setting_that_is_missing(bike):
@@ -224,7 +224,7 @@ def test_the_signal_of_a_worker_says_what_was_missing(cause, text):
     ],
 )
 def test_a_file_is_not_to_blame_for_what_the_machine_lacks(error, of_machine):
-    assert is_of_the_machine(error) == of_machine
+    assert is_machine_error(error) == of_machine
     for reading in (refusing("a.pth"), explain_errors("a.json", "copy it again")):
         with pytest.raises(type(error) if of_machine else Exception) as raised, reading:
             raise error

@@ -18,10 +18,10 @@ from gsmap.utils.files import (
     file_names,
     lock_folder,
     open_to_append,
-    own_folder,
     partial_path,
+    register_folder,
+    remove_link,
     require_no_link,
-    take_from_link,
     write_bytes,
     write_text,
 )
@@ -302,14 +302,14 @@ def test_what_is_added_to_is_a_plain_file_of_its_own(kind, tmp_path):
     assert theirs.read_text() == "keys"
     assert not (tmp_path / "new").exists()
     if kind != "folder":
-        take_from_link(path)
+        remove_link(path)
         assert not path.exists()
         assert theirs.read_text() == "keys"
         with open_to_append(path) as file:
             file.write(b"a")
         with open_to_append(path) as file:
             file.write(b"b")
-        take_from_link(path)
+        remove_link(path)
         assert path.read_bytes() == b"ab"
 
 
@@ -317,14 +317,14 @@ def test_no_link_leads_out_of_a_folder_whose_name_a_command_chooses(tmp_path):
     elsewhere, named = tmp_path / "elsewhere", tmp_path / "named"
     elsewhere.mkdir()
     named.symlink_to(tmp_path)  # what the user names may be a link
-    own = own_folder(named / "frames")
+    own = register_folder(named / "frames")
     write_text(own / "drive/front/0", "x")
     (own / "drive/back").symlink_to(elsewhere)
     with pytest.raises(ValueError, match="drive/back is a link, and what is written there"):
         write_text(own / "drive/back/0", "x")
     (tmp_path / "other").symlink_to(elsewhere)
     with pytest.raises(ValueError, match="other is a link"):
-        own_folder(named / "other")
+        register_folder(named / "other")
     require_no_link(named / "a/b", named)
     assert not any(elsewhere.iterdir())
 

@@ -156,7 +156,7 @@ def test_a_signal_that_another_thread_is_given_waits_until_processes_have_starte
     steps, before = [], signal.signal(signal.SIGINT, signal.default_int_handler)  # or ignored
 
     def start():
-        with parallel.signals_later():
+        with parallel.delay_signals():
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(0.2)
             steps.append("started")
@@ -176,7 +176,7 @@ LOCKED = """
 import signal, sys, threading
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from gsmap.utils.cli import run_command
-from gsmap.utils.parallel import result_of, signals_later
+from gsmap.utils.parallel import result_of, delay_signals
 
 enter, left = threading.Condition.__enter__, [int(sys.argv[1])]
 
@@ -192,7 +192,7 @@ def command():
     go = threading.Event()
     threading.Timer(0.1, go.set).start()
     with ThreadPoolExecutor(1) as pool:
-        with signals_later():
+        with delay_signals():
             future = pool.submit(go.wait)
         threading.Condition.__enter__ = interrupted
         WAIT

@@ -30,7 +30,7 @@ if shard.index == int(Path("bad").read_text()):
     sys.exit("error: of the user's making")
 target = Path("all.txt")
 shard.path_of(target).write_text(str(shard.index))
-shard.seal(target, "text", "", {}, 1)
+shard.write_manifest(target, "text", "", {}, 1)
 """
 
 

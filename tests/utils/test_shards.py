@@ -40,7 +40,7 @@ def write(folder: Path, count: int = 3, **options) -> Path:
     for index in range(count):
         shard = Shard(index, count)
         shard.path_of(target).write_text(f"part {index}")
-        shard.seal(target, "results", "digest", {"classes": ["a"], **options}, index)
+        shard.write_manifest(target, "results", "digest", {"classes": ["a"], **options}, index)
     return target
 
 
@@ -51,7 +51,7 @@ def test_all_shards_are_found_in_their_order(tmp_path):
         ("part 1", 1),
         ("part 2", 2),
     ]
-    WHOLE.seal(target, "results", "", {}, 0)  # the whole has no manifest
+    WHOLE.write_manifest(target, "results", "", {}, 0)  # the whole has no manifest
     assert not target.with_name("val.json.manifest").exists()
 
 

@@ -13,7 +13,7 @@ from gsmap.utils.cli import run_command
 from gsmap.utils.errors import InputError
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
-from gsmap.utils.terminal import PrintableStream, own_stream, printable
+from gsmap.utils.terminal import PrintableStream, printable, unescaped_stream
 
 TITLE = "\x1b]0;a new title\x07"
 
@@ -80,7 +80,7 @@ def test_a_bar_keeps_its_line_to_itself_where_texts_pass_by(monkeypatch):
     stream = PrintableStream(below)
     monkeypatch.setattr("sys.stderr", stream)
     monkeypatch.setattr("sys.stdout", stream)
-    assert own_stream(stream) is below
+    assert unescaped_stream(stream) is below
     with Progress(total=2, mininterval=0) as bar:
         bar.update()
         tqdm.write("between")

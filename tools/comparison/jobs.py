@@ -86,7 +86,7 @@ class Job:
         else:
             environment["CUDA_VISIBLE_DEVICES"] = self.device
         with open_to_append(self._log) as log:
-            # in bytes; a killed attempt may have written to the file before
+            # Position in bytes: an earlier attempt that was killed may have written to the file.
             self._log_start = log.seek(0, os.SEEK_END)
             self._process = subprocess.Popen(
                 self.run.commands()[self.stage],
@@ -161,7 +161,7 @@ def execute(runs: Sequence[Run]) -> Iterator[tuple[Run, str]]:
     Yields:
         Each run when it has ended, with its state: ``done``, or a sentence about the failure.
     """
-    waiting = deque(run for run in runs if not run.done)
+    waiting = deque(run for run in runs if not run.is_done)
     jobs: dict[str | None, Job] = {}
     usable_devices = devices()
     initial = sum(run.position for run in runs)
@@ -186,8 +186,9 @@ def execute(runs: Sequence[Run]) -> Iterator[tuple[Run, str]]:
                 stages = []
                 for job in jobs.values():
                     stages.append(f"{job.run.label} {job.stage}s")  # "NAME trains", "NAME tests"
-                done = f"{sum(run.done for run in runs)} of {len(runs)} runs done"
-                bar.set_description(", ".join([done, *stages]), refresh=False)
+                num_done = sum(run.is_done for run in runs)
+                summary = f"{num_done} of {len(runs)} runs done"
+                bar.set_description(", ".join([summary, *stages]), refresh=False)
                 position = sum(run.position for run in runs)
                 bar.update(position - bar.n)  # takes the increment
                 if jobs:

@@ -33,9 +33,9 @@ from gsmap.utils.shipped import shipped_path
 
 SETTINGS = "settings.json"  # settings at the start of a run; a later start must have equal ones
 RECORD = "run.json"  # machine, load, command and end of a run
-_SHOWN = 10
+_MAX_DIFFERENCES = 10  # in a message
 _digest = cache(digest)  # of files that many runs share
-_DECIDING = (
+_TRAINING_KEYS = (  # settings of a config that affect the training
     "model",
     "optim_wrapper",
     "param_scheduler",
@@ -66,7 +66,7 @@ def parse_entry(text: str) -> Entry:
     Raises:
         ValueError: If the name is not valid for a folder, or an override has no value.
     """
-    first, *options = re.split(r",(?![^\[(]*[\])])", text)
+    first, *options = re.split(r",(?![^\[(]*[\])])", text)  # at commas outside of brackets
     name, separator, config = first.rpartition("=")
     if not separator:
         name = Path(config).stem
@@ -123,14 +123,14 @@ class Run:
         return self.checkpoint.is_file()
 
     @property
-    def done(self) -> bool:
-        """Whether it is trained and tested."""
+    def is_done(self) -> bool:
+        """Whether the model is trained and tested."""
         return (self.folder / "metrics.json").is_file()
 
     @property
     def position(self) -> int:
         """Number of iterations in the log."""
-        if self.done:
+        if self.is_done:
             return self.iterations
         logs = sorted(self.folder.glob("2*/vis_data/scalars.json"))
         if not logs:
@@ -235,6 +235,7 @@ def _processes(protocol: Protocol) -> int:
         numbers.append(_read_settings(path)["processes"])
     cores = len(os.sched_getaffinity(0))
     numbers.extend(range(cores, 0, -1))
+    # The first number that divides the batch; 1 is the last and always does.
     return next(number for number in numbers if number > 0 and protocol.batch % number == 0)
 
 
@@ -270,7 +271,7 @@ def _plan_run(entry: Entry, seed: int, protocol: Protocol, processes: int) -> Ru
     dataset = plain(cfg.train_dataloader.dataset)
     for place in ("data_root", "ann_file"):  # the data may move; its digest is part of "data"
         dataset.pop(place, None)
-    settings = {key: plain(cfg.get(key)) for key in _DECIDING}
+    settings = {key: plain(cfg.get(key)) for key in _TRAINING_KEYS}
     settings["processes"] = processes
     settings["batch"] = protocol.batch
     settings["data"] = _data_settings(cfg)
@@ -308,7 +309,7 @@ def _refuse_differences(unequal: Mapping[str, tuple[Any, Any]], *, fault: str, r
     if not unequal:
         return
     pairs = [f"{key}: {one} and {other}" for key, (one, other) in unequal.items()]
-    raise InputError(f"{fault}: {'; '.join(pairs[:_SHOWN])}. {remedy}")
+    raise InputError(f"{fault}: {'; '.join(pairs[:_MAX_DIFFERENCES])}. {remedy}")
 
 
 def _read_settings(path: Path) -> dict[str, Any]:

@@ -31,7 +31,7 @@ from gsmap.visualization.style import RUN_COLOURS
 from mapdata.upstream_configs.fields import Fields
 from mapdata.upstream_configs.reader import read_assignments
 
-_COSTS = {
+_COSTS = {  # formats of the costs in the table
     "iterations": ".0f",
     "million parameters": ".2f",
     "seconds a step": ".3f",
@@ -78,11 +78,14 @@ def read_result(name: str, folder: Path, seed: int | None = None) -> Result:
     record = _json(folder / RECORD)
     figures = _json(folder / "metrics.json")
     log = read_run(folder, name) if any(folder.glob("2*/vis_data/scalars.json")) else None
-    steps = [record["step"] for record in log.train] if log else []
+    steps = []
+    if log:
+        steps = [entry["step"] for entry in log.train]
     if figures:
         state = "done"
     else:
-        state = record.get("state", "cut off" if steps else "not started")
+        default_state = "cut off" if steps else "not started"
+        state = record.get("state", default_state)
         if steps:
             state += f", after {max(steps):.0f} iterations"
     costs = {}
@@ -106,7 +109,16 @@ def read_result(name: str, folder: Path, seed: int | None = None) -> Result:
             raise InputError(
                 f"{folder}: the seed in its config must be a number, got {seed!r:.60}."
             )
-    return Result(name, seed, folder, state, figures, costs, record, log)
+    return Result(
+        name=name,
+        seed=seed,
+        folder=folder,
+        state=state,
+        figures=figures,
+        costs=costs,
+        record=record,
+        log=log,
+    )
 
 
 def _count_parameters(checkpoint: Path) -> int:
@@ -184,7 +196,8 @@ def evaluator_for(annotations: Path, changes: Mapping[str, Any]) -> MapEvaluator
     for config in (ChamferConfig, RasterConfig):
         names = {field.name for field in fields(config)}
         allowed |= names
-        configs.append(config(**{key: settings[key] for key in names & settings.keys()}))
+        config_settings = {key: settings[key] for key in names & settings.keys()}
+        configs.append(config(**config_settings))
     unknown = settings.keys() - allowed
     if unknown:
         raise InputError(

@@ -119,8 +119,8 @@ def read_run(path: str | Path, name: str | None = None) -> RunLog:
         raise InputError(f"{files[0]} holds no record of training: give a run's scalars.json.")
     return RunLog(
         name=name or path.resolve().name,
-        train=list(dict(sorted(train.items())).values()),
-        val=list(dict(sorted(val.items())).values()),
+        train=[train[step] for step in sorted(train)],
+        val=[val[step] for step in sorted(val)],
     )
 
 
@@ -128,7 +128,8 @@ def smooth(values: np.ndarray) -> np.ndarray:
     """Centred moving average over a tenth of the values; the window narrows at both ends. (n,)"""
     total = np.cumsum(np.concatenate([[0.0], values]))
     index = np.arange(len(values))
-    half = np.minimum(np.minimum(index, index[::-1]), len(values) // 20)
+    to_nearest_end = np.minimum(index, index[::-1])
+    half = np.minimum(to_nearest_end, len(values) // 20)  # values on each side in the window
     return (total[index + half + 1] - total[index - half]) / (2 * half + 1)
 
 
@@ -221,7 +222,8 @@ def plot_series(runs: Sequence[RunLog], keys: Sequence[str]) -> Figure:
     if unknown:
         raise InputError(f"no run logged {unknown}; there are {sorted(logged - set(_TIMING))}.")
     columns = min(len(keys), 2)
-    figure, axes = panel_grid(-(-len(keys) // columns), columns)
+    rows = math.ceil(len(keys) / columns)
+    figure, axes = panel_grid(rows, columns)
     for panel, key in zip(axes.ravel(), keys, strict=False):
         _draw_training(panel, runs, key, key)
     _fill_row(axes, len(keys))
@@ -243,9 +245,9 @@ def plot_precision_recall(reports: Mapping[str, Sequence[MetricReport]]) -> Figu
             panel = row[label]
             middle = len(detections.thresholds) // 2
             for report, colour in zip(reports.values(), RUN_COLOURS * 9, strict=False):
-                of_run = report[index].detections[name]
-                curve = precision_recall(of_run.hits[:, middle], of_run.num_gts)
-                panel.plot(*curve, color=colour, linewidth=1.3)
+                ranked = report[index].detections[name]
+                recall, precision = precision_recall(ranked.hits[:, middle], ranked.num_gts)
+                panel.plot(recall, precision, color=colour, linewidth=1.3)
             if not detections.num_gts:
                 panel.text(0.5, 0.5, "no ground truth", ha="center", fontsize=8)
             title = f"{style.title(label)}, {detections.thresholds[middle]:g}{unit}"

@@ -74,13 +74,13 @@ def consistency_report(args: argparse.Namespace) -> MetricReport:
     meta = annotations.meta
     classes = tuple(args.classes or meta.classes)
     config = ConsistencyConfig(
-        classes,
-        BEVGrid(meta.x_range, meta.y_range),
-        tuple(polygon_labels(args, classes)),
-        tuple(args.thresholds or CHAMFER_THRESHOLDS),
+        classes=classes,
+        grid=BEVGrid(meta.x_range, meta.y_range),
+        filled_classes=tuple(polygon_labels(args, classes)),
+        thresholds=tuple(args.thresholds or CHAMFER_THRESHOLDS),
     )
-    figures = evaluate_drives(args.results, annotations, config, args.tracks)
-    return MetricReport("consistency", {}, figures, {})
+    figures = evaluate_drives(args.results, annotations, config=config, tracks_file=args.tracks)
+    return MetricReport("consistency", groups={}, metrics=figures, detections={})
 
 
 def uncertainty_report(args: argparse.Namespace, settings: MetricSettings) -> MetricReport:
@@ -156,7 +156,7 @@ def interval_report(
         for key, interval in differences.items():
             for part, value in vars(interval).items():
                 figures[f"minus_other/{key}/{part}"] = value
-    return MetricReport("intervals", {}, figures, {})
+    return MetricReport("intervals", groups={}, metrics=figures, detections={})
 
 
 def read_groups(args: argparse.Namespace) -> "Groups | None":
@@ -187,8 +187,8 @@ def group_report(
     if groups is None:
         from gsmap.evaluation.analysis.distances import cut_by_distance, distance_groups
 
-        ranking = [metric for metric in evaluator.metrics if metric.ranks]
-        evaluator = MapEvaluator(*ranking, ground_truth_points=evaluator.ground_truth_points)
+        ap_metrics = [metric for metric in evaluator.metrics if metric.ranks]
+        evaluator = MapEvaluator(*ap_metrics, ground_truth_points=evaluator.ground_truth_points)
         classes = evaluator.classes
         pairs = open_pairs(args, args.results, classes=classes)
         pieces = cut_by_distance(pairs, polygon_labels(args, classes))

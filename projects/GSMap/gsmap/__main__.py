@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gsmap import __version__
 from gsmap.utils.cli import BAD_INPUT, CommandParser
-from gsmap.utils.faults import nearest
+from gsmap.utils.faults import suggestion
 from gsmap.utils.shipped import shipped_path
 
 
@@ -39,7 +39,7 @@ def main() -> None:
     elif name == "--version":
         sys.stdout.write(f"gsmap {__version__}\n")
     elif name not in tools:
-        hint = nearest(name, tools) or f"; there are {', '.join(tools)}."
+        hint = suggestion(name, tools) or f"; there are {', '.join(tools)}."
         sys.stderr.write(f"error: there is no command {name}{hint}\n")
         sys.exit(BAD_INPUT)
     else:

@@ -4,7 +4,7 @@ from importlib import import_module
 from pkgutil import iter_modules
 
 from gsmap.methods import METHODS
-from gsmap.utils.collection import collection_paused
+from gsmap.utils.collection import pause_collection
 
 MODULES = (
     "gsmap.apis.rig_fit",
@@ -33,7 +33,7 @@ FOLDERS = (  # all modules of these folders are imported
     *(f"gsmap.models.{method.name}" for method in METHODS),
 )
 
-with collection_paused():
+with pause_collection():
     for name in MODULES:
         import_module(name)
     for folder in FOLDERS:

@@ -13,7 +13,7 @@ from gsmap.datasets.errors import BrokenSampleError
 from gsmap.datasets.image_files import read_image
 from gsmap.datasets.plausibility import calibration_warnings
 from gsmap.utils.errors import InputError
-from gsmap.utils.faults import is_of_the_machine
+from gsmap.utils.faults import is_machine_error
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
 from gsmap.utils.words import format_count
@@ -36,7 +36,7 @@ def _open(path: Path) -> AnnotationFile:
             if not reader.get_batch(number).equals(batch):
                 raise InputError(f"part {number} is another one")
     except (pa.ArrowException, OSError, ValueError) as error:
-        if is_of_the_machine(error):
+        if is_machine_error(error):
             raise
         raise InputError(
             f"{path}: the footer, by which other programs read the file, is damaged ({error}); "

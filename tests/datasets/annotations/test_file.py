@@ -21,7 +21,7 @@ from gsmap.datasets.annotations.record import (
     SweepRecord,
 )
 from gsmap.structures.rigid import rigid
-from gsmap.utils.faults import in_words
+from gsmap.utils.faults import user_message
 
 
 def test_every_field_survives_across_batches_and_with_absent_parts(tmp_path: Path):
@@ -253,5 +253,5 @@ def test_what_the_machine_lacks_is_no_damage(tmp_path: Path, monkeypatch: pytest
             with pytest.raises(type(error)) as raised:
                 AnnotationFile(path)
         assert raised.value is error
-        assert "delete" not in in_words(raised.value)
+        assert "delete" not in user_message(raised.value)
     AnnotationFile(path)

@@ -35,7 +35,7 @@ from gsmap.datasets.source import Source, open_annotations
 from gsmap.evaluation.core.results_json import vectors_of
 from gsmap.structures.elements import MapElements
 from gsmap.utils.errors import InputError
-from gsmap.utils.parallel import result_of, signals_later
+from gsmap.utils.parallel import delay_signals, result_of
 
 if TYPE_CHECKING:  # slow to import
     from matplotlib.figure import Figure
@@ -346,7 +346,7 @@ class MapInferencer:
                     on_broken(frame)
                 if batch is not None:
                     turn = number % len(pools)
-                    with signals_later():  # a pool has locks, see `result_of`
+                    with delay_signals():  # a pool has locks, see `result_of`
                         future = pools[turn].submit(
                             self._step, turn=turn, batch=batch, stream=stream
                         )

@@ -9,7 +9,7 @@ from typing import Any
 
 from gsmap.evaluation.core.results_json import THREE_D, read_vectors, write_results
 from gsmap.utils.errors import InputError
-from gsmap.utils.files import lock, naming_file, open_to_append
+from gsmap.utils.files import add_path_to_errors, lock, open_to_append
 
 _SUFFIX = ".unfinished"
 
@@ -95,7 +95,7 @@ class ResultLog:
             self.done.clear()
             self.broken.clear()
             end = 0
-        with naming_file(self.path):
+        with add_path_to_errors(self.path):
             self._file.truncate(end)
             if not end:
                 self._file.write(self._head.encode())
@@ -157,7 +157,7 @@ class ResultLog:
     def _append(self, frame: dict[str, Any]) -> None:
         """Write a frame to the file."""
         self._record(frame)
-        with naming_file(self.path):
+        with add_path_to_errors(self.path):
             self._file.write(json.dumps(frame, separators=(",", ":")).encode() + b"\n")
             self._file.flush()
 

@@ -12,7 +12,7 @@ from mmengine.config import Config
 from mmengine.registry import Registry, build_from_cfg
 
 from gsmap.utils.errors import GsmapError, InputError
-from gsmap.utils.faults import in_words, nearest, registry_names
+from gsmap.utils.faults import registry_names, suggestion, user_message
 from gsmap.utils.shipped import shipped_path
 
 _BUILDER = build_from_cfg.__code__  # every registry calls it, also registries inside of classes
@@ -103,7 +103,7 @@ def building(cfg: Config, kind: type | None = None) -> Iterator[None]:
         parts = _parts_under_construction(error)
         if kind is not None:
             parts.append(_Part(registry=None, kind=kind))
-        fault = None if in_words(error) else _describe_fault(error, parts=parts)
+        fault = None if user_message(error) else _describe_fault(error, parts=parts)
         if fault is None:
             raise
         raise InputError(f"{where}{fault}") from error
@@ -160,7 +160,7 @@ def _describe_fault(error: BaseException, parts: list[_Part]) -> str | None:
     absent = _ABSENT_TYPE.match(text)
     if absent is not None and parts[0].registry is not None:
         registry = parts[0].registry
-        close = nearest(absent[1], names=registry_names(registry))
+        close = suggestion(absent[1], names=registry_names(registry))
         return f"there is no {registry.name} of type {absent[1]!r}{close or '.'}"
     subject = " of ".join(part.name for part in typed_parts) or "the run"
     if type(error) is ValueError:  # raised by the checks of a library's class
@@ -191,7 +191,7 @@ def _describe_unknown_setting(
         if any(getattr(member, "__name__", None) == target for member in family):
             valid_names = _argument_names(family, method=method)
             break
-    close = nearest(name, names=valid_names)
+    close = suggestion(name, names=valid_names)
     return f"{owner.removesuffix('.__init__')} has no setting {name!r}{close or '.'}"
 
 

@@ -33,7 +33,7 @@ from gsmap.checkpoints.settings import (
 )
 from gsmap.checkpoints.unwrapping import UnfitError, unwrap
 from gsmap.utils.errors import InputError
-from gsmap.utils.faults import in_words, is_of_the_machine
+from gsmap.utils.faults import is_machine_error, user_message
 from gsmap.utils.files import fetch_advice
 from gsmap.utils.model_facts import calibration_of
 from gsmap.utils.split_lists import SPLIT_LIST, checked_identity
@@ -96,7 +96,7 @@ def refusing(path: object) -> Iterator[None]:
         default = f"it is broken, or holds more than tensors and plain data ({reason}); {_REMEDY}"
         raise InputError(f"{path} was not loaded: {_remedy_for(path, default=default)}.") from error
     except _DAMAGE as error:
-        if is_of_the_machine(error) and not _exceeds_file_size(error, path=Path(str(path))):
+        if is_machine_error(error) and not _exceeds_file_size(error, path=Path(str(path))):
             raise
         remedy = _remedy_for(path, default="fetch it again, or use an earlier epoch's")
         raise InputError(
@@ -344,7 +344,7 @@ def _build_settings(
         with building(cfg):
             MODELS.build(cfg.model)
     except Exception as error:  # unchecked settings can raise any class of exception
-        reason = (in_words(error) or f"{type(error).__name__}: {error}").rstrip(".")
+        reason = (user_message(error) or f"{type(error).__name__}: {error}").rstrip(".")
         raise InputError(
             f"{path} was not loaded: of the settings in it, {reason}. Give the config that it was "
             f"trained with, or, {_REMEDY}"

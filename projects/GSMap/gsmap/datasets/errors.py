@@ -7,7 +7,7 @@ import pyarrow as pa
 import shapely
 
 from gsmap.utils.errors import InputError
-from gsmap.utils.faults import is_of_the_machine
+from gsmap.utils.faults import is_machine_error
 
 
 class BrokenSampleError(InputError):
@@ -45,7 +45,7 @@ def explain_errors(subject: object, remedy: str) -> Iterator[None]:
         from_arrow = type(error) is OSError and error.errno is None  # Arrow, for a damaged file
         is_about_content = isinstance(error, _CONTENT_ERRORS) or from_devkit or from_arrow
         has_name = str(subject) in str(error)
-        if has_name or not is_about_content or is_of_the_machine(error):
+        if has_name or not is_about_content or is_machine_error(error):
             raise
         reason = str(error)
         if isinstance(error, KeyError):

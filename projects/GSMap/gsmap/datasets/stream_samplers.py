@@ -96,7 +96,7 @@ class StreamTrainSampler(Sampler[int]):
         single_frame_iters: Number of iterations with single frames.
         pieces: Number of pieces that a scene is cut into.
         late_switch: Whether a scene switches to pieces only after all of its single frames, as in
-            the released code of StreamMapNet. The scenes then switch at different times: after 1.6
+            the released code. The scenes then switch at different times: after 1.6
             times ``single_frame_iters`` iterations, half of the samples come from pieces.
         seed: Seed of the random numbers, equal on all ranks; None for 0.
 

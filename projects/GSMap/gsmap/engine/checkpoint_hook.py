@@ -24,7 +24,7 @@ from gsmap.engine.optimizers import fit_optimizer_state
 from gsmap.engine.resuming import check_optimizer_state, check_resumable, refusing_state
 from gsmap.engine.run_log import innermost
 from gsmap.utils.errors import InputError, NotFiniteError
-from gsmap.utils.files import read_text, take_from_link, write_bytes, write_text
+from gsmap.utils.files import read_text, remove_link, write_bytes, write_text
 from gsmap.utils.model_facts import CALIBRATION, CHECKPOINT, calibration_of
 from gsmap.utils.shards import digest
 from gsmap.utils.split_lists import (
@@ -172,7 +172,7 @@ class AtomicCheckpointHook(CheckpointHook):
     def _save_checkpoint_with_step(self, runner: Runner, step: int, meta: dict) -> None:
         """Save a checkpoint; a link in place of `NEWEST` is replaced, not followed."""
         if runner.rank == 0:
-            take_from_link(Path(runner.work_dir, NEWEST))
+            remove_link(Path(runner.work_dir, NEWEST))
         super()._save_checkpoint_with_step(runner, step=step, meta=meta)
 
     def _check_split(self, trained_meta: dict[str, Any], loop: Any) -> None:

@@ -26,7 +26,7 @@ from gsmap.checkpoints.settings import pipeline_steps, scale_steps
 from gsmap.engine.rank_watch import TIMEOUT_S
 from gsmap.engine.targets import check_targets, class_of_type, share_settings
 from gsmap.utils.errors import InputError
-from gsmap.utils.faults import nearest, registry_names
+from gsmap.utils.faults import registry_names, suggestion
 from gsmap.utils.files import DAMAGED_ZIP
 from gsmap.utils.parallel import LAUNCHER, die_with_parent
 
@@ -284,7 +284,7 @@ def _check_registered(cfg: Config, component: str, registry: Registry, type_name
         ValueError: If the registry has no such class.
     """
     if isinstance(type_name, str) and registry.get(type_name) is None:
-        hint = nearest(type_name, names=registry_names(registry)) or "."
+        hint = suggestion(type_name, names=registry_names(registry)) or "."
         raise InputError(f"{cfg.filename}: there is no {component} of type {type_name!r}{hint}")
 
 
@@ -341,7 +341,7 @@ def _check_keys(cfg: Config) -> None:
             raise InputError(f"{cfg.filename}: {key} must be dict(...), got {value!r:.60}.")
         if is_known or key.startswith("_"):
             continue
-        hint = nearest(key, names=_known_keys())
+        hint = suggestion(key, names=_known_keys())
         if not hint:
             hint = "; names of a config's own values start with '_'."
         raise InputError(f"{cfg.filename}: unknown top-level key {key!r}{hint}")

@@ -22,7 +22,7 @@ from gsmap.engine.launch import newest_checkpoint, rank_timeout_s
 from gsmap.engine.rank_watch import RankWatch
 from gsmap.engine.resuming import refusing_state
 from gsmap.utils.errors import NotFiniteError
-from gsmap.utils.files import naming_file, write_text
+from gsmap.utils.files import add_path_to_errors, write_text
 from gsmap.utils.words import format_count
 
 # Prefixes of mmengine's long log records and of records without information about the run
@@ -82,14 +82,14 @@ class MapRunner(Runner):
                 settings to lower.
         """
         try:
-            with naming_file(Path(self.work_dir)), self._watch_ranks():
+            with add_path_to_errors(Path(self.work_dir)), self._watch_ranks():
                 return super().train()
         except FloatingPointError as error:
             raise NotFiniteError(f"{error} {_divergence_advice(self)}") from error
 
     def test(self) -> dict:
         """Run the test loop and return its metrics."""
-        with naming_file(Path(self.work_dir)), self._watch_ranks():
+        with add_path_to_errors(Path(self.work_dir)), self._watch_ranks():
             return super().test()
 
     def resume(

@@ -17,7 +17,7 @@ from torch.distributed.elastic.multiprocessing import SignalException
 from torch.distributed.elastic.multiprocessing.errors import ChildFailedError, ProcessFailure
 from torch.distributed.run import main
 
-from gsmap.utils.cli import ENDING
+from gsmap.utils.cli import END_SIGNALS
 from gsmap.utils.parallel import LAUNCHER
 
 INTERRUPTED = 128 + signal.SIGINT
@@ -80,7 +80,7 @@ if __name__ == "__main__":
     for part in ("agent.server.api", "multiprocessing.api"):  # torch sets a level for each logger
         logging.getLogger(f"torch.distributed.elastic.{part}").setLevel(logging.CRITICAL)
     os.environ[LAUNCHER] = str(os.getpid())
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)  # the ranks inherit the mask
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, END_SIGNALS)  # the ranks inherit the mask
     try:
         main()
     except Exception as error:

@@ -18,18 +18,18 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from gsmap.utils.faults import in_words
-from gsmap.utils.handover import tell_lost_batches
+from gsmap.utils.faults import user_message
+from gsmap.utils.handover import report_lost_batches
 from gsmap.utils.inputs import declare_files, protect_inputs
-from gsmap.utils.interrupt import SAID, is_first_rank
-from gsmap.utils.parallel import have_forks_die_too
-from gsmap.utils.terminal import print_safely
+from gsmap.utils.interrupt import INTERRUPTED_TEXT, is_first_rank
+from gsmap.utils.parallel import kill_forks_with_parent
+from gsmap.utils.terminal import escape_output
 
 BAD_INPUT = 2  # exit code, as for bad arguments in argparse
-ENDING = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
+END_SIGNALS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 _LONGEST_PATH = 4096  # characters; PATH_MAX of Linux
 CLEAN_UP_S = 5.0  # time in which further signals are ignored
-AGAIN_S = 0.05  # delay before a lost signal is sent again
+RESEND_DELAY_S = 0.05  # delay before a lost signal is sent again
 
 
 class CommandParser(argparse.ArgumentParser):
@@ -96,7 +96,7 @@ def _paths_in(value: Any) -> Iterator[Path]:
 
 
 @protect_inputs()
-def run_command(command: Callable[[], str | None], heed_kill: bool = True) -> None:
+def run_command(command: Callable[[], str | None], clean_up_on_kill: bool = True) -> None:
     """Run a command, print its result, and report user errors in one line.
 
     Control characters are escaped in all output (`terminal.printable`), and no output replaces an
@@ -104,7 +104,7 @@ def run_command(command: Callable[[], str | None], heed_kill: bool = True) -> No
 
     The command ends as follows:
 
-    * After an error that a user can cause (`faults.in_words`): ``error: ...`` and exit code 2.
+    * After an error that a user can cause (`faults.user_message`): ``error: ...`` and exit code 2.
     * After Ctrl-C: one line and exit code 130.
     * After ``kill``: exit code 143. After the end of its terminal: exit code 129.
     * After any other error: a traceback.
@@ -115,15 +115,15 @@ def run_command(command: Callable[[], str | None], heed_kill: bool = True) -> No
 
     Args:
         command: Function that returns the text to print, or None.
-        heed_kill: Whether the clean-up runs after ``kill``; processes that wait for each other
-            should die at once instead.
+        clean_up_on_kill: Whether the clean-up runs after ``kill``. The ranks of a training wait for
+            each other and should die at once instead.
     """
-    print_safely()
+    escape_output()
     os.environ.setdefault("NO_COLOR", "1")  # colours are control characters
     handler = _SignalHandler()
     try:
         try:
-            _install(handler, heed_kill=heed_kill)
+            _install(handler, clean_up_on_kill=clean_up_on_kill)
             text = command()
             if text is not None:
                 sys.stdout.write(f"{text}\n")
@@ -143,8 +143,8 @@ def run_command(command: Callable[[], str | None], heed_kill: bool = True) -> No
     except KeyboardInterrupt:  # including a rank that met an error of its peers before
         handler.has_ended = True
         if is_first_rank():
-            sys.stderr.write(SAID)
-        if "RANK" in os.environ and not heed_kill:
+            sys.stderr.write(INTERRUPTED_TEXT)
+        if "RANK" in os.environ and not clean_up_on_kill:
             sys.stderr.flush()
             os._exit(128 + signal.SIGINT)  # the end of the interpreter would wait for other ranks
         sys.exit(128 + signal.SIGINT)
@@ -152,27 +152,28 @@ def run_command(command: Callable[[], str | None], heed_kill: bool = True) -> No
         handler.has_ended = True
 
 
-def _install(handler: "_SignalHandler", heed_kill: bool) -> None:
+def _install(handler: "_SignalHandler", clean_up_on_kill: bool) -> None:
     """Install the handlers of signals and of errors in threads, and unblock the signals."""
     logging.raiseExceptions = False  # no traceback for a log file on a full disk
     threading.excepthook = _report_thread_error
     if getattr(sys.unraisablehook, "func", None) is not _hide_signal:
         sys.unraisablehook = partial(_hide_signal, sys.unraisablehook)
-    have_forks_die_too()
-    tell_lost_batches()
+    kill_forks_with_parent()
+    report_lost_batches()
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # ignored in the background of a shell
         signal.signal(signal.SIGINT, handler)
-    signal.signal(signal.SIGTERM, handler if heed_kill else signal.SIG_DFL)
-    if heed_kill and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # ignored under nohup
+    signal.signal(signal.SIGTERM, handler if clean_up_on_kill else signal.SIG_DFL)
+    runs_under_nohup = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    if clean_up_on_kill and not runs_under_nohup:
         signal.signal(signal.SIGHUP, handler)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, END_SIGNALS)
 
 
 def _report(error: BaseException | None) -> bool:
     """Print one line for an error that a user can cause; return whether it is one."""
     if error is None or os.environ.get("GSMAP_TRACEBACK"):
         return False
-    message = in_words(error)
+    message = user_message(error)
     if not message:
         return False
     sys.stderr.write(f"error: {' '.join(message.split())}\n")
@@ -205,10 +206,10 @@ class _KillError(_SignalError, SystemExit):
 class _SignalHandler:
     """Handler of Ctrl-C and ``kill`` that raises one exception, so that clean-ups run once.
 
-    Further signals during the clean-up are ignored. Python drops exceptions that are raised in a
-    finalizer or at the end of a fork, and so do C code and libraries, above all during imports. If
-    the exception is garbage collected before `run_command` catches it, the signal is sent again.
-    Forked workers inherit the handler, and ignore Ctrl-C.
+    Further signals during the clean-up are ignored. Some code drops the exception: Python, in a
+    finalizer or at the end of a fork, C code, and libraries, above all during imports. If the
+    exception is garbage collected before `run_command` catches it, the signal is sent again. Forked
+    workers inherit the handler, and ignore Ctrl-C.
     """
 
     def __init__(self) -> None:
@@ -239,6 +240,7 @@ class _SignalHandler:
         return error
 
     def _handle_drop(self, number: int) -> None:
+        """Send a signal again whose exception was dropped."""
         if not self.has_ended and os.getpid() == self._main:
             self._raise_time_s = -math.inf
             self._send_again(number)
@@ -249,7 +251,7 @@ class _SignalHandler:
 
 
 def _send_later(number: int) -> None:
-    time.sleep(AGAIN_S)
+    time.sleep(RESEND_DELAY_S)
     signal.pthread_kill(threading.main_thread().ident or 0, number)
 
 
@@ -284,6 +286,7 @@ def output_file(text: str) -> Path:
         OSError: If the path is a folder, or no file can be created there.
     """
     path = Path(text)
+    # Nearest parent that exists; the others are created with the file.
     folder = next(parent for parent in path.absolute().parents if parent.exists())
     if path.is_dir():
         raise _os_error(number=errno.EISDIR, path=path)

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def collection_paused() -> Iterator[None]:
+def pause_collection() -> Iterator[None]:
     """Context without garbage collections.
 
     The import of the library makes some 700,000 objects that live as long as the process. Garbage

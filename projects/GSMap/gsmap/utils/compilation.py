@@ -30,7 +30,7 @@ class CompilationNotice(event.Listener):
         """Do nothing after a compilation."""
 
 
-def place_for_kernels() -> TemporaryDirectory | None:
+def make_kernel_folder() -> TemporaryDirectory | None:
     """Make a cache folder for numba's kernels if numba has none, as in a read-only container.
 
     This process and its child processes use the folder. It is removed at the end of this process.
@@ -39,7 +39,7 @@ def place_for_kernels() -> TemporaryDirectory | None:
         The folder, or None if numba has a cache folder.
     """
     try:
-        caching.CompileResultCacheImpl(place_for_kernels)
+        caching.CompileResultCacheImpl(make_kernel_folder)
     except RuntimeError:
         folder = TemporaryDirectory(prefix="gsmap-kernels-")
         os.environ["NUMBA_CACHE_DIR"] = folder.name
@@ -56,4 +56,4 @@ def place_for_kernels() -> TemporaryDirectory | None:
 
 NOTICE = CompilationNotice()
 event.register(kind="numba:compile", listener=NOTICE)
-_FOLDER = place_for_kernels()
+_FOLDER = make_kernel_folder()

@@ -44,7 +44,7 @@ _NO_PEER = re.compile(r"gloo.*(closed|reset) by peer|NCCL.*remote process", flag
 _IN_WORKER = "Original Traceback (most recent call last)"  # in messages of torch's DataLoader
 
 
-def in_words(error: BaseException) -> str | None:
+def user_message(error: BaseException) -> str | None:
     """Return the message of an error that a user can cause.
 
     Such errors are this package's errors (`GsmapError`), system errors (``OSError``), and library
@@ -61,15 +61,15 @@ def in_words(error: BaseException) -> str | None:
     if _IN_WORKER in text:  # torch re-raises the class with a traceback as its message
         last_line = text.rstrip().splitlines()[-1]
         _, _, text = last_line.partition(": ")
-    message = _describe_machine_error(error=error, text=text) or _describe_system_error(
-        error=error, text=text
-    )
+    message = _describe_machine_error(error=error, text=text)
+    if message is None:
+        message = _describe_system_error(error=error, text=text)
     if message:
         return message
     return text if isinstance(error, GsmapError) else None
 
 
-def is_of_the_machine(error: BaseException) -> bool:
+def is_machine_error(error: BaseException) -> bool:
     """Whether an error comes from a limit of the system, independent of the content of a file."""
     if isinstance(error, MemoryError):  # also raised by Arrow
         return True
@@ -78,7 +78,7 @@ def is_of_the_machine(error: BaseException) -> bool:
     return isinstance(error, RuntimeError | OSError) and bool(_NO_MEMORY.search(str(error)))
 
 
-def nearest(name: str, names: Iterable[str]) -> str:
+def suggestion(name: str, names: Iterable[str]) -> str:
     """Return ``; did you mean ...?`` with the most similar name, empty if none is similar.
 
     Args:
@@ -106,7 +106,10 @@ def registry_names(registry: Any) -> list[str]:
 def _describe_machine_error(error: BaseException, text: str) -> str | None:
     """Describe a lack of memory, a missing device or a dead process."""
     is_runtime_error = isinstance(error, RuntimeError)
-    reason = text.strip().splitlines()[0].rstrip(".") if text.strip() else type(error).__name__
+    reason = type(error).__name__
+    if text.strip():
+        first_line = text.strip().splitlines()[0]
+        reason = first_line.rstrip(".")
     signals = f"{text} {error.__cause__}"
     if is_runtime_error and "signal: Bus error" in signals:
         return f"bus error of a data loader's worker: {_BUS_ERROR_ADVICE}."

@@ -31,8 +31,9 @@ try:
 except ImportError:  # Windows, where files are not locked
     fcntl = None  # type: ignore[assignment]
 
-SUFFIX = ".gsmap-partial"  # not used by other programs
+SUFFIX = ".gsmap-partial"  # of temporary files; not used by other programs
 _BOOT = Path("/proc/sys/kernel/random/boot_id")  # equal in all containers of a machine
+# Eight digits that identify this machine until its next start.
 _MACHINE = _BOOT.read_text()[:8] if _BOOT.exists() else secrets.token_hex(nbytes=4)
 _PARTIAL_NAME = re.compile(
     rf".+\.([0-9a-f]{{8}})-[0-9a-f]{{8}}{re.escape(SUFFIX)}", flags=re.DOTALL
@@ -40,7 +41,7 @@ _PARTIAL_NAME = re.compile(
 _DAY_S = 24 * 3600.0
 _DEVICES = Path("/dev")
 _STREAMS = Path("/dev/fd"), Path("/proc/self/fd")  # links to the open files of a process
-_OWN_FOLDERS: set[Path] = set()
+_REGISTERED_FOLDERS: set[Path] = set()  # by `register_folder`
 _HOLDER = re.compile(r"(process \d+ on \S+ since [\d: -]+)?")  # content that `lock_folder` writes
 _DIGEST_ENDING = re.compile(r"-[0-9a-f]{16}\Z")  # of names that `file_name` has changed
 # Exceptions of `zipfile` for a damaged archive
@@ -118,7 +119,7 @@ def _changed_name(foreign: str) -> str:
 
 
 @contextmanager
-def naming_file(path: Path) -> Iterator[None]:
+def add_path_to_errors(path: Path) -> Iterator[None]:
     """Context that adds a path to system errors without one, such as a failed write.
 
     Args:
@@ -132,13 +133,13 @@ def naming_file(path: Path) -> Iterator[None]:
         raise type(error)(error.errno, error.strerror, str(path)) from error
 
 
-def own_folder(path: Path) -> Path:
+def register_folder(path: Path) -> Path:
     """Register a folder whose name a command chooses, and return it.
 
     Afterwards `atomic_write` raises ``ValueError`` if a link would lead a file out of the folder.
     """
     require_no_link(path)
-    _OWN_FOLDERS.add(path)
+    _REGISTERED_FOLDERS.add(path)
     return path
 
 
@@ -160,7 +161,7 @@ def atomic_write(path: str | Path, mode: Literal["w", "wb"] = "w") -> Iterator[I
     """
     path = Path(path)
     require_no_input(path)
-    for folder in _OWN_FOLDERS:
+    for folder in _REGISTERED_FOLDERS:
         if path.is_relative_to(folder):
             require_no_link(path.parent, below=folder.parent)
     encoding = None if "b" in mode else "utf-8"
@@ -265,7 +266,7 @@ def require_no_link(path: Path, below: Path | None = None) -> None:
             )
 
 
-def take_from_link(path: Path) -> None:
+def remove_link(path: Path) -> None:
     """Remove a link, or one of several hard links, before a library writes to this path."""
     with suppress(FileNotFoundError):
         if not _is_plain(path.lstat()):
@@ -273,6 +274,7 @@ def take_from_link(path: Path) -> None:
 
 
 def _is_plain(status: os.stat_result) -> bool:
+    """Whether a path is a file without further hard links; a symbolic link is not."""
     return stat.S_ISREG(status.st_mode) and status.st_nlink == 1
 
 

@@ -1,4 +1,7 @@
-"""Errors for batches that a worker process cannot send; otherwise the command waits forever."""
+"""Errors for batches that a worker process of torch's data loader cannot send to its parent.
+
+Without an error, the command would wait for the batch forever.
+"""
 
 from multiprocessing import queues
 from typing import Any
@@ -13,7 +16,7 @@ _REMEDY = (
 _default_handler = queues.Queue._on_queue_feeder_error  # type: ignore[attr-defined]
 
 
-def tell_lost_batches() -> None:
+def report_lost_batches() -> None:
     """Report batches that cannot be sent, in this process and in its forked workers.
 
     A worker serialises its batches in a thread, in which Python prints an error and drops the

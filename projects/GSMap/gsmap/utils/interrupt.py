@@ -5,7 +5,7 @@ import signal
 import sys
 
 _MODULES = ("gsmap", "minicity")  # with a __main__ module
-SAID = "interrupted: nothing half-written is left\n"
+INTERRUPTED_TEXT = "interrupted: nothing half-written is left\n"
 
 
 def is_first_rank() -> bool:
@@ -42,5 +42,5 @@ def leave_at_once_on_ctrl_c() -> None:
 def _leave(number: int, _frame: object) -> None:
     """End the process at once, because some imports would catch an exception."""
     if is_first_rank():
-        os.write(2, SAID.encode())
+        os.write(2, INTERRUPTED_TEXT.encode())
     os._exit(128 + number)

@@ -20,7 +20,7 @@ _DECODER = json.JSONDecoder()
 
 
 def items_of(
-    path: Path, key: str | None, advice: str, beside: dict[str, Any] | None = None
+    path: Path, key: str | None, advice: str, other_entries: dict[str, Any] | None = None
 ) -> Iterator[tuple[Any, Place]]:
     """Yield the value and the place of each item of a list, with constant memory.
 
@@ -28,8 +28,8 @@ def items_of(
         path: JSON file.
         key: Key of the list in the file's object; None if the file itself is a list.
         advice: Remedy for a file without the list, for the message.
-        beside: Dictionary whose keys name further entries of the object; their values are filled in
-            as the file is read.
+        other_entries: Dictionary whose keys name further entries of the object; their values are
+            filled in as the file is read.
 
     Raises:
         FileNotFoundError: If the file does not exist.
@@ -38,7 +38,7 @@ def items_of(
     with path.open("rb") as file:
         under = "" if key is None else f" under {key!r}"
         try:
-            yield from _Parser(file).items(key=key, beside=beside or {})
+            yield from _Parser(file).items(key=key, other_entries=other_entries or {})
         except _FormError as error:
             raise InputError(f"{path} holds {error} and no list{under}: {advice}.") from error
         except (ValueError, RecursionError) as error:
@@ -65,18 +65,18 @@ class _Parser:
         self._offset = len(BOM_UTF8) if starts_with_mark else 0  # of the next value, in the file
         file.seek(self._offset)
 
-    def items(self, key: str | None, beside: dict[str, Any]) -> Iterator[tuple[Any, Place]]:
-        """Yield the items of the list under a key, and fill in the values of ``beside``."""
+    def items(self, key: str | None, other_entries: dict[str, Any]) -> Iterator[tuple[Any, Place]]:
+        """Yield the items of the list under a key, and fill in the values of ``other_entries``."""
         if key is None:
             self._require(opening="[", where="")
             yield from self._list_items()
         else:
             self._require(opening="{", where="")
-            yield from self._items_under(key=key, beside=beside)
+            yield from self._items_under(key=key, other_entries=other_entries)
         if self._next_character():
             raise self._error("more text")
 
-    def _items_under(self, key: str, beside: dict[str, Any]) -> Iterator[tuple[Any, Place]]:
+    def _items_under(self, key: str, other_entries: dict[str, Any]) -> Iterator[tuple[Any, Place]]:
         """Yield the items of the list under a key of an object."""
         is_complete = False
         names = []
@@ -88,8 +88,8 @@ class _Parser:
             if name != key:
                 names.append(f"{name:.30}")
                 value, _ = self._read_value()
-                if name in beside:
-                    beside[name] = value
+                if name in other_entries:
+                    other_entries[name] = value
                 continue
             if is_complete:
                 raise self._error(f"a second {key!r}")

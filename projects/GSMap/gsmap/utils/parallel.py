@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 
 from gsmap.utils.errors import InputError, WorkError
 from gsmap.utils.inputs import watch_files
-from gsmap.utils.terminal import print_safely
+from gsmap.utils.terminal import escape_output
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -69,7 +69,7 @@ def die_with_parent(parent: int) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
 
 
-def have_forks_die_too() -> None:
+def kill_forks_with_parent() -> None:
     """Let all forked child processes, and their children, die with their parent."""
     parent = 0
 
@@ -93,7 +93,7 @@ class _Worker:
 
 def _start_worker(setup: Path) -> None:
     """Prepare a worker process, which ends with its parent."""
-    print_safely()
+    escape_output()
     watch_files()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C for all
     signal.signal(signal.SIGTERM, _stop_worker)
@@ -189,7 +189,7 @@ def ordered_map(
 
 
 @contextmanager
-def signals_later() -> Iterator[None]:
+def delay_signals() -> Iterator[None]:
     """Context that delays signals; a process that is starting would print a traceback.
 
     The signal mask applies to this thread and to new processes. Another thread may receive the
@@ -233,13 +233,13 @@ def result_of(future: "Future[Result]", timeout_s: float | None = None) -> Resul
         TimeoutError: If there is no result within the time limit.
     """
     done: SimpleQueue[Future[Result]] = SimpleQueue()  # waits in C without a Python lock
-    with signals_later():
+    with delay_signals():
         future.add_done_callback(done.put)
     try:
         done.get(timeout=timeout_s)
     except Empty:
         raise TimeoutError from None
-    with signals_later():
+    with delay_signals():
         return future.result()
 
 
@@ -249,7 +249,7 @@ def _in_order(
     """Keep at most ``limit`` tasks in the pool, and yield their results in order."""
     pending: deque[Future[Any]] = deque()
     for task in tasks:
-        with signals_later():
+        with delay_signals():
             pending.append(pool.submit(_work, task))
         if len(pending) == limit:
             yield result_of(pending.popleft(), timeout_s=timeout_s)

@@ -5,9 +5,9 @@ from typing import Any, TextIO
 
 from tqdm import tqdm
 
-from gsmap.utils.terminal import own_stream
+from gsmap.utils.terminal import unescaped_stream
 
-_PLAIN = {"mininterval": 60.0, "maxinterval": 60.0}
+_EVERY_MINUTE = {"mininterval": 60.0, "maxinterval": 60.0}
 _FORMAT = "{desc}{n_fmt} of {total_fmt} {unit}, {elapsed}"
 _UNKNOWN_TOTAL = "{desc}{n_fmt} {unit}, {elapsed}"
 
@@ -23,10 +23,11 @@ class Progress(tqdm):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         if not sys.stderr.isatty():
             title = f"{kwargs['desc']}: " if kwargs.get("desc") else ""
-            kwargs |= {**_PLAIN, "desc": title, "bar_format": _FORMAT, "file": _Lines(sys.stderr)}
+            kwargs |= _EVERY_MINUTE
+            kwargs |= {"desc": title, "bar_format": _FORMAT, "file": _Lines(sys.stderr)}
         else:
             # the bar moves the cursor, which `PrintableStream` would suppress
-            kwargs.setdefault("file", own_stream(sys.stderr))
+            kwargs.setdefault("file", unescaped_stream(sys.stderr))
         super().__init__(*args, **kwargs)
 
     @property

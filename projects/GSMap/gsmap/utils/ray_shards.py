@@ -141,6 +141,7 @@ class _Run:
 
     def run_all(self) -> list[str]:
         """Run all shards, and return the failures."""
+        # Index of the shard of each task of Ray that is running.
         running = {self._start(index): index for index in range(self.count)}
         repeated: set[int] = set()
         finished: set[int] = set()

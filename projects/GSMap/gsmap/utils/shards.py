@@ -21,10 +21,17 @@ from gsmap.utils.inputs import require_own_file
 
 Items = TypeVar("Items", bound=Sequence[Any])
 
-_COMMON = ("kind", "target", "of", "version", "input", "options")
+_COMMON = ("kind", "target", "of", "version", "input", "options")  # equal for all shards
 _TYPES = {  # of the entries of a manifest
-    **dict.fromkeys(("kind", "target", "version", "input", "sha256"), str),
-    **dict.fromkeys(("shard", "of", "samples", "bytes"), int),
+    "kind": str,
+    "target": str,
+    "version": str,
+    "input": str,
+    "sha256": str,
+    "shard": int,
+    "of": int,
+    "samples": int,
+    "bytes": int,
     "options": dict,
 }
 _MAX_SHARDS = 99_999  # numbers in file names have five digits
@@ -86,7 +93,7 @@ class Shard:
             require_own_file(path, mark)
             require_own_file(_manifest_path(path), mark=b'"kind":')
 
-    def seal(
+    def write_manifest(
         self, target: Path, kind: str, source: str, options: Mapping[str, Any], samples: int
     ) -> None:
         """Write the manifest of this shard's complete file; does nothing for `WHOLE`.
@@ -124,7 +131,7 @@ class ShardFile(NamedTuple):
 
     Attributes:
         path: Path of the file.
-        manifest: Entries of the manifest, as `Shard.seal` writes them.
+        manifest: Entries of the manifest, as `Shard.write_manifest` writes them.
     """
 
     path: Path

@@ -19,6 +19,7 @@ def printable(text: str) -> str:
 
 
 def _escape(match: re.Match[str]) -> str:
+    """Escape the characters of a match that are not printable."""
     escaped = []
     for character in match[0]:
         escaped.append(character if character.isprintable() else ascii(character)[1:-1])
@@ -59,7 +60,7 @@ class PrintableStream:
         return getattr(self.stream, name)
 
 
-def print_safely() -> None:
+def escape_output() -> None:
     """Escape control characters in ``sys.stdout`` and ``sys.stderr`` until the process ends."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
@@ -67,6 +68,6 @@ def print_safely() -> None:
             setattr(sys, name, PrintableStream(stream))
 
 
-def own_stream(stream: TextIO) -> TextIO:
+def unescaped_stream(stream: TextIO) -> TextIO:
     """Return the stream below a `PrintableStream`, for a bar that moves the terminal's cursor."""
     return stream.stream if isinstance(stream, PrintableStream) else stream

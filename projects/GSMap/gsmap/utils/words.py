@@ -19,5 +19,7 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
         rows: Cells of each row.
     """
     rule = ["---"] * len(head)
-    lines = ["| " + " | ".join(cells) + " |" for cells in (head, rule, *rows)]
+    lines = []
+    for cells in (head, rule, *rows):
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)

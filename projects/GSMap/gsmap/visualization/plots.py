@@ -144,7 +144,7 @@ def plot_uncertainty(vertices: Vertices, classes: Sequence[str], law: str = "nor
     for axis, (name, (left, right)) in enumerate(zip(AXES, axes, strict=True)):
         left.plot([0, 1], [0, 1], color=style.grid, linewidth=1)
         for label, title in enumerate(classes):
-            of_class = vertices.of(vertices.labels == label)
+            of_class = vertices.select(vertices.labels == label)
             if not len(of_class.labels):
                 continue
             errors = of_class.errors[:, axis]

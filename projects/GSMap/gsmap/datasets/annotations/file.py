@@ -31,7 +31,7 @@ from gsmap.datasets.annotations.schema import (
     schema_of,
 )
 from gsmap.utils.errors import InputError
-from gsmap.utils.faults import is_of_the_machine
+from gsmap.utils.faults import is_machine_error
 from gsmap.utils.files import atomic_write
 from gsmap.utils.inputs import check_input
 from gsmap.utils.shards import WHOLE, Shard, ShardFile
@@ -62,9 +62,9 @@ class AnnotationWriter:
         shard.require_own(Path(path), mark=META_KEY)
         self.meta = meta
         self._write_manifest = partial(
-            shard.seal,
+            shard.write_manifest,
             Path(path),
-            SHARD_KIND,
+            kind=SHARD_KIND,
             source=source or meta.source_fingerprint,
             options=asdict(meta),
         )
@@ -246,7 +246,7 @@ class AnnotationFile(Sequence[MapSample]):
             schema, self._batches, seal, ends = read_messages(self._content)
             self.meta = _meta_of(schema)
         except (pa.ArrowException, OSError, ValueError, TypeError) as error:
-            if is_of_the_machine(error):
+            if is_machine_error(error):
                 raise
             raise InputError(
                 f"{self.path} is not a whole annotation file ({error}): delete it and run "
@@ -263,7 +263,7 @@ class AnnotationFile(Sequence[MapSample]):
             elif [end for end, _ in sums] != ends:
                 raise InputError("it was replaced after this run had opened it")
         except (pa.ArrowException, ValueError, TypeError, KeyError) as error:
-            if is_of_the_machine(error):
+            if is_machine_error(error):
                 raise
             reason = str(error).rstrip(".")
             raise InputError(

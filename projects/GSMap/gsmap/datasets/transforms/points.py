@@ -16,7 +16,7 @@ from pyarrow import feather
 from gsmap.datasets.errors import BrokenSampleError
 from gsmap.structures.grid import padded_size
 from gsmap.utils.errors import InputError
-from gsmap.utils.faults import is_of_the_machine
+from gsmap.utils.faults import is_machine_error
 from gsmap.utils.inputs import check_input
 
 # Columns of Argoverse 2. The first five have the meaning of the values in files of nuScenes.
@@ -74,7 +74,7 @@ def _read_feather(path: str, load_dim: int) -> np.ndarray:
         table.validate(full=True)
         columns = [table[name].to_numpy().astype(np.float32) for name in names]
     except (pa.ArrowException, OSError, ValueError, TypeError) as error:
-        if is_of_the_machine(error):
+        if is_machine_error(error):
             raise
         raise BrokenSampleError(
             f"{path} is not a whole LiDAR sweep ({error}): download it again."

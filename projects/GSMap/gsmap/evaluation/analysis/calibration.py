@@ -48,7 +48,7 @@ class Vertices(NamedTuple):
     sigmas: FloatArray
     distances: FloatArray
 
-    def of(self, rows: IntArray | BoolArray) -> "Vertices":
+    def select(self, rows: IntArray | BoolArray) -> "Vertices":
         """Select vertices by their indices or a mask."""
         return Vertices(
             labels=self.labels[rows],
@@ -234,12 +234,12 @@ def uncertainty_report(
 
     parts: dict[str, Vertices] = {}
     for name, labels in groups.items():
-        group = vertices.of(np.isin(vertices.labels, labels))
+        group = vertices.select(np.isin(vertices.labels, labels))
         parts[name] = group
         for low, high in pairwise(DISTANCES_M):
             band = f"{low:g}m+" if high == np.inf else f"{low:g}-{high:g}m"
             in_band = (low <= group.distances) & (group.distances < high)
-            parts[f"{name}/{band}"] = group.of(in_band)
+            parts[f"{name}/{band}"] = group.select(in_band)
     metrics: dict[str, float] = {}
     for name, part in parts.items():
         if len(part.labels):
@@ -279,7 +279,7 @@ def format_uncertainty(metrics: Mapping[str, float], law: str = "normal") -> str
     return "\n".join(rows)
 
 
-def fitted_factors(
+def fit_factors(
     vertices: Vertices, classes: Sequence[str], num_sigmas: float = 1.0, law: str = "normal"
 ) -> FloatArray:
     """Fit factors of the sigmas of each class so that a central interval has its coverage.
@@ -304,7 +304,7 @@ def fitted_factors(
     width = half_widths(law, covered)
     factors = np.empty((len(classes), len(AXES)))
     for label, name in enumerate(classes):
-        of_class = vertices.of(vertices.labels == label)
+        of_class = vertices.select(vertices.labels == label)
         if len(of_class.labels) < _FEWEST:
             raise InputError(
                 f"class {name!r} has {len(of_class.labels)} matched vertices, {_FEWEST} are "

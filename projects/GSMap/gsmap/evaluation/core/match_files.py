@@ -73,7 +73,9 @@ def write_matches(
         "ground_truth_points": evaluator.ground_truth_points,
     }
     options = {"evaluator": rules}
-    shard.seal(target, SHARD_KIND, source, options, len(matches))
+    shard.write_manifest(
+        target, kind=SHARD_KIND, source=source, options=options, samples=len(matches)
+    )
     return shard.path_of(target)
 
 

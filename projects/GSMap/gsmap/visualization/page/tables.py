@@ -276,7 +276,7 @@ def _reliability(
     """
     if vertices is None:
         return UNDEFINED, []
-    of_class = vertices.of(vertices.labels == label)
+    of_class = vertices.select(vertices.labels == label)
     if not len(of_class.labels):
         return UNDEFINED, []
     errors = of_class.errors[:, axis]
