@@ -90,8 +90,8 @@ def generated_frames(
     for number in range(count):
         truths = []
         preds = []
-        for label, most in ((0, 12), (1, 4), (2, 7)):
-            for _ in range(rng.integers(most + 1)):
+        for label, max_count in ((0, 12), (1, 4), (2, 7)):
+            for _ in range(rng.integers(max_count + 1)):
                 line = _random_element(rng, label) * stretch
                 truths.append({"label": label, "pts": np.round(line, 3).tolist()})
                 points = _add_noise(line, rng)
@@ -138,7 +138,7 @@ def _vector(element: Record) -> Record:
     return vector
 
 
-def write_race(folder: Path, frames: list[Record], count: int) -> tuple[Path, Path]:
+def write_repeated_frames(folder: Path, frames: list[Record], count: int) -> tuple[Path, Path]:
     """Write a result and a ground-truth file of many samples by repeating frames.
 
     Args:
@@ -315,10 +315,10 @@ def run(args: argparse.Namespace) -> None:
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         # The first run compiles the kernels.
-        few_files = write_race(Path(folder), frames, count=8)
+        few_files = write_repeated_frames(Path(folder), frames, count=8)
         _evaluate(few_files, ["chamfer", "raster"], grid=grid)
         for count in args.samples:
-            files = write_race(Path(folder), frames, count=count)
+            files = write_repeated_frames(Path(folder), frames, count=count)
             for metrics, workers in (
                 (["chamfer"], 1),
                 (["raster"], 1),

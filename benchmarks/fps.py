@@ -10,7 +10,7 @@ from torch import Tensor
 
 from benchmarks import model as models
 from benchmarks.measure import MIB, Cost, measure
-from benchmarks.model import drive_on, measure_each, model_and_batch, report
+from benchmarks.model import advance_samples, measure_each, model_and_batch, report
 from gsmap.apis.fast_frame import FastFrames, StaticFrame, matrix_products
 
 
@@ -70,7 +70,7 @@ def frame_cost(path: str, args: argparse.Namespace, cuda_graphs: bool = False) -
 
     @torch.no_grad()
     def predict() -> None:
-        drive_on(samples)
+        advance_samples(samples)
         autocast = torch.autocast(args.device, enabled=args.fp16 and not halved)
         with autocast, matrix_products(halved):
             model.predict(inputs, samples)

@@ -34,7 +34,16 @@ from gsmap.utils.parallel import ordered_map
 
 METRIC_NAMES = ("chamfer", "raster")
 WARM_UP = 100  # iterations
-_DECIDING = ("config", "checkpoint", "data_root", "iterations", "batch", "lr", "from_scratch")
+# Options that the figures depend on.
+_FIGURE_OPTIONS = (
+    "config",
+    "checkpoint",
+    "data_root",
+    "iterations",
+    "batch",
+    "lr",
+    "from_scratch",
+)
 
 
 @dataclass(frozen=True)
@@ -85,9 +94,9 @@ def run(args: argparse.Namespace) -> None:
         ValueError: If the output folder has figures of other settings.
     """
     variants: dict[str, str] = json.loads(args.variants.read_text())
-    settings = {key: str(getattr(args, key)) for key in _DECIDING}
+    settings = {key: str(getattr(args, key)) for key in _FIGURE_OPTIONS}
     for name, variant in variants.items():
-        note_settings(args.out / f"{name}.settings.json", {**settings, "variant": variant})
+        record_settings(args.out / f"{name}.settings.json", {**settings, "variant": variant})
     options = data_root_options(args.data_root)
     features = {part: args.out / f"{part}.pt" for part in ("train", "val")}
     for part, path in features.items():
@@ -123,7 +132,7 @@ def run(args: argparse.Namespace) -> None:
     print(markdown_table(header, rows))
 
 
-def note_settings(path: Path, settings: dict[str, str]) -> None:
+def record_settings(path: Path, settings: dict[str, str]) -> None:
     """Write the settings of a variant's figures to a file.
 
     Args:
@@ -222,7 +231,8 @@ def train_and_test(
         inputs = {"bev_feats": data["feats"][rows].float()}
         losses = head.loss(inputs, [data["samples"][i] for i in rows.tolist()])
         optimizer.zero_grad(set_to_none=True)
-        sum(value for name, value in losses.items() if "loss" in name).backward()
+        terms = [value for name, value in losses.items() if "loss" in name]
+        sum(terms).backward()
         torch.nn.utils.clip_grad_norm_(head.parameters(), settings.clip_grad.max_norm)
         optimizer.step()
         schedule.step()

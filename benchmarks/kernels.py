@@ -107,12 +107,14 @@ def run(args: argparse.Namespace) -> None:
             continue
         try:
             cells, correct = measure_case(case, device, reduced=args.reduced)
-        except Exception as error:  # the other kernels are measured all the same
+        except Exception as error:  # the other kernels are still measured
             lines = str(error).strip().splitlines()
             reason = lines[-1] if lines else ""
             cells = [f"failed: {type(error).__name__}: {reason:.200}"]
             correct = False
-        verdicts[case.kernel] = verdicts.get(case.kernel, True) and correct
+        if not correct:
+            verdicts[case.kernel] = False
+        verdicts.setdefault(case.kernel, True)
         publish_line("| " + " | ".join([case.kernel, case.size, *cells]) + " |")
     correct_kernels = [name for name, correct in verdicts.items() if correct]
     wrong_kernels = sorted(verdicts.keys() - set(correct_kernels))
@@ -332,7 +334,7 @@ def kernel_sampling_cases(reduced: bool) -> Iterator[Case]:
         if not bilinear:
             uv = uv.half().float()  # so that float32 and float64 round to equal pixels
         index = torch.arange(samples)
-        offsets = torch.stack([index // 3 - 2, index % 3 - 1], dim=-1)
+        offsets = torch.stack([index // 3 - 2, index % 3 - 1], dim=-1)  # rows of three pixels
         value = torch.randn(1, 6, shape[0] * shape[1], heads, 256 // heads)
         weights = torch.rand(1, rows * columns, heads, samples)
         yield Case(

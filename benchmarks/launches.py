@@ -116,7 +116,7 @@ class Trial:
             self.model.init_weights()  # after the move to the device, as in mmengine
             self.wrapper = build_optim_wrapper(self.model, self.settings)
         self.model.train()
-        models.drive_on(self.samples)
+        models.advance_samples(self.samples)
         self.gpu.clear()
         with self._count_parts():
             figures = self.model.train_step(self._data(self.samples), self.wrapper)
@@ -134,7 +134,7 @@ class Trial:
         """
         self.model.to(DEVICE)
         self.model.eval()
-        models.drive_on(self.samples)
+        models.advance_samples(self.samples)
         sample = self.samples[0].clone()
         for name in sample.keys():  # noqa: SIM118  samples of a test pipeline have no targets
             delattr(sample, name)

@@ -14,13 +14,13 @@ from gsmap.ops.polyline_raster import draw_polylines
 from gsmap.ops.raster_loss import raster_loss
 from gsmap.structures.grid import BEVGrid
 
-GRID = BEVGrid((-15, 15), (-30, 30), 128, 64)
+GRID = BEVGrid(x_range=(-15, 15), y_range=(-30, 30), height=128, width=64)
 POINTS = 20
-BANDS_M = (0.75, 4.0)
-ERRORS_M = (0.1, 0.5, 1.0, 2.0, 3.0)
-SCALES_M = (0.15, 0.25, 0.5, 1.0, 1.5)
-LENGTHS_M = (4.0, 10.0, 60.0)
-MISS_SIZES = ((128, 64), (200, 100), (256, 128))
+BANDS_M = (0.75, 4.0)  # widths of the ground-truth mask
+ERRORS_M = (0.1, 0.5, 1.0, 2.0, 3.0)  # standard deviations of the centres' errors
+SCALES_M = (0.15, 0.25, 0.5, 1.0, 1.5)  # standard deviations of the Gaussians
+LENGTHS_M = (4.0, 10.0, 60.0)  # lengths of missed lines
+MISS_SIZES = ((128, 64), (200, 100), (256, 128))  # rows and columns of the raster
 # Name in the tables, and ``normalize`` and ``foreground_weight`` of `raster_loss`.
 REDUCTIONS = {
     "both": ("both", 1.0),
@@ -55,8 +55,8 @@ def run(args: argparse.Namespace) -> None:
     parts.append(
         "IoU of a crossing of 10 x 4 m with the polygon of the centres that fit its mask:\n"
     )
-    outline_iou = fitted_crossing(False)
-    filled_iou = fitted_crossing(True)
+    outline_iou = fit_crossing(False)
+    filled_iou = fit_crossing(True)
     parts.append(f"outline {outline_iou:.2f}, filled {filled_iou:.2f}\n")
     publish("\n".join(parts), args.out)
 
@@ -153,7 +153,7 @@ def miss_table() -> str:
     return markdown_table(header, rows)
 
 
-def fitted_crossing(filled: bool, iterations: int = 800) -> float:
+def fit_crossing(filled: bool, iterations: int = 800) -> float:
     """Fit Gaussians that start on the outline of a crossing to its mask, by the default loss.
 
     Args:

@@ -18,7 +18,7 @@ from gsmap.utils.parallel import ordered_map
 Result = TypeVar("Result")
 
 MIB = 2**20
-M_MMAP_THRESHOLD = -3  # of glibc's mallopt
+M_MMAP_THRESHOLD = -3  # parameter of glibc's mallopt
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ def run(arguments: argparse.Namespace) -> None:
                 workers=0,
             )
             seconds = time.process_time() - start
-        images = 6 * 10 * arguments.scenes
+        images = 6 * 10 * arguments.scenes  # six cameras, ten samples of a scene
         print(
             f"{width}x{height}: {images / seconds:.1f} images/s of one core "
             f"({1000 * seconds / images:.1f} ms an image, {images} images)"

@@ -122,16 +122,20 @@ def image_shape(path: str, args: argparse.Namespace) -> tuple[int, int, int]:
         return cameras, height, width
     if "_file_size" not in cfg:
         raise InputError(f"{path} says nothing of _file_size (width, height): give --size H W.")
-    step: dict = next((step for step in dataset.pipeline if step.type == "ScaleImages"), {})
-    if step.get("size"):
-        width, height = step["size"]
+    scaling: dict = {}
+    for step in dataset.pipeline:
+        if step.type == "ScaleImages":
+            scaling = step
+            break
+    if scaling.get("size"):
+        width, height = scaling["size"]
         return cameras, height, width
-    scale = step.get("scale", 1.0)
-    unit = cfg.model.data_preprocessor.get("pad_size_divisor", 1)
+    scale = scaling.get("scale", 1.0)
+    divisor = cfg.model.data_preprocessor.get("pad_size_divisor", 1)
     sides = []
     for side in cfg._file_size:
         scaled = int(side * scale + 1e-6)
-        sides.append(math.ceil(scaled / unit) * unit)
+        sides.append(math.ceil(scaled / divisor) * divisor)
     width, height = sides
     return cameras, height, width
 
@@ -151,7 +155,7 @@ def model_and_batch(
     """Build a config's model and random inputs for it.
 
     The inputs are normalised images of cameras in a ring, and straight elements as ground truth.
-    Each sample belongs to another scene (see `drive_on`).
+    Each sample belongs to another scene (see `advance_samples`).
 
     Args:
         path: Config file.
@@ -204,7 +208,7 @@ def model_and_batch(
     return model, {"imgs": images}, samples
 
 
-def drive_on(samples: Sequence[Det3DDataSample]) -> None:
+def advance_samples(samples: Sequence[Det3DDataSample]) -> None:
     """Advance samples by half a second and 4 m, in place, for models with memory."""
     step = rigid(np.eye(3), [0.0, 4.0, 0.0])
     for sample in samples:

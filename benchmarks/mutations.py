@@ -76,12 +76,13 @@ def run(args: argparse.Namespace) -> None:
             modules[name] = path
             for index in range(count_places(path.read_text())):
                 places.append((name, index))
-        share = (args.number + number) // len(args.rooms)
+        num_mutants = (args.number + number) // len(args.rooms)
         order = rng.permutation(len(places))
-        if verdict("", "", tests=tests_of(room, None), seconds=None) != SURVIVED:
+        unchanged = verdict(module="", source="", tests=tests_of(room, None), seconds=None)
+        if unchanged != SURVIVED:
             raise InputError(f"the tests of {room} fail without a mutation: mend them first.")
         verdicts = []
-        for k in order[:share]:
+        for k in order[:num_mutants]:
             name, index = places[k]
             path = modules[name]
             line, change, source = mutant(path.read_text(), index)
@@ -262,7 +263,7 @@ def _run_tests(module: str, source: str, tests: Sequence[str]) -> None:
     import pytest
 
     options = ["-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist", "--rootdir", str(REPO)]
-    options += ["-m", ""]  # with the tests of faults
+    options += ["-m", ""]  # also runs the tests that are marked, such as tests of faults
     sys.exit(pytest.main([*options, *tests]))
 
 

@@ -14,6 +14,7 @@ kernels are computed by their counterparts for the CPU.
 
 import bisect
 import contextlib
+import math
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
@@ -301,7 +302,9 @@ class PretendedGPU(TorchDispatchMode):
             self._launch("download")
             return aten._to_copy.default(source.host, **options)
         dtype = kwargs.get("dtype") or source.dtype
-        self._launch(f"cast {str(source.dtype)[6:]} to {str(dtype)[6:]}")
+        source_name = str(source.dtype).removeprefix("torch.")
+        target_name = str(dtype).removeprefix("torch.")
+        self._launch(f"cast {source_name} to {target_name}")
         return PretendedTensor(aten._to_copy.default(source.host, **options))
 
     def _copy_into(self, target: Tensor, source: Tensor, non_blocking: bool = False) -> Tensor:
@@ -354,9 +357,12 @@ class PretendedGPU(TorchDispatchMode):
         node = torch._C._current_autograd_node()
         if node is None or "AccumulateGrad" in node.name():
             return "backward: sums"
+        # The part that was active when the node was made: the last mark up to its number.
         number = node._sequence_nr()
         marks_before = bisect.bisect_right(self._marks, number, key=lambda mark: mark[0])
-        part = self._marks[marks_before - 1][1] if marks_before else ""
+        part = ""
+        if marks_before:
+            _, part = self._marks[marks_before - 1]
         return f"backward: {part or 'rest'}"
 
     def _launch(self, name: str, times: int = 1) -> None:
@@ -424,8 +430,9 @@ def _num_launches(name: str, args: Any) -> int:
     for arg in args:
         if isinstance(arg, list | tuple) and len(arg) and isinstance(arg[0], Tensor):
             num_lists += 1
-    per_launch = _TENSORS_PER_LAUNCH[min(max(num_lists, 1), 5) - 1]
-    return -(-len(args[0]) // per_launch)
+    most_lists = len(_TENSORS_PER_LAUNCH)
+    per_launch = _TENSORS_PER_LAUNCH[min(max(num_lists, 1), most_lists) - 1]
+    return math.ceil(len(args[0]) / per_launch)
 
 
 @contextlib.contextmanager

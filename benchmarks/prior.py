@@ -16,7 +16,7 @@ from gsmap.prior import HitMissCounts, KeepMaximum, LastSeen, MapPrior, PriorSet
 from gsmap.prior.rules import WriteRule
 from gsmap.structures.grid import BEVGrid
 
-GRID = BEVGrid((-15, 15), (-30, 30), 200, 100)
+GRID = BEVGrid(x_range=(-15, 15), y_range=(-30, 30), height=200, width=100)
 SETTINGS = PriorSettings(("divider", "boundary", "ped_crossing"), "benchmark")
 RULES: tuple[WriteRule, ...] = (KeepMaximum(), LastSeen(), HitMissCounts())
 LINES_M = (-10.0, -3.5, 0.0, 3.5, 10.0)  # across the road
@@ -79,12 +79,18 @@ def pose_at(distance_m: float) -> NDArray[np.float64]:
     yaw = 0.3 * math.sin(distance_m / 300)
     pose = np.eye(4)
     pose[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
-    pose[:2, 3] = 200 * row + 90 * (1 - math.cos(distance_m / 300)), along_m
+    aside_m = 200 * row + 90 * (1 - math.cos(distance_m / 300))
+    pose[:2, 3] = [aside_m, along_m]
     return pose
 
 
 def cycle_poses(number: int, offset_m: float) -> Iterator[NDArray[np.float64]]:
-    """Yield the poses of the first frames of a road without an end, each moved along the road."""
+    """Yield the poses of the first frames of a road again and again, each moved along the road.
+
+    Args:
+        number: Number of frames.
+        offset_m: Distance by which each pose is moved along the road, in metres.
+    """
     for index in cycle(range(number)):
         yield pose_at(STEP_M * index + offset_m)
 

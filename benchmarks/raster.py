@@ -295,8 +295,8 @@ def rendering_cells(
         f"{fused_s / floor_s:.1f}",
         f"{reference.peak_bytes / MIB:.0f}",
         f"{fused.peak_bytes / MIB:.0f}",
-        f"{fused.peak_bytes / reference.peak_bytes:.4f}",
-        f"{fused.peak_bytes / (4 * upstream.numel()):.2f}",
+        f"{fused.peak_bytes / reference.peak_bytes:.4f}",  # memory as a share of the reference's
+        f"{fused.peak_bytes / (4 * upstream.numel()):.2f}",  # memory in sizes of all masks
         f"{soft_lines.time_s(device) * 1e3:.1f}",
     ]
 

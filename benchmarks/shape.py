@@ -40,7 +40,9 @@ def run(args: argparse.Namespace) -> None:
     rows = []
     for path in args.results:
         for name, shapes in line_shapes(path, args.truth).items():
-            length_ratio = turn = folds = np.nan
+            length_ratio = np.nan
+            turn = np.nan
+            folds = np.nan
             if len(shapes):
                 length_ratio = np.median(shapes[:, 0])
                 _, turn, folds = shapes.mean(axis=0)

@@ -82,7 +82,7 @@ def step_cost(path: str, args: argparse.Namespace, raster: str = "") -> Cost:
     batch = [sample.cpu() for sample in samples]
 
     def step() -> None:
-        models.drive_on(batch)  # a model with memory expects the next frame
+        models.advance_samples(batch)  # a model with memory expects the next frame
         data = {
             "inputs": {"img": list(images)},
             "data_samples": [sample.clone() for sample in batch],

@@ -47,13 +47,14 @@ def run(args: argparse.Namespace) -> None:
         """Vectorise maps in every size, note the times, and return the lines of the last size."""
         for size, size_settings in settings_by_size.items():
             head.vectorizing = size_settings
-            resized = type(maps)._make([resize_map(values, size) for values in maps])
+            resized_values = [resize_map(values, size) for values in maps]
+            resized = type(maps)._make(resized_values)  # a NamedTuple
             start = time.process_time()
             lines = vectorize_maps(resized)
             times_ms[size].append(1000 * (time.process_time() - start))
         return lines
 
-    head.lines = time_lines
+    head.lines = time_lines  # takes the place of the method
     rows_to_predict = range(min(args.samples + 1, len(dataset)))
     for _ in inferencer.predict(dataset, rows_to_predict):
         pass

@@ -96,7 +96,7 @@ def read_tables(pattern: str = "*") -> list[dict[str, Any]]:
     tables = []
     for method in METHODS:
         tables += method.paper()["tables"]
-    tables += read_json(shipped_path("configs/tables.json"))  # of several methods
+    tables += read_json(shipped_path("configs/tables.json"))  # tables of several methods
     chosen = [table for table in tables if fnmatchcase(table["table"], pattern)]
     if not chosen:
         raise InputError(

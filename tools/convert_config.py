@@ -53,8 +53,8 @@ def convert(source: Path, target: Path, allow_changes: bool = False) -> str:
         ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError,
     ) as error:  # fmt: skip
         raise InputError(f"{source} cannot be converted: {error}") from error
-    model_settings = []  # without a counterpart, as the others
-    other_settings = []
+    model_settings = []  # settings of the model without a counterpart
+    other_settings = []  # other settings without a counterpart
     for setting in conversion.unplaced:
         if setting.startswith("model."):
             model_settings.append(setting)

@@ -16,8 +16,8 @@ from gsmap.utils.errors import InputError
 from gsmap.visualization.film import write_drive_film
 from gsmap.visualization.page.page import PageOptions, is_own_page, page_data, write_page
 
-_PAGE = Path("report.html")  # without --out
-_IMAGE_WIDTH_PX = 320  # without --image-width
+_PAGE = Path("report.html")  # page to write without --out
+_IMAGE_WIDTH_PX = 320  # width without --image-width
 
 
 def parse_args() -> argparse.Namespace:

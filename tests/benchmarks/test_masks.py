@@ -21,5 +21,5 @@ def test_the_command_writes_a_table_per_reduction_and_band_and_one_of_misses(tmp
 
 
 def test_a_filled_mask_draws_the_centres_off_the_outline():
-    assert masks.fitted_crossing(filled=False, iterations=200) > 0.9
-    assert masks.fitted_crossing(filled=True, iterations=200) < 0.5
+    assert masks.fit_crossing(filled=False, iterations=200) > 0.9
+    assert masks.fit_crossing(filled=True, iterations=200) < 0.5

@@ -7,7 +7,7 @@ import torch
 from method_cases import cases_of_methods
 
 from benchmarks import export, fps, live, profile, step
-from benchmarks.model import drive_on, image_shape, model_and_batch
+from benchmarks.model import advance_samples, image_shape, model_and_batch
 
 REPO = Path(__file__).resolve().parents[2]
 
@@ -104,13 +104,13 @@ def test_a_model_with_memory_continues_its_streams_from_call_to_call():
     model, inputs, samples = model_and_batch(path, args, batch=2)
     shares = []
     for _ in range(2):
-        drive_on(samples)
+        advance_samples(samples)
         shares.append(float(model.loss(inputs, samples)["loss_trans"].detach()))
     assert shares[0] == 0 < shares[1]  # only what continues is told how the vehicle has moved
     model.eval()
     with torch.no_grad():
         for _ in range(2):
-            drive_on(samples)
+            advance_samples(samples)
             model.predict(inputs, samples)
     assert list(model.temporal.streams.states) == ["scene 0", "scene 1"]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.evaluation import CLASSES, generated_frames, write_race
+from benchmarks.evaluation import CLASSES, generated_frames, write_repeated_frames
 from gsmap.evaluation.core.chamfer_ap import ChamferConfig, chamfer_report, match_chamfer
 from gsmap.evaluation.core.evaluator import MapEvaluator
 from gsmap.evaluation.core.file_evaluation import CHUNK, SamplePairs, evaluate_files
@@ -23,7 +23,7 @@ COUNT = 3 * CHUNK
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory) -> tuple[Path, Path]:
-    return write_race(tmp_path_factory.mktemp("race"), generated_frames(COUNT), COUNT)
+    return write_repeated_frames(tmp_path_factory.mktemp("race"), generated_frames(COUNT), COUNT)
 
 
 def rewritten(path: Path, key: str, target: Path, change, **layout) -> Path:
@@ -69,7 +69,7 @@ def test_samples_that_lack_a_partner_are_counted_wherever_they_lie(files, tmp_pa
 def test_memory_does_not_grow_with_the_file(tmp_path):
     frames, peaks = generated_frames(20), []
     for count in (800, 3200):
-        results, _ = write_race(tmp_path, frames, count)
+        results, _ = write_repeated_frames(tmp_path, frames, count)
         assert results.stat().st_size > 4000 * count
         tracemalloc.start()
         assert sum(1 for _ in SampleFile(results, RESULTS_KEY, CLASSES)) == count

@@ -33,8 +33,8 @@ from gsmap.utils.shipped import shipped_path
 
 SETTINGS = "settings.json"  # settings at the start of a run; a later start must have equal ones
 RECORD = "run.json"  # machine, load, command and end of a run
-_MAX_DIFFERENCES = 10  # in a message
-_digest = cache(digest)  # of files that many runs share
+_MAX_DIFFERENCES = 10  # largest number of differences in a message
+_digest = cache(digest)  # computed once for a file that many runs share
 _TRAINING_KEYS = (  # settings of a config that affect the training
     "model",
     "optim_wrapper",

@@ -129,7 +129,7 @@ def interval_report(
         args: The options of the command.
 
     Returns:
-        The ends of the intervals; those of differences have the prefix ``minus_other/``.
+        The ends of the intervals. The keys of differences have the prefix ``minus_other/``.
     """
     from gsmap.evaluation.analysis.bootstrap import (
         ap_differences,

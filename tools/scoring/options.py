@@ -17,7 +17,7 @@ def parse_args(description: str | None, argv: list[str] | None = None) -> argpar
 
     Args:
         description: Text above the options in the help.
-        argv: The words of the command line; None reads those of the process.
+        argv: The words of the command line; None reads the command line of the process.
 
     Returns:
         The options. ``eval`` is the list of metric names, without repetitions.

@@ -21,12 +21,12 @@ FORMATS = ("JPEG", "PNG", "WEBP", "BMP")
 _STARTS = {b"\xff\xd8": "jpeg", b"\x89PNG": "png", b"RIFF": "webp", b"BM": "bmp"}
 _JPEG_START = b"\xff\xd8"
 _ORIENTATION_ENTRIES = (b"Exif\0\0", b"tiff:Orientation")  # EXIF and XMP may have an orientation
-_ORIENTATION_TAG = 0x0112  # of EXIF
+_ORIENTATION_TAG = 0x0112  # EXIF tag of the orientation
 _ROTATIONS = range(2, 9)  # orientations that need a rotation: 1 is upright, 0 is not set
 _MAX_PIXELS = 10**8  # a decoder allocates memory for the size in the header, whatever follows
 _MAX_JPEG_SCANS = 100  # each scan may take as much time as a whole image
 _SCAN = b"\xff\xda"
-_MIN_BRIGHTEST = 1 << 14  # of 16-bit values; a darker image has 14 bits or fewer
+_MIN_BRIGHTEST = 1 << 14  # a 16-bit image with less at its brightest pixel has 14 bits or fewer
 # Errors of pillow and simplejpeg for damaged files.
 _DAMAGE = (
     ValueError, OSError, SyntaxError, EOFError, LookupError, TypeError, AttributeError,

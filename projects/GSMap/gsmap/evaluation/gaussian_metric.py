@@ -22,7 +22,7 @@ Array = npt.NDArray[Any]
 
 SCORE_THRESHOLD = 0.3
 PIXEL_M = 0.3
-LINE_WIDTH_M = 0.75  # of lines in the mask of a ground truth
+LINE_WIDTH_M = 0.75  # width of a ground-truth line in its mask
 
 
 @METRICS.register_module()

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from gsmap.utils.errors import InputError
 
 NUM_CAN_BUS = 18
-OF_ONE_FRAME = slice(3, 17)  # of ``can_bus``; other entries are changes since an earlier frame
+OF_ONE_FRAME = slice(3, 17)  # entries of ``can_bus`` that need no earlier frame
 
 # Camera 1 km ahead of the vehicle with ahead as its direction. The whole range is behind the camera
 # and its frustum out of range, so it contributes to no BEV cell, by projection or by lifting.

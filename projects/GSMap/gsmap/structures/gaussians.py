@@ -65,6 +65,7 @@ class GaussianSpace:
     init_scales_m: tuple[float, float] = (1.0, 0.4)
     activation: str = "sigmoid"
     literal_covariance: bool = False
+    # Offset s_0 of sigma before its activation. (2,)
     _start: tuple[float, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:

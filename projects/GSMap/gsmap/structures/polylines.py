@@ -171,7 +171,8 @@ def equivalent_orders(
 
     An open polyline has two orders: forward and reversed. A ring, whose last vertex equals its
     first, has one order for each of its K vertices, which starts there and keeps the direction of
-    the ring; order k starts at vertex -k. P - 1 vertices are selected if there are more.
+    the ring. Order k starts k vertices before the first one. If there are more than P - 1 vertices,
+    P - 1 of them are selected.
 
     Args:
         points: Vertices at full resolution, in metres. (n, D)

@@ -41,7 +41,7 @@ _NO_DEVICE = re.compile(
     "not compiled with CUDA|no NVIDIA driver|No CUDA GPUs|invalid device ordinal|device string"
 )
 _NO_PEER = re.compile(r"gloo.*(closed|reset) by peer|NCCL.*remote process", flags=re.DOTALL)
-_IN_WORKER = "Original Traceback (most recent call last)"  # in messages of torch's DataLoader
+_IN_WORKER = "Original Traceback (most recent call last)"  # marks a message of torch's DataLoader
 
 
 def user_message(error: BaseException) -> str | None:

@@ -31,7 +31,7 @@ try:
 except ImportError:  # Windows, where files are not locked
     fcntl = None  # type: ignore[assignment]
 
-SUFFIX = ".gsmap-partial"  # of temporary files; not used by other programs
+SUFFIX = ".gsmap-partial"  # ending of temporary files, which no other program uses
 _BOOT = Path("/proc/sys/kernel/random/boot_id")  # equal in all containers of a machine
 # Eight digits that identify this machine until its next start.
 _MACHINE = _BOOT.read_text()[:8] if _BOOT.exists() else secrets.token_hex(nbytes=4)
@@ -43,7 +43,7 @@ _DEVICES = Path("/dev")
 _STREAMS = Path("/dev/fd"), Path("/proc/self/fd")  # links to the open files of a process
 _REGISTERED_FOLDERS: set[Path] = set()  # by `register_folder`
 _HOLDER = re.compile(r"(process \d+ on \S+ since [\d: -]+)?")  # content that `lock_folder` writes
-_DIGEST_ENDING = re.compile(r"-[0-9a-f]{16}\Z")  # of names that `file_name` has changed
+_DIGEST_ENDING = re.compile(r"-[0-9a-f]{16}\Z")  # ending of names that `file_name` has changed
 # Exceptions of `zipfile` for a damaged archive
 DAMAGED_ZIP = (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError)
 _LFS_POINTER = b"version https://git-lfs.github.com/"

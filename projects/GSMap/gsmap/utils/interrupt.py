@@ -4,7 +4,7 @@ import os
 import signal
 import sys
 
-_MODULES = ("gsmap", "minicity")  # with a __main__ module
+_MODULES = ("gsmap", "minicity")  # packages with a __main__ module
 INTERRUPTED_TEXT = "interrupted: nothing half-written is left\n"
 
 

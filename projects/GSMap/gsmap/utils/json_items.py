@@ -13,7 +13,7 @@ from gsmap.utils.files import fetch_advice
 Place = tuple[int, int]
 """Offset and length of an item in its file, in bytes."""
 _BLOCK = 1 << 20  # bytes
-_LISTED_NAMES = 5  # in a message
+_LISTED_NAMES = 5  # largest number of names in a message
 _KINDS = {"{": "an object", "[": "a list", '"': "a text"}
 _SPACE = re.compile(r"[ \t\n\r]*")
 _DECODER = json.JSONDecoder()
@@ -60,9 +60,11 @@ class _Parser:
         self._file = file
         self._decode = getincrementaldecoder("utf-8")().decode
         self._text = ""
-        self._position = 0  # of the next value, in the text
+        self._position = 0  # start of the next value in the text
         starts_with_mark = file.read(len(BOM_UTF8)) == BOM_UTF8
-        self._offset = len(BOM_UTF8) if starts_with_mark else 0  # of the next value, in the file
+        self._offset = (
+            len(BOM_UTF8) if starts_with_mark else 0
+        )  # start of the next value in the file
         file.seek(self._offset)
 
     def items(self, key: str | None, other_entries: dict[str, Any]) -> Iterator[tuple[Any, Place]]:

@@ -22,7 +22,7 @@ from gsmap.utils.inputs import require_own_file
 Items = TypeVar("Items", bound=Sequence[Any])
 
 _COMMON = ("kind", "target", "of", "version", "input", "options")  # equal for all shards
-_TYPES = {  # of the entries of a manifest
+_TYPES = {  # types of the entries of a manifest
     "kind": str,
     "target": str,
     "version": str,

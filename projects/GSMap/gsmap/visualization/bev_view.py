@@ -322,7 +322,7 @@ def _draw_truth(ax: Axes, panel: BEVPanel, view: FrameView, style: MapStyle) -> 
 
 
 def _element_colours(panel: BEVPanel, labels: np.ndarray, style: MapStyle) -> list[str]:
-    """Colours of matches if there are any, else the given colours, else those of classes. (N,)"""
+    """Colours of matches, or else the given colours, or else the colours of classes. (N,)"""
     outcomes, _ = panel.outcomes
     if outcomes:
         return [MATCH_COLOURS[outcome] for outcome in outcomes]

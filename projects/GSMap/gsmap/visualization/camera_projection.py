@@ -9,7 +9,7 @@ import numpy as np
 
 NEAR_M = 0.3
 """Smallest depth in metres of a visible point."""
-_NUM_PLANES = 5  # of the frustum
+_NUM_PLANES = 5  # planes of the frustum
 
 
 def _homogeneous_px(points: np.ndarray, img_from_frame: np.ndarray) -> np.ndarray:

@@ -27,7 +27,7 @@ from gsmap.visualization.style import FALSE_DASHES, MATCH_COLOURS, TRUTH_OPACITY
 
 DPI = 220
 """Dots per inch: text of 6.5 points is legible in a picture that is displayed 800 px wide."""
-_WIDTH = 1500  # of the layout, px at DPI
+_WIDTH = 1500  # width of the layout in px at DPI
 _SAVE_OPTIONS: dict[str, dict[str, Any]] = {
     "png": {"metadata": {"Software": "gsmap"}, "pil_kwargs": {"compress_level": 4}},
     "jpg": {"pil_kwargs": {"quality": 92}},

@@ -14,7 +14,8 @@ from gsmap.structures.rigid import is_rigid
 from gsmap.utils.errors import InputError
 
 _OPTIONAL = {"lidar", "can_bus", "instances", "ego_from_frame"}
-_PREFIXES = {"cameras[]": "camera's ", "lidar": "LiDAR ", "sweeps[]": "sweep's "}  # of messages
+# Words before the names of fields in messages.
+_PREFIXES = {"cameras[]": "camera's ", "lidar": "LiDAR ", "sweeps[]": "sweep's "}
 # Paths that are not relative, lead out of the data root or have other separators.
 _OUTSIDE = r"^$|^/|[\\\x00-\x1f]|(^|/)\.\.(/|$)"
 

@@ -38,7 +38,8 @@ from gsmap.utils.shards import WHOLE, Shard, ShardFile
 
 SHARD_KIND = "annotations"
 _ROWS_PER_BATCH = 256
-_TEXTS = ("dataset", "frame", "split", "command", "source_fingerprint")  # of the metadata
+# Texts of the metadata.
+_TEXTS = ("dataset", "frame", "split", "command", "source_fingerprint")
 
 
 class AnnotationWriter:

@@ -32,7 +32,7 @@ Image = NDArray[np.uint8]
 # Each tuple has one value for each of the five severities.
 _TURNS_DEG = (0.25, 0.5, 1.0, 2.0, 4.0)
 _SHIFTS_M = (0.02, 0.05, 0.1, 0.2, 0.4)
-_VISIBILITY_M = (200.0, 100.0, 60.0, 40.0, 25.0)  # in fog
+_VISIBILITY_M = (200.0, 100.0, 60.0, 40.0, 25.0)  # limit of visibility in fog
 _RAIN_DENSITIES = (0.001, 0.002, 0.0035, 0.0055, 0.008)  # share of pixels with a streak of rain
 _EXPOSURES = (0.6, 0.4, 0.25, 0.15, 0.08)  # at night, relative to day
 _NIGHT_NOISE = 12.0  # standard deviation in grey levels without any light

@@ -20,7 +20,7 @@ from gsmap.structures.polylines import resample
 from gsmap.utils.errors import InputError
 from gsmap.utils.settings import check_positive
 
-_NUM_PV_POINTS = 200  # of an element that is projected into the cameras
+_NUM_PV_POINTS = 200  # resampled points of an element for its projection into the cameras
 _MIN_DEPTH = 1e-7
 
 

@@ -370,7 +370,7 @@ def format_intervals(intervals: Mapping[str, Interval], title: str, signed: bool
         title: First line of the table.
         signed: Whether values above 0 have a plus sign, for differences.
     """
-    width = max((len(key) for key in intervals), default=0)  # of the column of keys
+    width = max((len(key) for key in intervals), default=0)  # width of the column of keys
     form = "+.4f" if signed else ".4f"
     rows = [title]
     for key, interval in intervals.items():

@@ -20,7 +20,7 @@ from gsmap.utils.model_facts import LAW_NAMES
 
 AXES = ("along", "across")
 DISTANCES_M = (0.0, 10.0, 20.0, np.inf)  # limits of the bands of distance from the vehicle
-LEVELS = np.linspace(0.05, 0.95, num=19)  # of central intervals
+LEVELS = np.linspace(0.05, 0.95, num=19)  # probabilities of central intervals
 _STANDARD = (stats.norm(), stats.laplace(scale=0.5**0.5))
 LAWS = dict(zip(LAW_NAMES, _STANDARD, strict=True))
 """Laws of errors (probability distributions) of variance 1, by name."""

@@ -79,7 +79,7 @@ def cut_line(points: FloatArray) -> Iterator[tuple[int, FloatArray]]:
     vertices = _interpolate(points, positions)
     middle_x, middle_y = _interpolate(points, middles).T
     distances = np.hypot(middle_x, middle_y)
-    bands = np.searchsorted(DISTANCES_M[1:-1], distances, side="right")  # of each part
+    bands = np.searchsorted(DISTANCES_M[1:-1], distances, side="right")  # band of each part
     changes = np.flatnonzero(np.diff(bands)) + 1
     pieces = []
     for start, end in pairwise([0, *changes.tolist(), len(bands)]):

@@ -24,8 +24,8 @@ from gsmap.utils.split_lists import require_same_list
 
 _MIN_PRECISION = 1e-3  # below one match in a thousand samples, an element adds nothing
 _REFINEMENTS = 3  # iterations that move an element to the mean of its matches
-_NUM_POINTS = 20  # of each element
-_MAX_CANDIDATES = 400  # of a class, drawn at random
+_NUM_POINTS = 20  # points of each element
+_MAX_CANDIDATES = 400  # candidates of a class, drawn at random
 _MAX_TRAINING_SAMPLES = 2000  # at equal distances in the file
 
 
@@ -253,7 +253,7 @@ def _evaluate_constant(
 def _check_splits(train_path: str | Path, truth_path: str | Path) -> None:
     """Raise ValueError if two annotation files belong to different splits of a data set."""
     for path in (train_path, truth_path):
-        if Path(path).suffix.lower() == ".json":  # without a split
+        if Path(path).suffix.lower() == ".json":  # a JSON file has no split
             return
     train_meta = AnnotationFile(train_path).meta
     truth_meta = AnnotationFile(truth_path).meta

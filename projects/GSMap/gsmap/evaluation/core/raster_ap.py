@@ -35,10 +35,10 @@ from gsmap.utils.errors import InputError
 LINE_THRESHOLDS = (0.25, 0.3, 0.35, 0.4, 0.45, 0.5)
 POLYGON_THRESHOLDS = (0.5, 0.55, 0.6, 0.65, 0.7, 0.75)
 MIN_SCORE = 0.05
-MAX_PREDICTIONS = 100  # of a class and sample
+MAX_PREDICTIONS = 100  # largest number of predictions of a class in a sample
 RECALL_LIMITS = (1, 10, 100)
 NUSCENES_GRID = BEVGrid(x_range=(-15.0, 15.0), y_range=(-30.0, 30.0))
-_MOST_PX = 2e7  # of a canvas: 560 m by 560 m at 8 pixels per metre
+_MOST_PX = 2e7  # largest canvas: 560 m by 560 m at 8 pixels per metre
 _FAR_PX = 2.0**20  # farther points are pulled in, so that they fit the integers of the drawing
 _GROUP_FIGURES = ("AP", "AR", "recall", "mIoU")  # prefixes of the figures with a mean per group
 

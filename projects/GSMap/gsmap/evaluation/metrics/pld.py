@@ -29,7 +29,7 @@ from gsmap.structures.polylines import arc_lengths
 from gsmap.utils.errors import InputError
 
 _STEP_M = 0.5  # distance of neighbouring points
-_MOST_STEPS = 2000  # of a line; the time grows with the square
+_MOST_STEPS = 2000  # largest number of steps of a line; the time grows with its square
 _CLOSED_M = 0.1  # largest gap between the ends of a ring
 _PARTS = ("PLD", "localisation", "cardinality")
 

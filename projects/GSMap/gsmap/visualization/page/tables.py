@@ -28,7 +28,7 @@ from gsmap.visualization.style import MapStyle
 Table = dict[str, Any]
 _MAX_CURVE_POINTS = 120
 _MAX_DIFFERENCES = 12  # samples in the table of differences
-_UNITS = {"chamfer": "m", "raster": "IoU"}  # of thresholds
+_UNITS = {"chamfer": "m", "raster": "IoU"}  # units of thresholds
 
 
 def _format_value(value: float, factor: float = 100, digits: int = 1) -> str:
