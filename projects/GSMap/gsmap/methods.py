@@ -59,5 +59,6 @@ METHODS = (
     Method("hdmapnet", "HDMapNet"),
     Method("vectormapnet", "VectorMapNet"),
     Method("bemapnet", "BeMapNet"),
+    Method("hrmapnet", "HRMapNet", built_on=("maptr", "maptrv2")),
     Method("streammapnet", "StreamMapNet", built_on=("maptr",)),
 )

@@ -1,8 +1,8 @@
 """Detector of map elements in images and LiDAR points."""
 
 import logging
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from typing import Any, ClassVar
 
@@ -47,6 +47,8 @@ class MapDetector(Base3DDetector):
         lidar_encoder: BEV encoder of the LiDAR.
         bev_fuser: Fusion of the BEV features of cameras and LiDAR.
         temporal: Settings of `StreamMemory`, for a model with memory of earlier frames.
+        prior: Config of a module that reads a map of earlier frames and writes the predictions to
+            it (`RasterPrior`).
         fold_batch_norms: Run the image backbone without gradients as a copy whose batch norms are
             folded into its convolutions. It is faster and needs a second copy of the weights.
         allow_untrained: Accept checkpoints without the weights of modules that start without
@@ -78,6 +80,7 @@ class MapDetector(Base3DDetector):
         lidar_encoder: dict | None = None,
         bev_fuser: dict | None = None,
         temporal: dict | None = None,
+        prior: dict | None = None,
         fold_batch_norms: bool = True,
         allow_untrained: bool = True,
         autocast: str | None = None,
@@ -115,6 +118,9 @@ class MapDetector(Base3DDetector):
         self.bev_fuser = MODELS.build(bev_fuser) if bev_fuser else None
         self.map_head = MODELS.build({**shared, "classes": classes, **map_head})
         self.temporal = None if temporal is None else StreamMemory(self.map_head, **temporal)
+        self.prior: Any = None
+        if prior is not None:
+            self.prior = MODELS.build({"head": self.map_head, "encoder": self.bev_encoder, **prior})
 
     def train(self, mode: bool = True) -> "MapDetector":
         """Set the mode. If ``compiled`` is set, the modules are compiled before a training."""
@@ -183,16 +189,29 @@ class MapDetector(Base3DDetector):
             if self.bev_fuser is not None:
                 feats = self.bev_fuser(outputs["bev_feats"], feats)
             outputs = {**outputs, "bev_feats": feats}
+        if self.prior is not None:
+            outputs = self.prior.fuse(outputs, metas, img_shape=tuple(imgs.shape[-2:]))
         return outputs
 
+    @contextmanager
     def over_time(
         self, outputs: dict[str, Any], batch_data_samples: Samples
-    ) -> AbstractContextManager[BatchMemory]:
-        """Context of a batch with its memory, or without if the model has none."""
-        if self.temporal is None:
-            return nullcontext(BatchMemory(outputs))
+    ) -> Iterator[BatchMemory]:
+        """Context of a batch with its memory, or without if the model has none.
+
+        At the end of the context, the memory and the map prior are updated.
+        """
         metas = [sample.metainfo for sample in batch_data_samples]
-        return self.temporal.remember_batch(outputs, metas)
+        hook = None if self.prior is None else self.prior.hook(outputs)
+        with ExitStack() as stack:
+            batch = BatchMemory(outputs)
+            if self.temporal is not None:
+                batch = stack.enter_context(self.temporal.remember_batch(outputs, metas))
+            if hook is not None:
+                batch.further_hooks = (hook,)
+            yield batch
+        if hook is not None:
+            self.prior.keep(hook, metas)
 
     def loss(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
         """All losses as scalars, by name.

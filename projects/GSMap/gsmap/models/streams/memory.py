@@ -38,17 +38,22 @@ class BatchMemory:
             recalled.
         propagation: Hook that adds the memory of queries to the head, or None.
         elements: Detections to store for the next frame, by name. (B, ...) each
+        further_hooks: Hooks that are called before the propagation, such as the one of a map prior.
     """
 
     outputs: dict[str, Any]
     past: Past | None = None
     propagation: Propagation | None = None
     elements: dict[str, Tensor] = field(default_factory=dict)
+    further_hooks: tuple[FlowHook, ...] = ()
 
     @property
     def hooks(self) -> dict[str, tuple[FlowHook, ...]]:
-        """Keyword arguments of the head: ``hooks``, or none without memory of queries."""
-        return {} if self.propagation is None else {"hooks": (self.propagation,)}
+        """Keyword arguments of the head: ``hooks``, or none if there is no hook."""
+        hooks = self.further_hooks
+        if self.propagation is not None:
+            hooks = (*hooks, self.propagation)
+        return {"hooks": hooks} if hooks else {}
 
 
 class StreamMemory(BaseModule):

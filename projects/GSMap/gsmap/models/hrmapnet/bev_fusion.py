@@ -1,0 +1,99 @@
+"""Fusion of BEV features with the map of earlier frames."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from mmdet3d.registry import MODELS
+from mmengine.model import BaseModule
+from torch import Tensor, nn
+
+from gsmap.models.base.layers import init_matrices
+from gsmap.models.base.parts import DEFAULTS, build_part
+from gsmap.structures.grid import BEVGrid
+
+_LAYER = {
+    "type": "BEVQueryEncoder",
+    "cross_attn": {
+        "type": "SpatialCrossAttention",
+        "num_heads": 8,
+        "num_points": 8,
+        "num_heights": 4,
+    },
+    "layer_cfg": {"num_heads": 8, "ffn_dims": 512, "dropout": 0.1},
+    "with_can_bus": False,
+}
+
+
+@MODELS.register_module()
+class PriorBEVFusion(BaseModule):
+    """Add a BEV layer where the map is known, append the map, and apply a convolution (HRMapNet).
+
+    Args:
+        grid: Extent and cells of the BEV features, H rows and W columns.
+        embed_dims: Channels C of the BEV features.
+        num_channels: Channels M of the map in each cell.
+        threshold: Smallest value of a channel from which a cell counts as known.
+        layer: Settings of the BEV layer, a `BEVQueryEncoder`; None to leave it out.
+        z_range: Lowest and highest z of the pillars of the layer, in metres.
+    """
+
+    def __init__(
+        self,
+        grid: BEVGrid,
+        embed_dims: int = 256,
+        num_channels: int = 3,
+        threshold: float = 0.8,
+        layer: Mapping[str, Any] | None = DEFAULTS,
+        z_range: Sequence[float] = (-10.0, 10.0),
+        init_cfg: dict | None = None,
+    ) -> None:
+        super().__init__(init_cfg)
+        self.threshold = threshold
+        self.layer: Any = None
+        if layer is not None:
+            sizes = {"grid": grid, "bev_pixel_m": grid.pixel_size_m, "embed_dims": embed_dims}
+            self.layer = build_part(layer, **_LAYER, **sizes, z_range=z_range)
+        self.conv = nn.Sequential(
+            nn.Conv2d(
+                embed_dims + num_channels, embed_dims, kernel_size=3, padding=1, bias=False
+            ),
+            nn.BatchNorm2d(embed_dims),
+            nn.ReLU(inplace=True),
+        )
+
+    @property
+    def calibration(self) -> tuple[str, ...]:
+        """Names of the arrays of calibration that the layer reads."""
+        return () if self.layer is None else self.layer.calibration
+
+    def init_weights(self) -> None:
+        """Initialise kernels from Xavier's uniform distribution, and the BEV layer."""
+        super().init_weights()
+        init_matrices(self.conv)
+
+    def forward(
+        self,
+        feats: Tensor,
+        cells: Tensor,
+        img_feats: Tensor,
+        calibration: Mapping[str, Tensor],
+        img_shape: tuple[int, int],
+    ) -> Tensor:
+        """Fuse BEV features with the map.
+
+        Args:
+            feats: BEV features. (B, C, H, W)
+            cells: Map in each cell, [0, 1]. (B, M, H, W)
+            img_feats: Image features, for the layer. (B, V, C, h, w)
+            calibration: A tensor for each name in ``calibration``. (B, ...)
+            img_shape: Rows and columns of the padded images.
+
+        Returns:
+            Fused features. (B, C, H, W)
+        """
+        if self.layer is not None:
+            extra = self.layer.encode(img_feats, calibration, img_shape=img_shape)["bev_feats"]
+            is_known = cells.amax(1, keepdim=True) >= self.threshold
+            feats = feats + torch.where(is_known, extra, 0.0)
+        return self.conv(torch.cat([feats, cells.to(feats.dtype)], dim=1))

@@ -1,0 +1,56 @@
+"""Rasters of predicted elements, as they are written to a map prior."""
+
+from collections.abc import Collection, Sequence
+
+import torch
+from torch import Tensor
+
+from gsmap.ops.polyline_raster import soft_rasters
+from gsmap.structures.grid import BEVGrid
+
+
+def draw_elements(
+    points_m: Tensor,
+    labels: Tensor,
+    grid: BEVGrid,
+    classes: Sequence[str],
+    areas: Collection[str],
+    softness: float = 2.0,
+    released_pixels: bool = False,
+) -> Tensor:
+    """Draw elements softly, one channel per class.
+
+    A pixel at a squared distance D in pixels from a line takes exp(-D / softness); areas are
+    filled. Of several elements of a class, the largest value counts.
+
+    Args:
+        points_m: Points of the elements in metres. (n, P, 2)
+        labels: Class indices. (n,)
+        grid: Extent and cells of the raster, H rows and W columns.
+        classes: Names of the classes.
+        areas: Names of the classes whose elements are filled.
+        softness: Softness in squared pixels, > 0.
+        released_pixels: Sample each pixel at its lower corner, as the release does.
+
+    Returns:
+        Values in [0, 1]. (classes, H, W)
+    """
+    raster = points_m.new_zeros((len(classes), grid.height, grid.width))
+    vertices = grid.px_from_metres(points_m)
+    if not released_pixels:
+        vertices = vertices - 0.5  # `soft_rasters` samples pixel (row, col) at (col, row)
+    for label, name in enumerate(classes):
+        lines = vertices[labels == label]
+        if not len(lines):
+            continue
+        is_area = torch.full((len(lines),), name in areas, device=lines.device)
+        masks = soft_rasters(
+            lines,
+            height=grid.height,
+            width=grid.width,
+            is_polygon=is_area,
+            line_softness=softness,
+            polygon_softness=softness,
+        )
+        raster[label] = masks.amax(0)
+    return raster

@@ -1,0 +1,214 @@
+"""Map priors of the places of a run."""
+
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gsmap.prior.map_prior import MapPrior
+from gsmap.prior.rules import WriteRule
+from gsmap.prior.settings import PriorSettings
+from gsmap.structures.grid import BEVGrid
+from gsmap.structures.rigid import is_rigid
+from gsmap.utils.errors import InputError
+
+_MOST_SCENES = 16  # maps of single scenes in memory
+
+
+class Place(NamedTuple):
+    """Place of a frame in the world.
+
+    Attributes:
+        token: Name of the sample.
+        name: Name of the town or map; empty if it is unknown.
+        scene: Name of the scene.
+        pose: Transform from the annotation frame to the world in metres. (4, 4)
+    """
+
+    token: str
+    name: str
+    scene: str
+    pose: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, meta: Mapping[str, Any]) -> "Place | None":
+        """Place of a sample, or None if its pose is unknown.
+
+        Args:
+            meta: Metainfo with ``lidar2global`` and, as far as they are known, ``token``,
+                ``map_name`` and ``scene``.
+
+        Raises:
+            ValueError: If the pose is no rigid motion.
+        """
+        if meta.get("lidar2global") is None:
+            return None
+        token = str(meta.get("token"))
+        pose = np.asarray(meta["lidar2global"], dtype=np.float64)
+        if pose.shape != (4, 4) or not is_rigid(pose):
+            raise InputError(
+                f"lidar2global of sample {token!r} must be a rigid motion (4, 4) to the world."
+            )
+        name = str(meta.get("map_name") or "")
+        return cls(token, name=name, scene=str(meta.get("scene") or ""), pose=pose)
+
+
+class PlaceMaps:
+    """Map priors by place, which start empty.
+
+    Args:
+        classes: Names of the classes.
+        grid: Extent and cells of the windows that are read and written.
+        rule: Rule of writing.
+        memory: ``"kept"``: one map for all frames of a place. ``"scene"``: one map for each scene.
+            ``"none"``: nothing is written.
+
+    Attributes:
+        memories: Valid values of ``memory``.
+
+    Raises:
+        ValueError: If ``memory`` is unknown, or the cells are no squares.
+    """
+
+    memories: ClassVar[tuple[str, ...]] = ("kept", "scene", "none")
+
+    def __init__(
+        self, classes: Sequence[str], grid: BEVGrid, rule: WriteRule, memory: str = "kept"
+    ) -> None:
+        if memory not in self.memories:
+            raise InputError(f"the memory of a prior must be one of {self.memories}: {memory!r}.")
+        width_m, height_m = grid.pixel_size_m
+        if abs(width_m - height_m) > 1e-6:
+            raise InputError(f"cells of a prior must be squares, got {width_m:g} x {height_m:g} m.")
+        self.classes = tuple(classes)
+        self.grid = grid
+        self.rule = rule
+        self.memory = memory
+        self.writes = memory != "none"
+        self.cell_m = round(width_m, 6)
+        self._priors: OrderedDict[str, MapPrior] = OrderedDict()
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "PlaceMaps":
+        """Empty maps with equal settings: a copy of a model begins without a map."""
+        return PlaceMaps(self.classes, self.grid, rule=self.rule, memory=self.memory)
+
+    def settings_of(self, name: str) -> PriorSettings:
+        """Settings of the map of a place."""
+        return PriorSettings(self.classes, place=name, cell_m=self.cell_m)
+
+    def find(self, place: Place) -> MapPrior | None:
+        """Map at a place, or None if nothing has been written there."""
+        return self._priors.get(self._key(place))
+
+    def find_or_create(self, place: Place) -> MapPrior:
+        """Map at a place, which is created if there is none."""
+        key = self._key(place)
+        if key not in self._priors:
+            if self.memory == "scene" and len(self._priors) >= _MOST_SCENES:
+                _, oldest = self._priors.popitem(last=False)
+                oldest.close()
+            self._priors[key] = MapPrior(self.settings_of(key), rule=self.rule)
+        return self._priors[key]
+
+    def _key(self, place: Place) -> str:
+        """Name of the map of a place."""
+        if self.memory == "scene" or not place.name:
+            return f"scene {place.scene}"
+        return place.name
+
+    def read(self, place: Place | None) -> Tensor:
+        """Read the window of a frame.
+
+        Args:
+            place: Place of the frame; None if it is unknown.
+
+        Returns:
+            Values in [0, 1] on the host, 0 where nothing is known. (classes, H, W)
+        """
+        prior = None if place is None or self.memory == "none" else self.find(place)
+        if place is None or prior is None:
+            return torch.zeros(len(self.classes), self.grid.height, self.grid.width)
+        return prior.read(place.pose, self.grid)
+
+    def write(self, place: Place | None, raster: Tensor) -> None:
+        """Write the drawn prediction of a frame. A frame without a known place is not written.
+
+        Args:
+            place: Place of the frame; None if it is unknown.
+            raster: Values in [0, 1]. (classes, H, W)
+        """
+        if place is not None and self.writes:
+            self.find_or_create(place).write(place.pose, self.grid, values=raster)
+
+
+class GivenMaps(PlaceMaps):
+    """Map priors of a user, one for each place.
+
+    Args:
+        priors: The priors.
+        classes: Names of the classes.
+        grid: Extent and cells of the windows that are read and written.
+        update: Write each frame after it is predicted.
+
+    Raises:
+        ValueError: If a prior has other classes or cells, or two are of one place.
+    """
+
+    def __init__(
+        self,
+        priors: Sequence[MapPrior],
+        classes: Sequence[str],
+        grid: BEVGrid,
+        update: bool = False,
+    ) -> None:
+        if not priors:
+            raise InputError("give at least one prior, or none at all.")
+        super().__init__(classes, grid, rule=priors[0].rule)
+        self.writes = update
+        for prior in priors:
+            name = prior.settings.place
+            self.settings_of(name).require_equal(prior.settings, f"the prior of {name!r}")
+            if name in self._priors:
+                raise InputError(f"two priors are of {name!r}: give one for each place.")
+            self._priors[name] = prior
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "GivenMaps":
+        """The maps themselves: they belong to the user and are not copied."""
+        return self
+
+    def find(self, place: Place) -> MapPrior:
+        """Map at a place. A frame without the name of a place is taken to be at the only one.
+
+        Raises:
+            ValueError: If there is no map of the place.
+        """
+        if not place.name and len(self._priors) == 1:
+            (prior,) = self._priors.values()
+            return prior
+        if place.name not in self._priors:
+            raise InputError(
+                f"sample {place.token!r} is in {place.name or 'an unknown place'!r}, and the "
+                f"priors are of {sorted(self._priors)}: give the prior of its place, too."
+            )
+        return self._priors[place.name]
+
+    def find_or_create(self, place: Place) -> MapPrior:
+        """Map at a place (`find`)."""
+        return self.find(place)
+
+    def read(self, place: Place | None) -> Tensor:
+        """Read the window of a frame.
+
+        Raises:
+            ValueError: If the place of the frame is unknown, or has no map.
+        """
+        if place is None:
+            raise InputError(
+                "a prior is read at the pose of a frame, and a sample has none: leave the prior "
+                "out, or give each sample its pose (lidar2global)."
+            )
+        return super().read(place)

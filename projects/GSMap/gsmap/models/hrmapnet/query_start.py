@@ -1,0 +1,150 @@
+"""Initialisation of queries by the map of earlier frames."""
+
+from typing import Any, NamedTuple
+
+import torch
+from mmdet3d.registry import MODELS
+from mmengine.model import BaseModule, xavier_init
+from torch import Tensor, nn
+
+from gsmap.models.base.decoder import Queries
+from gsmap.models.base.hooks import FlowHead, FlowHook, FlowStart
+from gsmap.models.base.pairs import Predictions
+from gsmap.structures.tensors import LateValues
+
+
+class MapKeys(NamedTuple):
+    """Cells of the map to which queries attend.
+
+    Attributes:
+        values: Map in each cell, [0, 1]. (B, K, M)
+        positions: Positional encoding of each cell. (B, K, C)
+        is_valid: False for padding. (B, K)
+    """
+
+    values: Tensor
+    positions: Tensor
+    is_valid: Tensor
+
+
+@MODELS.register_module()
+class PriorQueries(BaseModule):
+    """Attention of queries to the cells in which the map is known (HRMapNet).
+
+    Args:
+        embed_dims: Channels C of the queries and of the positional encoding.
+        num_channels: Channels M of the map in each cell.
+        num_heads: Heads of the attention.
+        stride: Every ``stride``-th row and column of the cells is used, from the first on.
+        threshold: Value that a channel of a cell must exceed for the cell to be used.
+        dropout: Probability to drop an attention weight in training.
+    """
+
+    def __init__(
+        self,
+        embed_dims: int = 256,
+        num_channels: int = 3,
+        num_heads: int = 8,
+        stride: int = 2,
+        threshold: float = 0.8,
+        dropout: float = 0.0,
+        init_cfg: dict | None = None,
+    ) -> None:
+        super().__init__(init_cfg)
+        self.stride = stride
+        self.threshold = threshold
+        self.label_encoder = nn.Linear(num_channels, embed_dims)
+        self.attention = nn.MultiheadAttention(
+            embed_dims, num_heads, dropout=dropout, batch_first=True
+        )
+
+    def init_weights(self) -> None:
+        """Initialise the encoder of map values from Xavier's uniform distribution."""
+        super().init_weights()
+        xavier_init(self.label_encoder, distribution="uniform", bias=0.0)
+
+    def forward(self, query: Tensor, keys: MapKeys) -> Tensor:
+        """Attend to the map, without the residual.
+
+        Args:
+            query: Queries. (B, Q, C)
+            keys: Cells of the map.
+
+        Returns:
+            Changes of the queries, 0 in samples without a valid cell. (B, Q, C)
+        """
+        tokens = keys.positions + self.label_encoder(keys.values)
+        has_cells = keys.is_valid.any(1, keepdim=True)  # (B, 1)
+        # A softmax over no cell has no value: such a sample attends to its padding.
+        is_blocked = has_cells & ~keys.is_valid
+        change, _ = self.attention(
+            query=query, key=tokens, value=tokens, key_padding_mask=is_blocked, need_weights=False
+        )
+        return torch.where(has_cells[..., None], change, 0.0)
+
+
+class PriorHook(FlowHook):
+    """Hook of a batch that starts its queries from the map, and keeps its predictions.
+
+    Args:
+        queries: Attention to the map, or None to leave the queries as they are.
+        keys: Cells of the map; None without ``queries``.
+
+    Attributes:
+        scores: Class logits of the last layer, once the head has run. (B, N, classes)
+        points_m: Points of the last layer in metres. (B, N, P, 2)
+    """
+
+    def __init__(self, queries: PriorQueries | None, keys: MapKeys | None) -> None:
+        self.queries = queries
+        self.keys = keys
+        self.scores: LateValues | None = None
+        self.points_m: LateValues | None = None
+
+    def start(self, head: FlowHead, start: FlowStart) -> FlowStart:
+        """Queries of the head, changed by the map, with references from the changed queries.
+
+        Differs from HRMapNet for heads whose queries have a positional half: this half attends, and
+        both halves change.
+
+        Args:
+            head: The head.
+            start: Queries of the head and of the previous hooks.
+        """
+        if self.queries is None:
+            return start
+        states, positions, references = start.queries
+        num = _num_rows(head)  # queries of other hooks follow
+        own_positions = positions[:, :num]
+        change = self.queries(own_positions, self.keys)
+        new_positions = own_positions + change
+        new_states = states[:, :num] + change
+        new_references = head.reference.start(new_positions)
+        num_references = new_references.shape[1]
+        queries = Queries(
+            state=torch.cat([new_states, states[:, num:]], dim=1),
+            position=torch.cat([new_positions, positions[:, num:]], dim=1),
+            reference=torch.cat([new_references, references[:, num_references:]], dim=1),
+        )
+        return start._replace(queries=queries)
+
+    def outputs(self, head: Any, layers: list[Predictions]) -> list[Predictions]:
+        """Keep the predictions of the last layer on their way to the host.
+
+        Args:
+            head: The head.
+            layers: Predictions of each layer.
+        """
+        last = layers[-1]
+        num = head.query_groups[0].num
+        points_m = head.reference.metres(last.pts[:, :num].detach().float())
+        self.scores = LateValues(last.scores[:, :num].float())
+        self.points_m = LateValues(points_m[..., :2])
+        return layers
+
+
+def _num_rows(head: Any) -> int:
+    """Number of rows of the states of the head's queries."""
+    groups = head.query_groups if head.training else head.query_groups[:1]
+    num_instances = sum(group.num for group in groups)
+    return num_instances * (head.num_points if head.decoder.point_queries else 1)

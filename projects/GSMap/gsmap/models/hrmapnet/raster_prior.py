@@ -1,0 +1,389 @@
+"""Raster prior of a detector: reads the map of earlier frames, and writes its predictions."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from mmdet.models.layers import LearnedPositionalEncoding
+from mmdet3d.registry import MODELS
+from mmengine.model import BaseModule
+from torch import Tensor
+
+from gsmap.models.base.head import MapHead
+from gsmap.models.base.parts import DEFAULTS, build_part
+from gsmap.models.encoders.camera_encoder import stack_calibration
+from gsmap.models.hrmapnet.bev_fusion import PriorBEVFusion
+from gsmap.models.hrmapnet.drawing import draw_elements
+from gsmap.models.hrmapnet.maps import GivenMaps, Place, PlaceMaps
+from gsmap.models.hrmapnet.query_start import MapKeys, PriorHook, PriorQueries
+from gsmap.prior.map_prior import MapPrior
+from gsmap.prior.rules import RULES, WriteRule
+from gsmap.structures.classes import AREA_CLASSES
+from gsmap.structures.grid import BEVGrid
+from gsmap.structures.tensors import LateValues, cached_constant, exclude_from_compile, upload
+from gsmap.utils.errors import InputError
+
+CELLS = "prior_cells"
+KEYS = "prior_keys"
+VALID = "prior_valid"
+"""Names of the outputs of `RasterPrior.fuse`."""
+
+
+class _Pending(NamedTuple):
+    """Predictions of a batch that are not written yet.
+
+    Attributes:
+        maps: Maps to write to.
+        places: Place of each sample, or None where it is unknown.
+        scores: Class logits. (B, N, classes)
+        points_m: Points in metres. (B, N, P, 2)
+    """
+
+    maps: PlaceMaps
+    places: list[Place | None]
+    scores: LateValues
+    points_m: LateValues
+
+
+@MODELS.register_module()
+class RasterPrior(BaseModule):
+    """Raster of earlier predictions at a place, as an input of a `MapDetector` (HRMapNet).
+
+    Before a frame, a window of the map is read at its pose. The BEV features are fused with it, and
+    the queries start from it. After the frame, the predictions are drawn and written. Training and
+    test begin with empty maps, so the map of a training is emptied at each epoch. Samples need
+    ``lidar2global`` and ``map_name``; a sample without a pose reads an empty map.
+
+    Args:
+        head: Head of the detector, a `MapHead`.
+        encoder: BEV encoder of the detector, with its cells as ``grid``.
+        bev: Settings of `PriorBEVFusion`, or None without a fusion.
+        queries: Settings of `PriorQueries`, or None without an initialisation of queries.
+        cell_m: Side of a cell of the map in metres. It divides the side of a BEV cell.
+        score_threshold: Predictions with a higher score are written.
+        softness: Softness of drawn predictions in squared cells (`draw_elements`).
+        released_pixels: Draw predictions half a cell too far up, as the release does.
+        train_rule: Name of the rule of writing in training as ``name``, and its settings.
+        test_rule: Rule of writing in tests.
+        test_memory: Frames of a test that share a map: those of a place (``"kept"``), of a scene
+            (``"scene"``), or none (``"none"``).
+
+    Attributes:
+        num_channels: Channels M of the map in each BEV cell.
+
+    Raises:
+        ValueError: If head, encoder or a setting does not fit.
+    """
+
+    def __init__(
+        self,
+        head: Any,
+        encoder: Any,
+        bev: Mapping[str, Any] | None = DEFAULTS,
+        queries: Mapping[str, Any] | None = DEFAULTS,
+        cell_m: float = 0.3,
+        score_threshold: float = 0.4,
+        softness: float = 2.0,
+        released_pixels: bool = False,
+        train_rule: Mapping[str, Any] | None = None,
+        test_rule: Mapping[str, Any] | None = None,
+        test_memory: str = "kept",
+        init_cfg: dict | None = None,
+    ) -> None:
+        super().__init__(init_cfg)
+        if not isinstance(head, MapHead):
+            raise InputError(f"{type(head).__name__} can have no prior, which needs a MapHead.")
+        cells = getattr(encoder, "grid", None)
+        if not isinstance(cells, BEVGrid) or encoder.num_levels != 1:
+            raise InputError(
+                f"{type(encoder).__name__} can have no prior, which needs a BEV encoder of one "
+                "level of images with cells of a fixed size."
+            )
+        if bev is None and queries is None:
+            raise InputError("prior needs bev, queries or both, such as bev=dict().")
+        self.window = head.grid.rasterized(cell_m)
+        self.scale = self.window.height // cells.height
+        size = (self.scale * cells.height, self.scale * cells.width)
+        if not self.scale or size != (self.window.height, self.window.width):
+            raise InputError(
+                f"prior.cell_m is {cell_m:g}: BEV cells of {cells.pixel_size_m[0]:g} m must be a "
+                "multiple of it."
+            )
+        self.classes = head.classes
+        self.coder = head.coder
+        self.num_channels = len(self.classes) * self.scale**2
+        self.score_threshold = score_threshold
+        self.softness = softness
+        self.released_pixels = released_pixels
+        self.train_rule = _build_rule(train_rule, default="keep_maximum")
+        self.test_rule = _build_rule(test_rule, default="last_seen")
+        self.test_memory = test_memory
+        self.cells = cells
+        embed_dims = head.embed_dims
+        shared = {"embed_dims": embed_dims, "num_channels": self.num_channels}
+        self.bev: PriorBEVFusion | None = None
+        if bev is not None:
+            heights = {"z_range": encoder.z_range} if hasattr(encoder, "z_range") else {}
+            self.bev = build_part(bev, type="PriorBEVFusion", grid=cells, **heights, **shared)
+        self.queries: PriorQueries | None = None
+        self.positions: LearnedPositionalEncoding | None = None
+        if queries is not None:
+            self.queries = build_part(queries, type="PriorQueries", **shared)
+            if self.bev is None or self.bev.layer is None:
+                self.positions = LearnedPositionalEncoding(
+                    embed_dims // 2, cells.height, cells.width
+                )
+        self._given: PlaceMaps | None = None
+        self._pending: list[_Pending] = []
+        self._maps = self.new_maps()
+
+    @property
+    def calibration(self) -> tuple[str, ...]:
+        """Names of the arrays of calibration that the fusion reads."""
+        return () if self.bev is None else self.bev.calibration
+
+    @property
+    def maps(self) -> PlaceMaps:
+        """Maps that are read and written."""
+        return self._maps if self._given is None else self._given
+
+    def new_maps(self) -> PlaceMaps:
+        """Create empty maps, for training or test."""
+        rule = self.train_rule if self.training else self.test_rule
+        memory = "kept" if self.training else self.test_memory
+        return PlaceMaps(self.classes, self.window, rule=rule, memory=memory)
+
+    def maps_of(self, priors: Sequence[MapPrior], update: bool = False) -> GivenMaps:
+        """Maps of a user, for `use` and `using`.
+
+        Args:
+            priors: The priors, one for each place.
+            update: Write each frame to them after it is predicted.
+
+        Raises:
+            ValueError: If a prior has other classes or cells, or two are of one place.
+        """
+        return GivenMaps(priors, self.classes, grid=self.window, update=update)
+
+    def use(self, maps: PlaceMaps | None) -> None:
+        """Use these maps in tests from now on; None for the maps of the model.
+
+        Args:
+            maps: Maps of `maps_of` or `new_maps`.
+        """
+        self.flush()
+        self._given = maps
+
+    @contextmanager
+    def using(self, maps: PlaceMaps) -> Iterator[None]:
+        """Use these maps in this context, and write all predictions at its end.
+
+        Args:
+            maps: Maps of `maps_of` or `new_maps`.
+        """
+        previous = self._given
+        self.use(maps)
+        try:
+            yield
+        finally:
+            self.use(previous)
+
+    def train(self, mode: bool = True) -> "RasterPrior":
+        """Set the mode, and empty the maps of the model."""
+        super().train(mode)
+        self._pending.clear()
+        self._maps = self.new_maps()
+        return self
+
+    @exclude_from_compile
+    def fuse(
+        self,
+        outputs: Mapping[str, Any],
+        metas: Sequence[Mapping[str, Any]],
+        img_shape: tuple[int, int],
+    ) -> dict[str, Any]:
+        """Read the map of a batch, and fuse the outputs of the encoder with it.
+
+        Args:
+            outputs: Outputs of the encoder: ``bev_feats`` (B, C, H, W), ``img_feats``.
+            metas: Metainfo of each sample.
+            img_shape: Rows and columns of the padded images.
+
+        Returns:
+            The outputs with fused ``bev_feats``, and the cells of the map for `hook`.
+        """
+        self.flush()
+        windows = [self.maps.read(Place.of(meta)) for meta in metas]
+        cells = F.pixel_unshuffle(torch.stack(windows), self.scale)  # (B, M, H, W) on the host
+        device = outputs["bev_feats"].device
+        calibration = stack_calibration(metas, self.calibration, device)
+        host = [cells]
+        if self.queries is not None:
+            host += self._select_keys(cells)
+        uploaded = upload(host, device)
+        keys = dict(zip((KEYS, VALID), uploaded[1:], strict=False))
+        fused = self.fuse_cells(outputs, uploaded[0], calibration, img_shape=img_shape)
+        return fused | keys
+
+    def fuse_window(
+        self,
+        outputs: Mapping[str, Any],
+        window: Tensor,
+        calibration: Mapping[str, Tensor],
+        img_shape: tuple[int, int],
+    ) -> dict[str, Any]:
+        """Fuse the outputs of the encoder with a window, by operations of fixed sizes.
+
+        Args:
+            outputs: Outputs of the encoder.
+            window: Values of the map, [0, 1]. (B, classes, h, w)
+            calibration: A tensor for each name in ``calibration``. (B, ...)
+            img_shape: Rows and columns of the padded images.
+
+        Returns:
+            The outputs with fused ``bev_feats``, and the cells of the map for `hook`.
+        """
+        cells = F.pixel_unshuffle(window, self.scale)
+        fused = self.fuse_cells(outputs, cells, calibration, img_shape=img_shape)
+        if self.queries is not None:
+            stride = self.queries.stride
+            numbers = torch.arange(self.cells.height * self.cells.width, device=window.device)
+            numbers = numbers.view(self.cells.height, self.cells.width)[::stride, ::stride]
+            largest = cells[:, :, ::stride, ::stride].amax(1).flatten(1)  # (B, K)
+            fused[KEYS] = numbers.reshape(1, -1).expand(len(window), -1)
+            fused[VALID] = largest > self.queries.threshold
+        return fused
+
+    def fuse_cells(
+        self,
+        outputs: Mapping[str, Any],
+        cells: Tensor,
+        calibration: Mapping[str, Tensor],
+        img_shape: tuple[int, int],
+    ) -> dict[str, Any]:
+        """Fuse the outputs of the encoder with the map in each BEV cell.
+
+        Args:
+            outputs: Outputs of the encoder.
+            cells: Map in each cell. (B, M, H, W)
+            calibration: A tensor for each name in ``calibration``. (B, ...)
+            img_shape: Rows and columns of the padded images.
+
+        Returns:
+            The outputs with fused ``bev_feats``, and ``cells``.
+        """
+        fused = {**outputs, CELLS: cells}
+        if self.bev is not None:
+            fused["bev_feats"] = self.bev(
+                outputs["bev_feats"],
+                cells=cells,
+                img_feats=outputs["img_feats"],
+                calibration=calibration,
+                img_shape=img_shape,
+            )
+        return fused
+
+    def hook(self, outputs: Mapping[str, Any]) -> PriorHook:
+        """Hook of a batch into the flow of the head.
+
+        Args:
+            outputs: Outputs of `fuse` or `fuse_window`.
+        """
+        if self.queries is None:
+            return PriorHook(None, None)
+        cells = outputs[CELLS].flatten(2).transpose(1, 2)  # (B, H * W, M)
+        numbers = outputs[KEYS]  # (B, K)
+        values = cells.gather(1, numbers[..., None].expand(-1, -1, cells.shape[-1]))
+        positions = self._cell_positions(cells)[numbers]  # (B, K, C)
+        return PriorHook(self.queries, MapKeys(values, positions, is_valid=outputs[VALID]))
+
+    def keep(self, hook: PriorHook, metas: Sequence[Mapping[str, Any]]) -> None:
+        """Keep the predictions of a batch, to be written before the next batch (`flush`).
+
+        Args:
+            hook: Hook of the batch, after the head has run.
+            metas: Metainfo of each sample.
+        """
+        if hook.scores is None or hook.points_m is None or not self.maps.writes:
+            return
+        places = [Place.of(meta) for meta in metas]
+        self._pending.append(_Pending(self.maps, places, hook.scores, hook.points_m))
+
+    def flush(self) -> None:
+        """Write the predictions of the previous batch to its maps."""
+        pending = list(self._pending)
+        self._pending.clear()
+        for batch in pending:
+            all_scores = batch.scores.read()
+            all_points_m = batch.points_m.read()
+            for index, place in enumerate(batch.places):
+                raster = self.draw(all_scores[index], all_points_m[index])
+                batch.maps.write(place, raster)
+
+    @torch.no_grad()
+    def draw(self, scores: Tensor, points_m: Tensor) -> Tensor:
+        """Draw the predictions of a frame whose scores are high enough.
+
+        Args:
+            scores: Class logits. (N, classes)
+            points_m: Points in metres. (N, P, 2)
+
+        Returns:
+            Values in [0, 1]. (classes, h, w)
+        """
+        best = self.coder.decode(scores, points_m)
+        is_sure = best.scores > self.score_threshold
+        return draw_elements(
+            points_m[best.query_inds[is_sure]],
+            labels=best.labels[is_sure],
+            grid=self.window,
+            classes=self.classes,
+            areas=AREA_CLASSES,
+            softness=self.softness,
+            released_pixels=self.released_pixels,
+        )
+
+    def _select_keys(self, cells: Tensor) -> list[Tensor]:
+        """Numbers of the known cells of each sample, and which are no padding. 2 x (B, K)"""
+        assert self.queries is not None
+        stride = self.queries.stride
+        is_known = torch.zeros(len(cells), self.cells.height, self.cells.width, dtype=torch.bool)
+        largest = cells[:, :, ::stride, ::stride].amax(1)
+        is_known[:, ::stride, ::stride] = largest > self.queries.threshold
+        numbers = [known.flatten().nonzero()[:, 0] for known in is_known]
+        length = max(1, *(len(sample) for sample in numbers))
+        padded = torch.zeros(len(cells), length, dtype=torch.long)
+        is_valid = torch.zeros(len(cells), length, dtype=torch.bool)
+        for row, sample in enumerate(numbers):
+            padded[row, : len(sample)] = sample
+            is_valid[row, : len(sample)] = True
+        return [padded, is_valid]
+
+    def _cell_positions(self, like: Tensor) -> Tensor:
+        """Positional encoding of all cells, on the device of a tensor. (H * W, C)"""
+        encoding = self.positions
+        if encoding is None:
+            assert self.bev is not None
+            encoding = self.bev.layer.positional_encoding
+        shape = (1, self.cells.height, self.cells.width)
+        mask = cached_constant(like, ("prior cells", *shape), lambda: like.new_zeros(shape))
+        return encoding(mask)[0].flatten(1).T
+
+
+def _build_rule(settings: Mapping[str, Any] | None, default: str) -> WriteRule:
+    """Build a rule of writing.
+
+    Args:
+        settings: Its name as ``name``, and its settings, or None.
+        default: Name of the rule if ``settings`` has none.
+    """
+    arguments = {"name": default, **(settings or {})}
+    name = arguments.pop("name")
+    if name not in RULES:
+        raise InputError(f"the rule of a prior must be one of {sorted(RULES)}, got {name!r}.")
+    try:
+        return RULES[name](**arguments)
+    except TypeError as error:
+        raise InputError(f"the rule {name} of a prior takes other settings: {error}.") from error
