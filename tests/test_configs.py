@@ -169,6 +169,9 @@ def small(cfg: Config) -> Config:
         encoder.num_layers = (1, 1)  # over the cameras, and of the features of the map
     if "num_cams" in encoder:
         encoder.num_cams = 6  # MiniCity's
+    prior_layer = ((cfg.model.get("prior") or {}).get("bev") or {}).get("layer") or {}
+    if "num_cams" in prior_layer:
+        prior_layer.num_cams = 6
     shrink_images(cfg)
     return cfg
 

@@ -145,6 +145,8 @@ def make_tiny(cfg: Config, root: Path, annotations: Callable) -> None:  # noqa: 
     """Let a published config train on MiniCity, sample by sample, with small images."""
     if "num_cams" in (cfg.model.get("bev_encoder") or {}):
         cfg.model.bev_encoder.num_cams = 6
+    if cfg.model.get("prior"):
+        cfg.model.prior.bev.layer.num_cams = 6
     shrink_images(cfg)
     for part in ("train", "val", "test"):
         loader = cfg[f"{part}_dataloader"]

@@ -10,7 +10,7 @@ with calibration.yaml, or a bag of ROS 1 or 2 (docs/inference.md).
 import argparse
 import sys
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -47,6 +47,7 @@ if TYPE_CHECKING:  # slow to import
     from gsmap import MapInferencer
     from gsmap.apis.frame_loader import BrokenFrame
     from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
+    from gsmap.prior.map_prior import MapPrior
 
 _ONE_SAMPLE_HZ = 1e-4  # rate at which a drive has one sample
 _SAMPLES = ".arrow"  # suffix of the file with the samples, in place of the one of --out
@@ -101,6 +102,15 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     group.add_argument(
         "--allow-missing-cameras", action="store_true", help="leave absent cameras blank"
     )
+    group = parser.add_argument_group("map of earlier drives, for a model that reads it")
+    group.add_argument(
+        "--prior", nargs="+", type=Path, default=[], metavar="FILE", help="maps, one for each place"
+    )
+    group.add_argument(
+        "--update-prior",
+        action="store_true",
+        help="write the predictions to it; a FILE that does not exist is created",
+    )
     group = parser.add_argument_group("running")
     group.add_argument(
         "--device",
@@ -133,6 +143,8 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         parser.error(f"--out names a JSON file, the samples go to a {_SAMPLES}: got {args.out}")
     if args.ground_z is not None and not args.show_dir:
         parser.error("--ground-z is for pictures: give --show-dir, too, or leave it out")
+    if args.update_prior and not args.prior:
+        parser.error("--update-prior changes the file of --prior: give it, too")
     if args.model and len(args.model) > 2:
         parser.error(f"--model takes a name, or a config and a checkpoint, got {args.model}")
     return args
@@ -278,6 +290,8 @@ def run_settings(args: argparse.Namespace) -> dict[str, str]:
     settings = {"model": args.model[0], "checkpoint": digest(checkpoint)}
     for name in ("cfg_options", "token", "max_samples", "allow_missing_cameras", "amp"):
         settings[name] = str(getattr(args, name))
+    for path in args.prior:
+        settings[f"prior {path.resolve()}"] = digest(path) if path.exists() else "new"
     return settings
 
 
@@ -307,6 +321,7 @@ def predict(
     dataset: "VectorizedMapDataset",
     chosen: list[int],
     results: ResultLog | None,
+    priors: Sequence["MapPrior"],
 ) -> dict[str, str]:
     """Predict samples, draw them and log the predictions.
 
@@ -316,6 +331,7 @@ def predict(
         dataset: The samples.
         chosen: Indices of the samples to predict.
         results: Log of the predictions; None without ``--out``.
+        priors: Maps of earlier drives.
 
     Returns:
         The reason for each broken frame, by the token of its sample.
@@ -332,7 +348,7 @@ def predict(
         if results and done:
             bar.write(f"going on after {len(done)} of {format_count(len(chosen), 'sample')}")
             broken.update(results.broken)
-            if inferencer.model.temporal is None:  # memory needs the frames before
+            if not remembers(inferencer):  # memory needs the frames before
                 bar.update(len(done))
                 chosen = [index for index in chosen if tokens[index] not in done]
 
@@ -350,6 +366,8 @@ def predict(
             num_workers=args.workers,
             allow_missing_cameras=args.allow_missing_cameras,
             on_broken=skip,
+            priors=priors,
+            update_priors=args.update_prior,
         )
         for sample in samples:
             token = str(sample.metainfo["token"])
@@ -359,6 +377,70 @@ def predict(
                 results.add(token, inferencer.vectors(sample))
             bar.update()
     return broken
+
+
+def remembers(inferencer: "MapInferencer") -> bool:
+    """Whether predictions of a model depend on the samples before."""
+    return inferencer.model.temporal is not None or inferencer.model.prior is not None
+
+
+def read_priors(
+    args: argparse.Namespace,
+    inferencer: "MapInferencer",
+    dataset: "VectorizedMapDataset",
+    chosen: Sequence[int],
+    stack: ExitStack,
+) -> list["MapPrior"]:
+    """Open the files of ``--prior``.
+
+    Args:
+        args: The options of the command.
+        inferencer: The model.
+        dataset: The samples.
+        chosen: Indices of the samples to predict.
+        stack: Closes the files.
+    """
+    if not args.prior:
+        return []
+    from gsmap.apis.map_priors import open_priors
+
+    return open_priors(
+        inferencer.model,
+        args.prior,
+        stack,
+        update=args.update_prior,
+        new_place=place_of(dataset, chosen, args.prior[0]),
+    )
+
+
+def save_priors(args: argparse.Namespace, priors: Sequence["MapPrior"]) -> None:
+    """Write the priors of ``--update-prior`` to their files."""
+    if not args.update_prior:
+        return
+    for prior, path in zip(priors, args.prior, strict=True):
+        prior.save(path)
+    print(f"updated: {', '.join(map(str, args.prior))}")
+
+
+def place_of(dataset: "VectorizedMapDataset", chosen: Sequence[int], path: Path) -> str:
+    """Name of the place of samples, or of the file if it is not known.
+
+    Args:
+        dataset: The samples.
+        chosen: Indices of the samples to predict.
+        path: File of the prior.
+
+    Raises:
+        ValueError: If the file does not exist and the samples are in several places.
+    """
+    all_names = dataset.annotations.column("map_name")
+    names = sorted({all_names[index] for index in chosen})
+    if len(names) > 1 and not path.exists():
+        raise InputError(
+            f"{path} does not exist, and the samples are in {', '.join(names)}: make the prior of "
+            "each place from its own samples, by --token or its own file."
+        )
+    return (names[0] if names else "") or path.stem
 
 
 def draw(
@@ -404,7 +486,7 @@ def main(argv: list[str] | None = None) -> str | None:
     from gsmap.apis.map_inferencer import select_samples
 
     inferencer = open_model(args)
-    if args.shard.count and inferencer.model.temporal is not None:
+    if args.shard.count and remembers(inferencer):
         raise InputError(
             "--shard cuts drives, which a model with memory needs whole: leave it out."
         )
@@ -417,8 +499,10 @@ def main(argv: list[str] | None = None) -> str | None:
     run["images"] = str(source.data_root)  # the folder name depends on content and calibration
     chosen_tokens = [tokens[index] for index in chosen]
     classes = dataset.metainfo["classes"]
-    with open_log(args, run, tokens=chosen_tokens, classes=classes) as results:
-        broken = predict(args, inferencer, dataset, chosen, results)
+    with ExitStack() as stack:
+        results = stack.enter_context(open_log(args, run, tokens=chosen_tokens, classes=classes))
+        priors = read_priors(args, inferencer, dataset, chosen, stack)
+        broken = predict(args, inferencer, dataset, chosen, results, priors)
         if chosen and len(broken) == len(chosen):
             raise no_usable_frame(broken, source.notes)
         if results:
@@ -430,6 +514,7 @@ def main(argv: list[str] | None = None) -> str | None:
                 options=settings,
                 samples=count,
             )
+        save_priors(args, priors)
     print_summary(args, source, dataset.ann_file, len(chosen), broken)
     return None
 

@@ -9,6 +9,7 @@ import gsmap  # noqa: F401 - first: it handles Ctrl-C during imports and bars fo
 # isort: split
 import argparse
 import json
+from contextlib import ExitStack
 from pathlib import Path
 
 from mmengine.config import Config
@@ -55,6 +56,14 @@ def parse_args() -> argparse.Namespace:
         action="store_true",
         help="score data of another split than that of the training, whose places it may share",
     )
+    parser.add_argument(
+        "--prior",
+        nargs="+",
+        type=Path,
+        default=[],
+        metavar="FILE",
+        help="maps of earlier drives, one for each place, for a model that reads them",
+    )
     add_common_arguments(parser)
     return parser.parse_args()
 
@@ -85,6 +94,9 @@ def main() -> None:
     args = parse_args()
     if not args.eval and not args.out:
         raise InputError("Nothing to do: name a metric after --eval, or a file after --out.")
+    from mmengine.model import is_model_wrapper
+
+    from gsmap.apis.map_priors import use_priors
     from gsmap.checkpoints.building import building
     from gsmap.checkpoints.reading import adopt_settings
     from gsmap.engine.launch import load_config
@@ -97,8 +109,11 @@ def main() -> None:
     apply_options(cfg, args)
     if notes and is_first_rank():
         print("\n".join(notes))
-    with building(cfg):
+    with building(cfg), ExitStack() as stack:
         runner = MapRunner.from_cfg(cfg)
+        if args.prior:
+            model = runner.model.module if is_model_wrapper(runner.model) else runner.model
+            use_priors(model, args.prior, stack)
         metrics = runner.test()
     if args.metrics_out and runner.rank == 0:
         write_text(args.metrics_out, json.dumps(metrics, indent=2))

@@ -18,6 +18,7 @@ from gsmap.apis.onnx_inferencer import (
     METADATA_KEY,
     NO_SIGNALS,
     POSE_ONLY_RULE,
+    PRIOR_INPUT,
     STREAM_INPUTS,
     OnnxInferencer,
 )
@@ -69,7 +70,14 @@ class ExportedDetector(nn.Module):
             )
         self.model = model
         stream_inputs = () if model.temporal is None else STREAM_INPUTS
-        self.input_names = ("images", *model.bev_encoder.calibration, *stream_inputs)
+        calibration = [*model.bev_encoder.calibration]
+        prior_inputs = ()
+        if model.prior is not None:
+            prior_inputs = (PRIOR_INPUT,)
+            for name in model.prior.calibration:
+                if name not in calibration:
+                    calibration.append(name)
+        self.input_names = ("images", *calibration, *prior_inputs, *stream_inputs)
         self.output_names = ("scores", "labels", "points", *head.reference.outputs[1:])
         self.memory: tuple[str, ...] = ()
 
@@ -80,7 +88,8 @@ class ExportedDetector(nn.Module):
             images: Pixel values of the data pipeline: 0 to 255, neither normalised nor padded.
                 (V, 3, H, W)
             inputs: Tensors of ``input_names[1:]``. The first ones are the calibration of the BEV
-                encoder, (V, 4, 4) or (18,) each. A model with memory also takes the transform from
+                encoder, (V, 4, 4) or (18,) each. A model with a map prior also takes its window
+                (classes, H, W). A model with memory also takes the transform from
                 the previous to the current frame in metres (4, 4), the seconds between them (1,),
                 1 or 0 for whether the stream continues (1,), and the memory of the previous frame.
 
@@ -116,8 +125,14 @@ class ExportedDetector(nn.Module):
         temporal = self.model.temporal
         image_size = tuple(images.shape[-2:])
         outputs = self.model.bev_encoder.encode(feats, calibration=batched, img_shape=image_size)
+        further_hooks: tuple[Any, ...] = ()
+        prior = self.model.prior
+        if prior is not None:
+            window = batched[PRIOR_INPUT]
+            outputs = prior.fuse_window(outputs, window, batched, img_shape=image_size)
+            further_hooks = (prior.hook(outputs),)
         if temporal is None:
-            predictions = head(outputs)
+            predictions = head(outputs, hooks=further_hooks) if further_hooks else head(outputs)
         else:
             past = Past(
                 memory={name: batched[f"{MEMORY_PREFIX}{name}"] for name in self.memory},
@@ -126,6 +141,7 @@ class ExportedDetector(nn.Module):
                 continues=batched["continues"][0] > 0.5,
             )
             recalled = temporal.recall(outputs, past)
+            recalled.further_hooks = further_hooks
             predictions = head(recalled.outputs, **recalled.hooks)
         last_layer = predictions[-1]
         decoded = head.reference.decode(last_layer.references[0])
@@ -161,6 +177,10 @@ class ExportedDetector(nn.Module):
                 inputs[name] = torch.zeros(NUM_CAN_BUS)
             elif name == "now_from_then":
                 inputs[name] = torch.eye(4)
+            elif name == PRIOR_INPUT:
+                window = self.model.prior.window
+                shape = (len(self.model.map_head.classes), window.height, window.width)
+                inputs[name] = torch.zeros(shape)
             elif name in STREAM_INPUTS:
                 inputs[name] = torch.zeros(1)
             else:

@@ -44,6 +44,8 @@ def reason_against(model: Any) -> str:
         return "it reads LiDAR, whose number of voxels changes"
     if model.temporal is not None:
         return "it remembers earlier frames (temporal)"
+    if model.prior is not None:
+        return "it reads a map of earlier frames (prior)"
     if head.not_exported:
         return f"{type(head).__name__} has no fixed number of operations ({head.not_exported})"
     if not hasattr(model.data_preprocessor, "normalise"):

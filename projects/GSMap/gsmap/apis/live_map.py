@@ -1,7 +1,7 @@
 """A trained model on the cameras of one vehicle, frame by frame."""
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from mmengine.config import Config
 
+from gsmap.apis.map_priors import maps_for
 from gsmap.datasets.memory import VEHICLE, Cameras, bgr_by_name, source_in_memory
 from gsmap.datasets.plausibility import calibration_warnings
 from gsmap.datasets.source import Source, ground_from_frame
+from gsmap.prior.map_prior import MapPrior
 from gsmap.structures.elements import MapElements
 from gsmap.structures.rigid import invert_rigid
 from gsmap.structures.streams import Frame, MapStream
@@ -36,7 +38,13 @@ class Predictor(Protocol):
         """Create the test data set of the config with other samples."""
 
     def predict(
-        self, dataset: "VectorizedMapDataset", *, allow_missing_cameras: bool, stream: Any
+        self,
+        dataset: "VectorizedMapDataset",
+        *,
+        allow_missing_cameras: bool,
+        stream: Any,
+        priors: "Sequence[MapPrior]",
+        update_priors: bool,
     ) -> "Iterator[Det3DDataSample]":
         """Predict the samples of a data set.
 
@@ -44,6 +52,8 @@ class Predictor(Protocol):
             dataset: From ``dataset``.
             allow_missing_cameras: Whether cameras of the model may be absent.
             stream: Memory of the earlier frames of the drive; None for independent samples.
+            priors: Maps of earlier drives, one for each place.
+            update_priors: Write each sample to ``priors``.
         """
 
     def elements(self, data_sample: "Det3DDataSample") -> MapElements:
@@ -68,6 +78,11 @@ class LiveMap:
             trained in, its pose on the vehicle is taken from the training data, otherwise from
             nuScenes (``lidar``) or Argoverse 2 (``ego``).
         allow_missing_cameras: Whether cameras of the model may be absent.
+        prior: Map of earlier drives, for a model that reads one.
+        update_prior: Write each frame to ``prior`` after it is predicted.
+
+    Raises:
+        ValueError: If a prior is given to a model without one, or does not fit it.
     """
 
     def __init__(
@@ -77,7 +92,13 @@ class LiveMap:
         cam_from_frame: Cameras,
         frame: str | None = None,
         allow_missing_cameras: bool = False,
+        prior: MapPrior | None = None,
+        update_prior: bool = False,
     ):
+        self._priors = () if prior is None else (prior,)
+        self._update_prior = update_prior
+        if prior is not None:
+            maps_for(inferencer.model, self._priors)
         self._inferencer = inferencer
         self._config = inferencer.cfg.test_dataloader.dataset
         self._intrinsics = intrinsics
@@ -131,7 +152,8 @@ class LiveMap:
                 the training images. (H, W, 3) each
             can_bus: Vehicle signals, as `motion_signals` computes them from poses. Without them, a
                 model that was trained with signals assumes a standing vehicle. (18,)
-            at: Name, scene, time and pose of the frame. Required with ``stream``. The pose is the
+            at: Name, scene, time and pose of the frame. Required with ``stream`` and with the prior
+                of this map. The pose is the
                 transform from the frame of the calibration to the world, in metres.
             stream: Memory of the earlier frames of the drive, from ``MapInferencer.new_stream``.
                 For temporal models only.
@@ -147,7 +169,10 @@ class LiveMap:
                 given, a stream is given for a model that is not temporal, or the frame is not
                 later than the last frame of the stream.
         """
-        if (at is None) != (stream is None):
+        has_stream = stream is not None
+        if self._priors and at is None:
+            raise InputError("a frame reads the prior at its pose: give it at=Frame(...).")
+        if has_stream != (at is not None) and not (self._priors and not has_stream):
             raise InputError(
                 "a frame that continues a stream needs both at=Frame(...) and stream=..., got "
                 f"at={at} and stream={stream}."
@@ -170,7 +195,11 @@ class LiveMap:
             frame = None
         self._dataset.frame_in_memory = frame
         predictions = self._inferencer.predict(
-            self._dataset, allow_missing_cameras=self._allow_missing_cameras, stream=stream
+            self._dataset,
+            allow_missing_cameras=self._allow_missing_cameras,
+            stream=stream,
+            priors=self._priors,
+            update_priors=self._update_prior,
         )
         (data_sample,) = predictions  # the data set has one sample
         return data_sample

@@ -26,6 +26,7 @@ from gsmap.apis.frame_loader import BrokenFrame, FrameDataset, collate
 from gsmap.apis.input_dataset import open_dataset
 from gsmap.apis.live_map import LiveMap
 from gsmap.apis.loading import load_model
+from gsmap.apis.map_priors import maps_for
 from gsmap.checkpoints.building import building
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import MapSample
@@ -33,6 +34,7 @@ from gsmap.datasets.elements import elements_of_predictions
 from gsmap.datasets.memory import Cameras
 from gsmap.datasets.source import Source, open_annotations
 from gsmap.evaluation.core.results_json import vectors_of
+from gsmap.prior.map_prior import MapPrior
 from gsmap.structures.elements import MapElements
 from gsmap.utils.errors import InputError
 from gsmap.utils.parallel import delay_signals, result_of
@@ -302,6 +304,8 @@ class MapInferencer:
         allow_missing_cameras: bool = False,
         on_broken: Callable[[BrokenFrame], object] | None = None,
         stream: Any = None,
+        priors: Sequence[MapPrior] = (),
+        update_priors: bool = False,
     ) -> "Iterator[Det3DDataSample]":
         """Predict samples of a data set. Several devices take batches in turn.
 
@@ -317,19 +321,24 @@ class MapInferencer:
             stream: Drive that the samples continue, for a model with memory (`new_stream`); it may
                 be used in several calls. By default each scene starts a new one. The stream is at
                 most a batch ahead of the samples that are yielded.
+            priors: Maps of earlier drives, one for each place, for a model that reads them. By
+                default such a model starts from an empty map in each call.
+            update_priors: Write each sample to ``priors`` after it is predicted.
 
         Yields:
             The samples in order, with ``pred_instances_3d`` on the CPU.
 
         Raises:
             ValueError: If a file of a sample is missing or damaged, or a camera is absent; for a
-                model with memory, if frames are out of order, or there are several devices.
+                model with memory, if frames are out of order, or there are several devices; if a
+                prior is given to a model without one, or does not fit the samples.
         """
         num_ahead = 0 if stream is not None else len(self.replicas)  # batches in computation
         if stream is None and self.model.temporal is not None:
             stream = self._temporal().new_scenes()
         elif stream is not None:
             self._temporal()
+        maps = self._maps(priors, update=update_priors)
         dataset = self._fit_cameras(dataset, allow_missing_cameras=allow_missing_cameras)
         frames = FrameDataset(dataset, blank_cameras=allow_missing_cameras)
         subset = frames if indices is None else Subset(frames, indices=indices)
@@ -348,7 +357,7 @@ class MapInferencer:
                     turn = number % len(pools)
                     with delay_signals():  # a pool has locks, see `result_of`
                         future = pools[turn].submit(
-                            self._step, turn=turn, batch=batch, stream=stream
+                            self._step, turn=turn, batch=batch, stream=stream, maps=maps
                         )
                         pending.append(future)
                 if len(pending) > num_ahead:
@@ -374,9 +383,26 @@ class MapInferencer:
             raise InputError("a model with memory runs on one device: name a single one.")
         return self.model.temporal
 
+    def _maps(self, priors: Sequence[MapPrior], update: bool) -> Any:
+        """Maps that the samples of a call read; None for a model without a prior.
+
+        Args:
+            priors: Maps of earlier drives; none to start from an empty map.
+            update: Write each sample to ``priors``.
+        """
+        if priors:
+            maps = maps_for(self.model, priors, update=update)
+        elif self.model.prior is not None:
+            maps = self.model.prior.new_maps()
+        else:
+            return None
+        if len(self.devices) > 1:
+            raise InputError("a model with a prior runs on one device: name a single one.")
+        return maps
+
     @torch.no_grad()
     def _step(
-        self, turn: int, batch: dict[str, Any], stream: Any = None
+        self, turn: int, batch: dict[str, Any], stream: Any = None, maps: Any = None
     ) -> "list[Det3DDataSample]":
         """Predict a batch on one device.
 
@@ -384,6 +410,7 @@ class MapInferencer:
             turn: Index of the device.
             batch: Inputs and data samples.
             stream: Drive or scenes of the samples, for a model with memory.
+            maps: Maps that the samples read, for a model with a prior.
         """
         model = self.replicas[turn]
         device_type = self.devices[turn].type
@@ -391,9 +418,11 @@ class MapInferencer:
         if fast_frames is not None and fast_frames.serves(batch):
             return fast_frames(batch)
         memory = nullcontext() if stream is None else self.model.temporal.using(stream)
+        prior = nullcontext() if maps is None else self.model.prior.using(maps)
         in_bfloat16 = self.amp and device_type == "cpu"
         with (
             memory,
+            prior,
             matrix_products(model.half_backbone is not None),
             torch.autocast(device_type, enabled=in_bfloat16),
         ):
@@ -441,6 +470,8 @@ class MapInferencer:
         cam_from_frame: Cameras,
         frame: str | None = None,
         allow_missing_cameras: bool = False,
+        prior: MapPrior | None = None,
+        update_prior: bool = False,
     ) -> LiveMap:
         """Create a function from the images of each frame to its map.
 
@@ -449,6 +480,8 @@ class MapInferencer:
             cam_from_frame: Transform from the frame to each camera, in metres. (4, 4) each
             frame: Frame of the transforms, as `LiveMap` takes it.
             allow_missing_cameras: Whether cameras of the model may be absent.
+            prior: Map of earlier drives, for a model that reads one.
+            update_prior: Write each frame to ``prior`` after it is predicted.
         """
         return LiveMap(
             self,
@@ -456,6 +489,8 @@ class MapInferencer:
             cam_from_frame=cam_from_frame,
             frame=frame,
             allow_missing_cameras=allow_missing_cameras,
+            prior=prior,
+            update_prior=update_prior,
         )
 
     def elements(self, data_sample: "Det3DDataSample") -> MapElements:

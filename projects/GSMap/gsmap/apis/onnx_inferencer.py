@@ -28,6 +28,7 @@ POSE_ONLY_RULE = (
 )
 NO_SIGNALS = "not needed: the model was trained without vehicle signals; zeros are taken"
 STREAM_INPUTS = ("now_from_then", "seconds", "continues")  # inputs of a model with memory
+PRIOR_INPUT = "prior"  # window of a map prior, an input of a model that reads one
 MEMORY_PREFIX = "memory_"  # of further inputs; the outputs that replace them start with new_memory_
 _PRECISIONS = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 _REQUIRED_OUTPUTS = {"scores", "labels", "points"}
@@ -45,6 +46,8 @@ class OnnxInferencer:
         classes: Names of the classes.
         cameras: Names of the cameras, in the order of images and matrices.
         image_size: Rows and columns of the images, in pixels.
+        prior_shape: Shape (classes, H, W) of the window of a map prior; None if the model reads
+            none. The window covers ``x_range`` and ``y_range`` of the metadata.
         metadata: Metadata of the file. ``ground_from_frame`` (4, 4), if present, is the transform
             in metres from the annotation frame to the ground below the rear axle (x ahead, y left,
             z up) in the training data. The frame of a vehicle's calibration must have this pose.
@@ -102,11 +105,14 @@ class OnnxInferencer:
             raise InputError("its graph is not the one that its metadata tell of")
         self._initial_memory: dict[str, NDArray[Any]] = {}
         self._calibration: list[str] = []
+        self.prior_shape: tuple[int, ...] | None = None
         for graph_input in other_inputs:
             name = graph_input.name
             if name.startswith(MEMORY_PREFIX):
                 dtype = _PRECISIONS[graph_input.type]
                 self._initial_memory[name] = np.zeros(graph_input.shape, dtype=dtype)
+            elif name == PRIOR_INPUT:
+                self.prior_shape = tuple(graph_input.shape)
             elif name not in STREAM_INPUTS:
                 self._calibration.append(name)
         if self.has_memory != bool(self._initial_memory):
@@ -159,6 +165,8 @@ class OnnxInferencer:
                   training data.
                 * GKT and BEVFormer also read ``can_bus`` (18,) of a record, unless the model was
                   trained without vehicle signals.
+                * Models with a map prior also read ``prior``, the values of the cells in the range
+                  of the map, of ``prior_shape``, in [0, 1]; by default zeros.
                 * Models with memory also read ``scene``, ``timestamp_ns`` and ``lidar2global``
                   (4, 4), from the annotation frame to the world in metres.
             stream: Drive of the sample, for a model with memory (`new_stream`); it is advanced.
@@ -210,9 +218,25 @@ class OnnxInferencer:
                 )
         stacked = np.stack(list(map(np.asarray, images)))  # (V, H, W, 3)
         pixels = np.ascontiguousarray(stacked.transpose(0, 3, 1, 2), dtype=np.float32)
+        if self.prior_shape is not None:
+            inputs[PRIOR_INPUT] = self._read_window(meta)
         if self.has_memory or stream is not None:
             inputs |= self._stream_inputs(meta, stream=stream)
         return {"images": pixels, **inputs}
+
+    def _read_window(self, meta: Mapping[str, Any]) -> NDArray[np.float32]:
+        """Window of the map prior in the metadata of a frame; zeros if there is none."""
+        assert self.prior_shape is not None
+        window = meta.get(PRIOR_INPUT)
+        if window is None:
+            return np.zeros(self.prior_shape, dtype=np.float32)
+        values = np.asarray(window, dtype=np.float32)
+        if values.shape != self.prior_shape or not ((values >= 0) & (values <= 1)).all():
+            raise InputError(
+                f"prior of {self.path.name} must have values in [0, 1] and shape "
+                f"{self.prior_shape}, got shape {values.shape}."
+            )
+        return values
 
     def _check_signals(self, meta: Mapping[str, Any]) -> None:
         """Raise ValueError if the graph needs vehicle signals and ``meta`` has none."""

@@ -55,9 +55,7 @@ class PriorBEVFusion(BaseModule):
             sizes = {"grid": grid, "bev_pixel_m": grid.pixel_size_m, "embed_dims": embed_dims}
             self.layer = build_part(layer, **_LAYER, **sizes, z_range=z_range)
         self.conv = nn.Sequential(
-            nn.Conv2d(
-                embed_dims + num_channels, embed_dims, kernel_size=3, padding=1, bias=False
-            ),
+            nn.Conv2d(embed_dims + num_channels, embed_dims, kernel_size=3, padding=1, bias=False),
             nn.BatchNorm2d(embed_dims),
             nn.ReLU(inplace=True),
         )

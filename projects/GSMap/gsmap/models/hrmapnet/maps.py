@@ -92,10 +92,6 @@ class PlaceMaps:
         self.cell_m = round(width_m, 6)
         self._priors: OrderedDict[str, MapPrior] = OrderedDict()
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> "PlaceMaps":
-        """Empty maps with equal settings: a copy of a model begins without a map."""
-        return PlaceMaps(self.classes, self.grid, rule=self.rule, memory=self.memory)
-
     def settings_of(self, name: str) -> PriorSettings:
         """Settings of the map of a place."""
         return PriorSettings(self.classes, place=name, cell_m=self.cell_m)
@@ -117,7 +113,7 @@ class PlaceMaps:
     def _key(self, place: Place) -> str:
         """Name of the map of a place."""
         if self.memory == "scene" or not place.name:
-            return f"scene {place.scene}"
+            return f"{place.name} scene {place.scene}"
         return place.name
 
     def read(self, place: Place | None) -> Tensor:

@@ -64,7 +64,7 @@ class RasterPrior(BaseModule):
         cell_m: Side of a cell of the map in metres. It divides the side of a BEV cell.
         score_threshold: Predictions with a higher score are written.
         softness: Softness of drawn predictions in squared cells (`draw_elements`).
-        released_pixels: Draw predictions half a cell too far up, as the release does.
+        released_pixels: Draw predictions half a cell off, as the release does.
         train_rule: Name of the rule of writing in training as ``name``, and its settings.
         test_rule: Rule of writing in tests.
         test_memory: Frames of a test that share a map: those of a place (``"kept"``), of a scene
@@ -138,6 +138,10 @@ class RasterPrior(BaseModule):
         self._given: PlaceMaps | None = None
         self._pending: list[_Pending] = []
         self._maps = self.new_maps()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Attributes of a copy, which begins with empty maps."""
+        return {**vars(self), "_pending": [], "_maps": self.new_maps()}
 
     @property
     def calibration(self) -> tuple[str, ...]:

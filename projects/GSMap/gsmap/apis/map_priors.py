@@ -1,0 +1,74 @@
+"""Map priors of a user for a model that reads one."""
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from gsmap.prior.map_prior import MapPrior
+from gsmap.utils.errors import InputError
+
+
+def require_prior(model: Any) -> None:
+    """Raise ValueError if a model takes no prior."""
+    if model.prior is None:
+        raise InputError("the model takes no prior (model.prior): leave the prior out.")
+
+
+def maps_for(model: Any, priors: Sequence[MapPrior], update: bool = False) -> Any:
+    """Maps of a user in the form that a model reads.
+
+    Args:
+        model: A `MapDetector`.
+        priors: The priors, one for each place.
+        update: Write each frame to them after it is predicted.
+
+    Raises:
+        ValueError: If the model takes no prior, or a prior does not fit it.
+    """
+    require_prior(model)
+    return model.prior.maps_of(priors, update=update)
+
+
+def use_priors(model: Any, paths: Sequence[Path], stack: ExitStack) -> None:
+    """Let a model read files of priors in its tests, without changing them.
+
+    Args:
+        model: A `MapDetector`.
+        paths: The files, one for each place.
+        stack: Closes the priors.
+
+    Raises:
+        FileNotFoundError: If a file does not exist.
+        ValueError: If the model takes no prior, or a prior is invalid or does not fit it.
+    """
+    priors = open_priors(model, paths, stack)
+    model.prior.use(maps_for(model, priors))
+
+
+def open_priors(
+    model: Any, paths: Sequence[Path], stack: ExitStack, update: bool = False, new_place: str = ""
+) -> list[MapPrior]:
+    """Open files of priors until the end of a context.
+
+    Args:
+        model: A `MapDetector` with a prior, which gives a new file its classes, cells and rule.
+        paths: The files.
+        stack: Closes the priors.
+        update: Reserve the files, to save them later; a file that does not exist is created.
+        new_place: Name of the place of a file that is created.
+
+    Raises:
+        FileNotFoundError: If a file does not exist and is not to be updated.
+        ValueError: If a file is no valid prior.
+        RuntimeError: If a file is reserved by another process.
+    """
+    require_prior(model)
+    priors = []
+    for path in paths:
+        if update and not path.exists():
+            settings = model.prior.maps.settings_of(new_place)
+            with MapPrior(settings, rule=model.prior.test_rule) as empty:
+                empty.save(path)
+        priors.append(stack.enter_context(MapPrior.load(path, update=update)))
+    return priors

@@ -1,0 +1,59 @@
+"""An exported model: the window is an input, and the writing is outside."""
+
+import numpy as np
+import pytest
+import torch
+from export_cases import POINTS_M, SCORES, shake
+from methods.hrmapnet.prior_cases import CLASSES, frames, prior_model
+from model_cases import IMAGE_SHAPE, NUM_CAMS
+
+from gsmap.apis.export import export_onnx, largest_differences
+from gsmap.apis.onnx_inferencer import OnnxInferencer
+from gsmap.datasets.elements import elements_of_predictions
+from gsmap.models.hrmapnet.maps import Place
+from gsmap.prior import KeepMaximum, MapPrior, PriorSettings
+
+for _package in ("onnx", "onnxscript", "onnxruntime"):
+    pytest.importorskip(_package, reason=f"{_package} is not installed: pip install -e .[onnx]")
+
+
+HERE = ("town", "a", 0.0)
+IMAGES = np.random.default_rng(0).integers(0, 255, (NUM_CAMS, *IMAGE_SHAPE, 3), np.uint8)
+
+
+def images_of(images, model):
+    """Return images as a data set hands them to a model, in a batch of one."""
+    pixels = torch.from_numpy(images.transpose(0, 3, 1, 2)).float()
+    return model.data_preprocessor({"inputs": {"img": [pixels]}})["inputs"]
+
+
+def test_a_file_reads_the_window_as_in_torch(tmp_path):
+    model = prior_model().eval()
+    shake(model)
+    model.map_head.coder.margin_m = None  # every query is found
+    path = tmp_path / "model.onnx"
+    export_onnx(model, path, [f"CAM_{number}" for number in range(NUM_CAMS)], IMAGE_SHAPE)
+    exported = OnnxInferencer(path, num_threads=1)
+    assert exported.prior_shape == (3, 48, 24)
+    (sample,) = frames(HERE)
+    meta = sample.metainfo
+    prior = MapPrior(PriorSettings(CLASSES, "town", cell_m=1.25), KeepMaximum())
+    maps = model.prior.maps_of([prior])
+    drawn = torch.rand(3, 48, 24, generator=torch.Generator().manual_seed(0))
+    prior.write(meta["lidar2global"], model.prior.window, drawn)
+    window = maps.read(Place.of(meta)).numpy()
+    found = exported(IMAGES, {**meta, "prior": window})
+    with torch.no_grad(), model.prior.using(maps):
+        (predicted,) = model(images_of(IMAGES, model), [sample], mode="predict")
+    expected = elements_of_predictions(predicted.pred_instances_3d)
+    scores, metres = largest_differences(found, expected)
+    assert len(found) == len(expected) > 5
+    assert scores < SCORES
+    assert metres < POINTS_M
+    without = exported(IMAGES, meta)
+    zeros = exported(IMAGES, {**meta, "prior": np.zeros_like(window)})
+    np.testing.assert_array_equal(without.scores, zeros.scores)
+    assert largest_differences(without, expected)[1] > 10 * POINTS_M  # the map counts
+    for wrong in (window[:2], window + 1.0, window * np.nan):
+        with pytest.raises(ValueError, match=r"prior of model\.onnx must have values in \[0, 1\]"):
+            exported(IMAGES, {**meta, "prior": wrong})
