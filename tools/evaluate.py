@@ -5,6 +5,7 @@ Examples:
     python tools/evaluate.py results.json gsmap_nuscenes_val.arrow --eval chamfer raster
     python tools/evaluate.py results.json nuscenes_map_anns_val.json --eval chamfer --hard
     python tools/evaluate.py gsmap_nuscenes_val.arrow --prior gsmap_nuscenes_train.arrow
+    python tools/evaluate.py maps/changes.geojson val.arrow --changes data/minicity/changes.geojson
 """
 
 # ruff: noqa: E402 - numpy reads these variables when it is imported
@@ -23,6 +24,7 @@ from importlib import import_module
 from pathlib import Path
 
 from scoring.analyses import (
+    change_report,
     consistency_report,
     group_report,
     interval_report,
@@ -54,7 +56,8 @@ from gsmap.utils.ray_shards import run_on_ray
 from gsmap.utils.shards import digest, digest_of_common, read_shard
 from gsmap.utils.words import format_count
 
-PRINTED = ("intervals", "by", "uncertainty")  # reports that their analyses print themselves
+# Reports that their analyses print themselves.
+PRINTED = ("intervals", "by", "uncertainty", "changes")
 
 
 def metric_settings(args: argparse.Namespace) -> MetricSettings:
@@ -212,6 +215,9 @@ def main(argv: list[str] | None = None) -> str:
     if args.executor:
         return run_on_ray(args, sys.argv)
     start = time.perf_counter()
+    if args.changes:
+        print_reports([change_report(args)], [], args)
+        return f"{args.results} in {time.perf_counter() - start:.1f} s"
     settings = metric_settings(args)
     evaluator = build_evaluator(args, settings)
     if args.shard.count:

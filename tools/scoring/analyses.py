@@ -20,7 +20,7 @@ from gsmap.evaluation.core.file_evaluation import (
     scenes_of,
 )
 from gsmap.evaluation.core.metric import MetricSettings
-from gsmap.evaluation.core.report import MetricReport
+from gsmap.evaluation.core.report import UNDEFINED, MetricReport
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.errors import InputError
 from gsmap.utils.model_facts import law_of
@@ -81,6 +81,32 @@ def consistency_report(args: argparse.Namespace) -> MetricReport:
     )
     figures = evaluate_drives(args.results, annotations, config=config, tracks_file=args.tracks)
     return MetricReport("consistency", groups={}, metrics=figures, detections={})
+
+
+def change_report(args: argparse.Namespace) -> MetricReport:
+    """Print precision and recall of the changes of a GeoJSON file."""
+    from gsmap.evaluation.analysis.change_files import KINDS, read_changes
+    from gsmap.evaluation.analysis.changes import change_figures
+
+    if args.ground_truth.suffix.lower() == ".json":
+        raise InputError(
+            f"--changes needs poses, which {args.ground_truth} has not: give the annotation file "
+            "(.arrow)."
+        )
+    found = read_changes(args.results)
+    truth = read_changes(args.changes)
+    figures = change_figures(found, truth, AnnotationFile(args.ground_truth))
+    rows = []
+    for name in (*KINDS, "all", "any_kind"):
+        row = [name.replace("_", " ")]
+        for key in ("precision", "recall"):
+            value = figures[f"{name}/{key}"]
+            row.append("-" if value == UNDEFINED else f"{100 * value:.1f}")
+        for key in ("num_found", "num_true"):
+            row.append(f"{figures.get(f'{name}/{key}', figures[f'all/{key}']):.0f}")
+        rows.append(row)
+    print(markdown_table(["changes", "precision", "recall", "found", "true in view"], rows) + "\n")
+    return MetricReport.of_figures("changes", figures)
 
 
 def uncertainty_report(args: argparse.Namespace, settings: MetricSettings) -> MetricReport:

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from gsmap.evaluation.analysis import DISTANCE
+from gsmap.evaluation.analysis import CHANGES_SUFFIX, DISTANCE
 from gsmap.evaluation.core.evaluator import METRIC_NAMES
 from gsmap.evaluation.core.metric import metric_files
 from gsmap.structures.classes import AREA_CLASSES
@@ -168,7 +168,15 @@ def add_analysis(parser: argparse.ArgumentParser) -> None:
         metavar="map|scene|distance|FILE",
         help="AP of each map or scene alone, of the map cut at 10 and 20 m from the vehicle, or "
         "of scenes by night and weather (FILE: scene.json of nuScenes' tables, or JSON with a word "
-        "for each scene or each sample)",
+        "for each scene or each sample), or of samples with and without a change in range (FILE: "
+        "GeoJSON of changes)",
+    )
+    group.add_argument(
+        "--changes",
+        type=Path,
+        metavar="TRUTH",
+        help="precision and recall of a GeoJSON file of changes (build_map.py --changes), given in "
+        "place of results, against the true changes",
     )
     group.add_argument(
         "--consistency",
@@ -219,10 +227,28 @@ def check_combinations(parser: argparse.ArgumentParser, args: argparse.Namespace
         parser.error("--law needs --uncertainty")
     if args.prior:
         check_prior(parser, args)
+    check_changes(parser, args)
     if args.by == DISTANCE and args.dim == 3:
         parser.error("--by distance is in the plane: leave out --dim 3")
     if args.shard.count:
         check_shard(parser, args)
+
+
+def check_changes(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
+    """Require that changes are scored against true changes, and without other analyses."""
+    is_changes = args.results is not None and args.results.suffix.lower() == CHANGES_SUFFIX
+    if is_changes and not args.changes:
+        parser.error(f"{args.results} is a file of changes: give the true ones as --changes")
+    if not args.changes:
+        return
+    if not is_changes:
+        parser.error(f"--changes scores a file of changes ({CHANGES_SUFFIX}), given as results")
+    if args.shard.count:
+        parser.error("--changes needs all changes: leave out --shard")
+    for name in ("by", "bootstrap", "against", "consistency", "uncertainty", "pr_curves"):
+        if getattr(args, name) not in (None, False):
+            option = "--" + name.replace("_", "-")
+            parser.error(f"{option} is of elements, not of changes: leave it or --changes out")
 
 
 def check_prior(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:

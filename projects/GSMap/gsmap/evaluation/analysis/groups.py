@@ -9,7 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.evaluation.analysis import CHANGES_SUFFIX
 from gsmap.evaluation.analysis.bootstrap import resampled_figures
+from gsmap.evaluation.analysis.change_files import read_changes
+from gsmap.evaluation.analysis.changes import changed_samples
 from gsmap.evaluation.core.report import UNDEFINED, MetricReport
 from gsmap.structures.elements import FloatArray, IntArray
 from gsmap.utils.errors import InputError
@@ -65,6 +68,7 @@ def read_groups(annotations: str | Path, by: str) -> Groups:
         annotations: Path of the annotation file.
         by: ``scene``, ``map``, or a JSON file with the group of each scene or of each sample. The
             ``scene.json`` of nuScenes is accepted, too; its descriptions contain weather and night.
+            A GeoJSON file of changes groups samples by whether a change lies in their range.
 
     Raises:
         FileNotFoundError: If a file does not exist.
@@ -77,6 +81,8 @@ def read_groups(annotations: str | Path, by: str) -> Groups:
             f"--by takes {', '.join(_COLUMNS)} or a JSON file, and there is no file {by!r}."
         )
     file = AnnotationFile(annotations)
+    if Path(by).suffix.lower() == CHANGES_SUFFIX:
+        return Groups(changed_samples(read_changes(by), file))
     tokens = file.column("token")
     groups = file.column(_COLUMNS.get(by, "scene"))
     if by not in _COLUMNS:

@@ -1,0 +1,161 @@
+"""GeoJSON files of changes of a map: elements that are removed, added or moved."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsmap.structures.elements import FloatArray
+from gsmap.structures.polylines import arc_lengths, points_at_steps
+from gsmap.utils.errors import InputError
+from gsmap.utils.json_items import items_of
+
+KINDS = ("removed", "added", "moved")
+"""Kinds of changes."""
+STEP_M = 0.5
+"""Distance of the points at which changes are compared."""
+_FARTHEST_M = 1e7  # largest coordinate
+_LONGEST_M = 1e6  # of all changes of a file together
+_LONGEST_NAME = 80  # letters
+_ABSENT = "absent"
+
+
+@dataclass(frozen=True, eq=False)
+class MapChange:
+    """Change of a map element, or of a part of a line.
+
+    Attributes:
+        kind: One of `KINDS`.
+        class_name: Class of the element.
+        map_name: Name of the map, in whose global frame the points are; empty if unknown.
+        points: Vertices in metres, closed for areas: the old place of a removed element, otherwise
+            the new one. (n, 2)
+        old_points: Old place of a moved element, if it is known. (m, 2)
+        confidence: Confidence in [0, 1].
+    """
+
+    kind: str
+    class_name: str
+    map_name: str
+    points: FloatArray
+    old_points: FloatArray | None
+    confidence: float
+
+    def samples(self) -> FloatArray:
+        """Points at equal steps along the change. (M, 2)"""
+        return points_at_steps(self.points, STEP_M)
+
+
+def read_changes(path: str | Path) -> list[MapChange]:
+    """Read the changes of ``build_map --changes`` or of MiniCity.
+
+    A feature is a line, or a polygon whose outer ring is used. Its properties are ``change`` (one
+    of `KINDS`), ``class`` and, if they are known, ``map``, ``confidence`` and the ``old`` vertices.
+
+    Args:
+        path: File, which may be untrusted. Coordinates are metres of the global frame
+            (``"crs": null``).
+
+    Raises:
+        FileNotFoundError: If the file does not exist.
+        ValueError: If the file is malformed, or a value is out of range.
+    """
+    path = Path(path)
+    members: dict[str, Any] = {"crs": _ABSENT}
+    advice = "give a GeoJSON file of changes (build_map.py --changes, or MiniCity's)"
+    changes = []
+    total_m = 0.0
+    for number, (feature, _) in enumerate(items_of(path, "features", advice, beside=members)):
+        try:
+            change = _read_feature(feature)
+            for points in (change.points, change.old_points):
+                if points is not None:
+                    total_m += arc_lengths(points)[-1]
+            if total_m > _LONGEST_M:
+                raise InputError(f"the changes are longer than {_LONGEST_M / 1000:g} km")
+        except InputError as error:
+            text = str(error).rstrip(".")
+            raise InputError(f"{path}, feature {number}: {text}.") from error
+        changes.append(change)
+    if members["crs"] is not None:
+        raise InputError(
+            f"{path} has no coordinates in metres of the global frame: give the file of changes "
+            'with "crs": null.'
+        )
+    return changes
+
+
+def _read_feature(feature: Any) -> MapChange:
+    """Read a feature of a file of changes."""
+    if not isinstance(feature, dict) or not isinstance(feature.get("properties"), dict):
+        raise InputError("it is no object with properties")
+    properties = feature["properties"]
+    kind = properties.get("change")
+    if kind not in KINDS:
+        raise InputError(f"`change` must be one of {', '.join(KINDS)}, got {kind!r:.60}")
+    confidence = properties.get("confidence", 1.0)
+    if not _is_number(confidence) or not 0 <= confidence <= 1:
+        raise InputError(f"`confidence` must be a number in [0, 1], got {confidence!r:.60}")
+    old_points = None
+    if kind == "moved" and "old" in properties:
+        old_points = _read_points(properties["old"])
+    return MapChange(
+        kind=kind,
+        class_name=_read_name(properties, "class"),
+        map_name=_read_name(properties, "map") if "map" in properties else "",
+        points=_read_geometry(feature.get("geometry")),
+        old_points=old_points,
+        confidence=float(confidence),
+    )
+
+
+def _read_name(properties: Mapping[str, Any], key: str) -> str:
+    """Read a printable name of moderate length."""
+    name = properties.get(key)
+    if not isinstance(name, str) or not name.isprintable() or not 0 < len(name) <= _LONGEST_NAME:
+        raise InputError(f"`{key}` must be a printable name of at most {_LONGEST_NAME} letters")
+    return name
+
+
+def _read_geometry(geometry: Any) -> FloatArray:
+    """Read a line, or the outer ring of a polygon. (n, 2)"""
+    kind = geometry.get("type") if isinstance(geometry, dict) else None
+    if kind == "LineString":
+        return _read_points(geometry.get("coordinates"))
+    if kind != "Polygon":
+        raise InputError(f"its geometry must be a LineString or a Polygon, got {kind!r:.60}")
+    rings = geometry.get("coordinates")
+    if not isinstance(rings, list) or not rings:
+        raise InputError("its polygon has no ring")
+    ring = _read_points(rings[0])
+    if len(ring) < 4 or not np.array_equal(ring[0], ring[-1]):
+        raise InputError("the ring of its polygon is not closed")
+    return ring
+
+
+def _read_points(positions: Any) -> FloatArray:
+    """Read two or more positions without their heights. (n, 2)"""
+    if not isinstance(positions, list) or len(positions) < 2:
+        raise InputError("its coordinates are no list of two or more positions")
+    points = []
+    for position in positions:
+        if not isinstance(position, list) or len(position) < 2:
+            raise InputError("a position has no two coordinates")
+        if not _is_coordinate(position[0]) or not _is_coordinate(position[1]):
+            raise InputError(
+                f"coordinates must be metres within {_FARTHEST_M:g} m, got {position!r:.60}"
+            )
+        points.append((float(position[0]), float(position[1])))
+    return np.array(points, dtype=np.float64)
+
+
+def _is_number(value: Any) -> bool:
+    """Whether a value is a number and no truth value."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _is_coordinate(value: Any) -> bool:
+    """Whether a value is a finite number of metres in range."""
+    return _is_number(value) and abs(value) <= _FARTHEST_M  # false for NaN

@@ -1,0 +1,306 @@
+"""Precision and recall of the changes of a map, and the samples that have a change in range."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import shapely
+
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.evaluation.analysis.change_files import KINDS, STEP_M, MapChange
+from gsmap.evaluation.core.report import UNDEFINED
+from gsmap.structures.elements import BoolArray, FloatArray, IntArray
+from gsmap.structures.polylines import is_closed
+from gsmap.structures.rigid import invert_rigid
+from gsmap.utils.errors import InputError
+
+NEAR_M = 1.5
+"""Largest distance between a found and a true change, the loosest threshold of AP_chamfer."""
+MIN_VIEWS = 5
+"""Smallest number of samples that have a point in range, for the point to be in view."""
+SHORTEST_M = 5.0
+"""Length of the shortest part of a line in view that must be found."""
+WANTED_RECALL = 0.6
+CHANGED = "changed"
+UNCHANGED = "unchanged"
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Ranges of the samples of one map.
+
+    Attributes:
+        frame_from_global: Transforms from the global frame to the samples, in metres. (S, 4, 4)
+        x_range: Smallest and largest x of the range, in metres.
+        y_range: Smallest and largest y of the range, in metres.
+    """
+
+    frame_from_global: FloatArray
+    x_range: tuple[float, float]
+    y_range: tuple[float, float]
+
+    def contains(self, sample: int, points: FloatArray) -> BoolArray:
+        """Find the points in the range of a sample. As in a map, heights are ignored.
+
+        Args:
+            sample: Index of the sample.
+            points: Points in the global frame, in metres. (n, 2)
+
+        Returns:
+            True for points in range. (n,)
+        """
+        transform = self.frame_from_global[sample]
+        x, y = (points @ transform[:2, :2].T + transform[:2, 3]).T
+        is_in_x = (x >= self.x_range[0]) & (x <= self.x_range[1])
+        is_in_y = (y >= self.y_range[0]) & (y <= self.y_range[1])
+        return is_in_x & is_in_y
+
+    def count(self, points: FloatArray) -> IntArray:
+        """Count the samples that have each point in range. (n, 2) -> (n,)"""
+        counts = np.zeros(len(points), dtype=np.int64)
+        for sample in range(len(self.frame_from_global)):
+            counts += self.contains(sample, points)
+        return counts
+
+
+def views_by_map(annotations: AnnotationFile) -> dict[str, Views]:
+    """Ranges of the samples of an annotation file, by the name of their map."""
+    poses: dict[str, list[FloatArray]] = {}
+    for sample in annotations:
+        poses.setdefault(sample.map_name, []).append(_level(sample.global_from_frame))
+    meta = annotations.meta
+    views = {}
+    for name, global_from_frame in poses.items():
+        frame_from_global = invert_rigid(np.array(global_from_frame))
+        views[name] = Views(frame_from_global, meta.x_range, y_range=meta.y_range)
+    return views
+
+
+def _level(pose: FloatArray) -> FloatArray:
+    """Position and yaw of a pose. (4, 4)"""
+    yaw = np.arctan2(pose[1, 0], pose[0, 0])
+    level = np.eye(4)
+    level[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    level[:2, 3] = pose[:2, 3]
+    return level
+
+
+def with_map_names(
+    changes: Iterable[MapChange], map_names: Sequence[str], where: str
+) -> list[MapChange]:
+    """Give changes without the name of their map the name of the only map.
+
+    Args:
+        changes: Changes of a file.
+        map_names: Names of the maps of the annotation file.
+        where: Name of the file, for the message.
+
+    Raises:
+        ValueError: If a change has no name and there are several maps.
+    """
+    named = []
+    for change in changes:
+        if not change.map_name:
+            if len(map_names) > 1:
+                raise InputError(
+                    f"{where} has changes without the property `map`, and the annotation file has "
+                    f"{len(map_names)} maps: name one for each change."
+                )
+            change = replace(change, map_name=map_names[0])
+        named.append(change)
+    return named
+
+
+def changed_samples(changes: Sequence[MapChange], annotations: AnnotationFile) -> dict[str, str]:
+    """Group samples by whether a change lies in their range.
+
+    Args:
+        changes: True changes.
+        annotations: The samples.
+
+    Returns:
+        ``changed`` or ``unchanged`` of each sample, by token.
+    """
+    views = views_by_map(annotations)
+    changes = with_map_names(changes, sorted(views), where="the file")
+    tokens: dict[str, list[str]] = {}
+    names = annotations.column("map_name")
+    for token, map_name in zip(annotations.column("token"), names, strict=True):
+        tokens.setdefault(map_name, []).append(token)
+    group_of = {}
+    for map_name, tokens_of_map in tokens.items():
+        points = _all_samples([change for change in changes if change.map_name == map_name])
+        for index, token in enumerate(tokens_of_map):
+            is_changed = views[map_name].contains(index, points).any()
+            group_of[token] = CHANGED if is_changed else UNCHANGED
+    return group_of
+
+
+def _all_samples(changes: Sequence[MapChange]) -> FloatArray:
+    """Points at equal steps along the old and new places of changes. (M, 2)"""
+    points = [np.zeros((0, 2))]
+    for change in changes:
+        points.append(change.samples())
+        if change.old_points is not None:
+            points.append(replace(change, points=change.old_points).samples())
+    return np.concatenate(points)
+
+
+def change_figures(
+    found: Sequence[MapChange], truth: Sequence[MapChange], annotations: AnnotationFile
+) -> dict[str, float]:
+    """Compute precision and recall of changes.
+
+    A found change is correct if half of its length lies within `NEAR_M` of true changes of its map,
+    class and kind. A true change must be found if it is in view: at least `SHORTEST_M` of a line,
+    or half of the outline of an area, with at least `MIN_VIEWS` samples. It is found if half of its
+    length in view lies within `NEAR_M` of found changes of its map, class and kind.
+
+    Args:
+        found: Changes found by a model.
+        truth: All true changes.
+        annotations: Samples of the drives that found the changes.
+
+    Returns:
+        Figures by key: for each kind, for ``all`` and for ``any_kind`` (kinds are not compared) the
+        ``precision`` and ``recall``, and numbers; -1 for the precision or recall of no change.
+        ``precision_at_recall_0.6`` of all is the largest precision at this recall or more over all
+        thresholds of confidence, -1 if there is none.
+
+    Raises:
+        ValueError: If the map of a found change is unknown.
+    """
+    views = views_by_map(annotations)
+    found = with_map_names(found, sorted(views), where="the file of found changes")
+    truth = with_map_names(truth, sorted(views), where="the file of true changes")
+    unknown = sorted({change.map_name for change in found} - views.keys())
+    if unknown:
+        raise InputError(
+            f"a change is on the map {unknown[0]!r}, and the samples are on "
+            f"{sorted(views)!r:.200}: give the annotation file of its drives."
+        )
+    targets = _targets(truth, views)
+    strict = _Comparison.of(found, truth, targets=targets, same_kind=True)
+    loose = _Comparison.of(found, truth, targets=targets, same_kind=False)
+    figures: dict[str, float] = {}
+    for kind in (*KINDS, "all"):
+        is_found_kind = _has_kind(found, kind)
+        is_true_kind = _has_kind(list(targets), kind)
+        figures[f"{kind}/precision"] = _mean(strict.hits[is_found_kind])
+        figures[f"{kind}/recall"] = _mean(strict.limits[is_true_kind] >= 0)
+        figures[f"{kind}/num_found"] = float(is_found_kind.sum())
+        figures[f"{kind}/num_true"] = float(is_true_kind.sum())
+    best = UNDEFINED
+    for limit in np.unique(strict.confidences):
+        if _mean(strict.limits >= limit) >= WANTED_RECALL:
+            best = max(best, _mean(strict.hits[strict.confidences >= limit]))
+    figures[f"all/precision_at_recall_{WANTED_RECALL}"] = best
+    figures["any_kind/precision"] = _mean(loose.hits)
+    figures["any_kind/recall"] = _mean(loose.limits >= 0)
+    return figures
+
+
+@dataclass(frozen=True, eq=False)
+class _Comparison:
+    """Matches of F found changes and T targets.
+
+    Attributes:
+        hits: Whether each found change is correct. (F,)
+        confidences: Confidence of each found change. (F,)
+        limits: Largest limit of confidence with which each target is found, or -1. (T,)
+    """
+
+    hits: BoolArray
+    confidences: FloatArray
+    limits: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        found: Sequence[MapChange],
+        truth: Sequence[MapChange],
+        targets: Mapping[MapChange, FloatArray],
+        same_kind: bool,
+    ) -> "_Comparison":
+        """Compare found with true changes.
+
+        Args:
+            found: Found changes.
+            truth: All true changes.
+            targets: Points in view of the true changes that must be found. T x (M, 2)
+            same_kind: Whether kinds must be equal.
+        """
+        hits = np.zeros(len(found), dtype=np.bool_)
+        confidences = np.zeros(len(found))
+        for index, change in enumerate(found):
+            hits[index] = _is_correct(change, truth, same_kind)
+            confidences[index] = change.confidence
+        limits = np.zeros(len(targets))
+        for index, (target, points) in enumerate(targets.items()):
+            limits[index] = _confidence_limit(target, points, found=found, same_kind=same_kind)
+        return cls(hits, confidences, limits=limits)
+
+
+def _has_kind(changes: Sequence[MapChange], kind: str) -> BoolArray:
+    """Whether each change is of a kind; ``all`` is every kind. (N,)"""
+    return np.array([kind in ("all", change.kind) for change in changes], dtype=np.bool_)
+
+
+def _mean(values: BoolArray) -> float:
+    """Share of true values; -1 without values."""
+    return float(values.mean()) if len(values) else UNDEFINED
+
+
+def _targets(truth: Sequence[MapChange], views: Mapping[str, Views]) -> dict[MapChange, FloatArray]:
+    """True changes that must be found, with their points in view. Each (M, 2)"""
+    targets = {}
+    for change in truth:
+        if change.map_name not in views:
+            continue
+        points = change.samples()
+        in_view = points[views[change.map_name].count(points) >= MIN_VIEWS]
+        least = len(points) / 2 if is_closed(change.points) else SHORTEST_M / STEP_M
+        if len(in_view) >= max(least, 1):
+            targets[change] = in_view
+    return targets
+
+
+def _is_correct(change: MapChange, truth: Sequence[MapChange], same_kind: bool) -> bool:
+    """Whether half of a found change lies near true changes of its map and class."""
+    lines = []
+    for other in truth:
+        if _may_match(change, other, same_kind):
+            lines.append(shapely.LineString(other.points))
+            if not same_kind and other.old_points is not None:
+                lines.append(shapely.LineString(other.old_points))
+    points = shapely.points(change.samples())
+    is_near = shapely.dwithin(points, shapely.union_all(lines), NEAR_M)
+    return bool(len(points)) and bool(is_near.mean() >= 0.5)
+
+
+def _confidence_limit(
+    target: MapChange, in_view: FloatArray, found: Sequence[MapChange], same_kind: bool
+) -> float:
+    """Largest limit of confidence with which a true change is found; -1 if it is not found.
+
+    Args:
+        target: The true change.
+        in_view: Its points in view. (M, 2)
+        found: Found changes.
+        same_kind: Whether kinds must be equal.
+    """
+    points = shapely.points(in_view)
+    best = np.full(len(points), -1.0)
+    for change in found:
+        if _may_match(target, change, same_kind):
+            is_near = shapely.dwithin(points, shapely.LineString(change.points), NEAR_M)
+            best[is_near] = np.maximum(best[is_near], change.confidence)
+    half = -(-len(best) // 2)
+    return float(np.sort(best)[::-1][half - 1])
+
+
+def _may_match(change: MapChange, other: MapChange, same_kind: bool) -> bool:
+    """Whether two changes have one map and class and, if it counts, one kind."""
+    if (change.map_name, change.class_name) != (other.map_name, other.class_name):
+        return False
+    return not same_kind or change.kind == other.kind
