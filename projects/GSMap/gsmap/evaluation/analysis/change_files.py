@@ -67,7 +67,9 @@ def read_changes(path: str | Path) -> list[MapChange]:
     advice = "give a GeoJSON file of changes (build_map.py --changes, or MiniCity's)"
     changes = []
     total_m = 0.0
-    for number, (feature, _) in enumerate(items_of(path, "features", advice, beside=members)):
+    for number, (feature, _) in enumerate(
+        items_of(path, "features", advice, other_entries=members)
+    ):
         try:
             change = _read_feature(feature)
             for points in (change.points, change.old_points):
