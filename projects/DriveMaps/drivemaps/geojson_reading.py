@@ -56,7 +56,9 @@ def read_geojson(
     path = Path(path)
     collector = ElementCollector(path, classes, rule=rule or ClassRule(CLASS_KEY))
     members: dict[str, Any] = {"crs": _NO_CRS}
-    for number, (feature, _) in enumerate(items_of(path, "features", _ADVICE, beside=members)):
+    for number, (feature, _) in enumerate(
+        items_of(path, "features", _ADVICE, other_entries=members)
+    ):
         try:
             _add_feature(feature, collector)
         except InputError as error:
