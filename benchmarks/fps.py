@@ -11,7 +11,8 @@ from torch import Tensor
 from benchmarks import model as models
 from benchmarks.measure import MIB, Cost, measure
 from benchmarks.model import advance_samples, measure_each, model_and_batch, report
-from gsmap.apis.fast_frame import FastFrames, StaticFrame, matrix_products
+from gsmap.apis.fast_frame import FastFrames, StaticFrame
+from gsmap.structures.tensors import matrix_products
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

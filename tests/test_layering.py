@@ -52,7 +52,7 @@ COMMON = {
     "encoders": {"base"},
     "streams": {"base"},
     "lines": {"base"},
-    "": {"encoders", "streams"},
+    "": {"base", "encoders", "streams"},
 }
 MODELS = COMMON | {
     method.name: {*method.built_on, "base", "encoders", "lines", "streams"} for method in METHODS

@@ -6,20 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import torch.nn.functional as F
 from inferencer_cases import NAMES, make_config, make_remembering, make_samples
 from mmdet.models.backbones import ResNet
 from mmengine.dataset import pseudo_collate
 
-from gsmap.apis.fast_frame import (
-    FastFrames,
-    StaticFrame,
-    matrix_products,
-    reason_against,
-)
+from gsmap.apis.fast_frame import FastFrames, StaticFrame, reason_against
 from gsmap.apis.map_inferencer import MapInferencer
 from gsmap.models.encoders.folded_backbone import FoldedBackbone
-from gsmap.models.encoders.half_backbone import fused_resnet
+from gsmap.models.encoders.fused_resnet import convolve_folded, fused_resnet
+from gsmap.structures.tensors import matrix_products
 
 REPO = Path(__file__).resolve().parents[2]
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
@@ -95,17 +90,7 @@ def test_training_does_not_use_half_copies(inferencer):
 
 @pytest.mark.parametrize("depth", [18, 50])
 @torch.no_grad()
-def test_fused_convolutions_are_those_of_the_blocks(depth, monkeypatch):
-    """The operators exist on a GPU alone; here plain ones stand in for them."""
-
-    def plain(x, weight, bias, **geometry):
-        return F.conv2d(x, weight, bias, **geometry).relu()
-
-    def plain_add(x, weight, z, alpha, bias, **geometry):
-        return (F.conv2d(x, weight, bias, **geometry) + alpha * z).relu()
-
-    monkeypatch.setattr(torch, "cudnn_convolution_relu", plain)
-    monkeypatch.setattr(torch, "cudnn_convolution_add_relu", plain_add)
+def test_fused_convolutions_are_those_of_the_blocks(depth):
     torch.manual_seed(0)
     backbone = ResNet(depth, base_channels=8, out_indices=(1, 3))
     backbone.eval()
@@ -115,7 +100,7 @@ def test_fused_convolutions_are_those_of_the_blocks(depth, monkeypatch):
     images = torch.randn(2, 3, 64, 96)
     folding = FoldedBackbone()
     expected = folding(backbone, images)
-    found = fused_resnet(folding.folded, images)
+    found = fused_resnet(folding.folded, images, convolve=convolve_folded)
     for ours, theirs in zip(found, expected, strict=True):
         torch.testing.assert_close(ours, theirs)
 

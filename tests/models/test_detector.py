@@ -107,11 +107,11 @@ def test_mixed_precision_stays_close_to_float32():
 def test_image_augmentation_is_for_training_only():
     torch.manual_seed(0)
     model = build_small(img_augment={"type": "GridMask", "prob": 1.0})
-    images = torch.ones(1, 2, 3, 64, 96)
+    images = torch.ones(1, 6, 3, 64, 96)
     seen = []
     model.img_backbone.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
-    model.train().extract_img_feats(images)
-    model.eval().extract_img_feats(images)
+    for training in (True, False):
+        model.train(training).extract_feat({"imgs": images}, make_samples(ONE))
     assert 0 < (seen[0] == 0).float().mean() < 1
     assert (seen[1] == 1).all()
 

@@ -7,8 +7,7 @@ per image size, and replayed for later frames.
 
 import threading
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +17,7 @@ from torch import Tensor, nn
 
 from gsmap.structures.calibration import stack_calibration_arrays
 from gsmap.structures.grid import padded_size
-from gsmap.structures.tensors import tensor_versions, upload
+from gsmap.structures.tensors import matrix_products, tensor_versions, upload
 from gsmap.utils.errors import InputError, WorkError
 
 if TYPE_CHECKING:
@@ -311,19 +310,3 @@ class FastFrames:
         visible.update(scores_3d=scores, labels_3d=labels)
         instances = InstanceData(metainfo=dict(head.reference.metainfo), **visible)
         return self.frame.model.add_pred_to_datasample([sample], [instances])[0]
-
-
-@contextmanager
-def matrix_products(in_tf32: bool) -> Iterator[None]:
-    """Context manager that selects TF32 for float32 matrix products on a GPU.
-
-    Args:
-        in_tf32: Whether to use TF32; if not, the precision is not changed.
-    """
-    previous_precision = torch.get_float32_matmul_precision()
-    if in_tf32:
-        torch.set_float32_matmul_precision("high")
-    try:
-        yield
-    finally:
-        torch.set_float32_matmul_precision(previous_precision)

@@ -1,7 +1,7 @@
 """Detector of map elements in images and LiDAR points."""
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from typing import Any, ClassVar
@@ -16,12 +16,15 @@ from torch import Tensor
 from torch.utils._pytree import tree_map_only
 
 from gsmap.checkpoints.strict import adapt_state, neutral_keys
+from gsmap.models.encoders.camera_encoder import stack_calibration
 from gsmap.models.encoders.folded_backbone import FoldedBackbone
+from gsmap.models.encoders.fused_resnet import FrozenNorms, has_frozen_norms
 from gsmap.models.encoders.half_backbone import HalfBackbone
 from gsmap.models.loss_check import LossCheck
+from gsmap.models.step_graphs import SWITCH, StepGraphs, reason_against_recording
 from gsmap.models.streams.memory import BatchMemory, StreamMemory
 from gsmap.structures.grid import BEVGrid
-from gsmap.structures.tensors import at_least_float32
+from gsmap.structures.tensors import at_least_float32, is_recording
 from gsmap.utils.errors import InputError
 
 Inputs = dict[str, Any]
@@ -57,13 +60,18 @@ class MapDetector(Base3DDetector):
             names of this package or of the release, and there must be no further ones.
         autocast: ``"bfloat16"``: backbone, neck and encoders, with nearly all arithmetic, use
             this type in training. Head, matching and losses run in float32, and no loss scale is
-            needed. None: no autocast here; ``--amp`` then includes the head.
+            needed. A ResNet with fixed batch norms is computed as fused convolutions
+            (`FrozenNorms`). None: no autocast here; ``--amp`` then includes the head.
         compiled: Compile backbone, neck, encoders and head at the start of a training, which takes
             a minute or more. True, or a mode of ``torch.compile``; ``"reduce-overhead"`` also
             captures CUDA graphs.
+        cuda_graphs: Record the operations of a training step up to the predictions once, on a GPU,
+            and replay them, forward and backward (`StepGraphs`). With ``autocast``, their float32
+            matrix products are computed in TF32.
 
     Raises:
-        ValueError: If there is no encoder, two encoders without a fusion, or another ``autocast``.
+        ValueError: If there is no encoder, two encoders without a fusion, another ``autocast``, or
+            ``cuda_graphs`` for a model whose steps cannot be recorded.
     """
 
     compiler: ClassVar[str] = "inductor"  # backend of torch.compile
@@ -85,12 +93,14 @@ class MapDetector(Base3DDetector):
         allow_untrained: bool = True,
         autocast: str | None = None,
         compiled: bool | str = False,
+        cuda_graphs: bool = False,
         data_preprocessor: dict | None = None,
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(data_preprocessor=data_preprocessor, init_cfg=init_cfg)
         self.img_backbone = MODELS.build(img_backbone) if img_backbone else None
         self.folded_backbone = FoldedBackbone() if fold_batch_norms else None
+        self.frozen_norms = FrozenNorms()
         # Convolutions on CPUs and tensor cores are fastest with channels last. mmcv's deformable
         # convolution reads such tensors as channels first, without an error.
         self.channels_last = True
@@ -121,6 +131,11 @@ class MapDetector(Base3DDetector):
         self.prior: Any = None
         if prior is not None:
             self.prior = MODELS.build({"head": self.map_head, "encoder": self.bev_encoder, **prior})
+        self.step_graphs: StepGraphs | None = None
+        if cuda_graphs:
+            if reason := reason_against_recording(self):
+                raise InputError(f"{SWITCH}=True does not go with this model: {reason}.")
+            self.step_graphs = StepGraphs()
 
     def train(self, mode: bool = True) -> "MapDetector":
         """Set the mode. If ``compiled`` is set, the modules are compiled before a training."""
@@ -145,8 +160,6 @@ class MapDetector(Base3DDetector):
         if self.img_backbone is None:
             raise InputError("the model has no img_backbone, so it takes no images.")
         images = imgs.flatten(0, 1)
-        if self.training and self.img_augment is not None:
-            images = self.img_augment(images)
         if self.half_backbone is not None and not torch.is_grad_enabled():
             maps = self.half_backbone(
                 self.img_backbone, self.img_neck, images=images, channels_last=self.channels_last
@@ -154,7 +167,9 @@ class MapDetector(Base3DDetector):
             return _split_batch(maps, batch_size=len(imgs))
         if self.channels_last:
             images = images.contiguous(memory_format=torch.channels_last)
-        if self.folded_backbone is None:
+        if self._fuses_frozen_norms(images):
+            feats = self.frozen_norms(self.img_backbone, images, dtype=torch.bfloat16)
+        elif self.folded_backbone is None:
             feats = self.img_backbone(images)
         else:
             feats = self.folded_backbone(self.img_backbone, images)
@@ -162,24 +177,47 @@ class MapDetector(Base3DDetector):
             feats = self.img_neck(feats)
         return _split_batch(feats, batch_size=len(imgs))
 
+    def _fuses_frozen_norms(self, images: Tensor) -> bool:
+        """Whether the backbone runs as fused convolutions: in half precision, on a GPU."""
+        if not (self.training and self.autocast and images.is_cuda and self.channels_last):
+            return False
+        is_compiled = getattr(self.img_backbone, "_compiled_call_impl", None) is not None
+        return has_frozen_norms(self.img_backbone) and not is_compiled
+
+    def augment_images(self, imgs: Tensor) -> Tensor:
+        """Apply the augmentation of the normalised images in training. (B, V, 3, H, W)"""
+        if not self.training or self.img_augment is None:
+            return imgs
+        images = self.img_augment(imgs.flatten(0, 1))
+        return images.unflatten(dim=0, sizes=(len(imgs), -1))
+
     def halve_backbone(self) -> None:
         """Run image backbone and neck in float16 in inference (`HalfBackbone`)."""
         self.half_backbone = HalfBackbone()
 
-    def extract_feat(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
+    def extract_feat(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Any]:
         """Outputs of the BEV encoder: ``bev_feats`` (B, C, H, W), and the inputs of its losses."""
-        if not (self.training and self.autocast):
-            return self._encode(batch_inputs, batch_data_samples)
-        device = next(self.parameters()).device.type
-        with torch.autocast(device, dtype=getattr(torch, self.autocast)):
+        with self._training_autocast() as in_half_precision:
             outputs = self._encode(batch_inputs, batch_data_samples)
-        return tree_map_only(Tensor, _in_float32, outputs)
+        return tree_map_only(Tensor, _in_float32, outputs) if in_half_precision else outputs
+
+    @contextmanager
+    def _training_autocast(self) -> Iterator[bool]:
+        """Context manager of ``autocast`` in training, with whether it is in effect."""
+        if not (self.training and self.autocast):
+            yield False
+            return
+        device = next(self.parameters()).device.type
+        # A recorded step must cast the weights at each replay.
+        caches = not is_recording(device)
+        with torch.autocast(device, dtype=getattr(torch, self.autocast), cache_enabled=caches):
+            yield True
 
     def _encode(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
         """Outputs of the BEV encoder, in the types of the autocast context."""
         outputs: dict[str, Tensor] = {}
         if self.bev_encoder is not None:
-            imgs = batch_inputs["imgs"]
+            imgs = self.augment_images(batch_inputs["imgs"])
             metas = []
             for sample in batch_data_samples:
                 metas.append({**sample.metainfo, "batch_input_shape": tuple(imgs.shape[-2:])})
@@ -192,6 +230,20 @@ class MapDetector(Base3DDetector):
         if self.prior is not None:
             outputs = self.prior.fuse(outputs, metas, img_shape=tuple(imgs.shape[-2:]))
         return outputs
+
+    def encode_images(self, imgs: Tensor, calibration: Mapping[str, Tensor]) -> dict[str, Any]:
+        """Outputs of the BEV encoder, from tensors alone.
+
+        Args:
+            imgs: Normalised and augmented images. (B, V, 3, H, W)
+            calibration: A tensor for each array that the encoder reads. (B, ...)
+        """
+        encoder: Any = self.bev_encoder
+        size = (imgs.shape[-2], imgs.shape[-1])
+        with self._training_autocast() as in_half_precision:
+            levels = encoder.levels(self.extract_img_feats(imgs))
+            outputs = encoder.encode(levels, calibration=calibration, img_shape=size)
+        return tree_map_only(Tensor, _in_float32, outputs) if in_half_precision else outputs
 
     @contextmanager
     def over_time(
@@ -223,15 +275,26 @@ class MapDetector(Base3DDetector):
         Raises:
             FloatingPointError: If a loss is not finite (`LossCheck`).
         """
-        outputs = self.extract_feat(batch_inputs, batch_data_samples)
-        with self.over_time(outputs, batch_data_samples) as batch:
-            losses = self.map_head.loss(batch.outputs, batch_data_samples, **batch.hooks)
+        losses = self._losses(batch_inputs, batch_data_samples)
         scalars = {}
         for name, loss in losses.items():
             scalars[name] = loss.mean() if loss.dim() else loss
         tokens = [sample.metainfo.get("token", "unknown") for sample in batch_data_samples]
         self.loss_check.start(scalars, tokens=tokens)
         return scalars
+
+    def _losses(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
+        """Losses of the head by name, as scalars or with one value for each of their elements."""
+        if self.step_graphs is not None:
+            imgs = self.augment_images(batch_inputs["imgs"])
+            metas = [sample.metainfo for sample in batch_data_samples]
+            encoder: Any = self.bev_encoder
+            calibration = stack_calibration(metas, encoder.calibration, imgs.device)
+            outputs, layers = self.step_graphs(self, imgs, calibration=calibration)
+            return self.map_head.loss(outputs, batch_data_samples, layers=layers)
+        outputs = self.extract_feat(batch_inputs, batch_data_samples)
+        with self.over_time(outputs, batch_data_samples) as batch:
+            return self.map_head.loss(batch.outputs, batch_data_samples, **batch.hooks)
 
     def parse_losses(self, losses: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
         """Sum the values whose names contain "loss".

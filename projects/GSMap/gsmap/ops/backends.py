@@ -23,11 +23,11 @@ TRITON_KERNELS = {
     "deformable_sample": True,
     "draw_polylines": True,
     "pairwise_soft_iou": True,
-    "raster_loss": False,
+    "raster_loss": True,
     "render_gaussians": True,
     "render_gaussians_in_warps": False,  # replaces the kernel of render_gaussians where enabled
     "sample_kernels": True,
-    "soft_rasters": False,
+    "soft_rasters": True,
 }
 SWITCH = "GSMAP_TRITON_KERNELS"  # environment variable: further kernels for "auto", or "all"
 UNORDERED = ("deformable_sample", "sample_kernels")  # atomics add their gradients in any order

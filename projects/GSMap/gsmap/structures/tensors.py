@@ -2,7 +2,8 @@
 
 import functools
 import sys
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, ParamSpec, TypeVar
 
 import torch
@@ -214,3 +215,24 @@ def tensor_versions(module: nn.Module) -> list[tuple[int, int]]:
     """Address and version of each tensor of a module, which change with its values."""
     tensors = [*module.parameters(), *module.buffers()]
     return [(t.data_ptr(), 0 if t.is_inference() else t._version) for t in tensors]
+
+
+@contextmanager
+def matrix_products(in_tf32: bool) -> Iterator[None]:
+    """Context manager that selects TF32 for float32 matrix products on a GPU.
+
+    Args:
+        in_tf32: Whether to use TF32; if not, the precision is not changed.
+    """
+    previous_precision = torch.get_float32_matmul_precision()
+    if in_tf32:
+        torch.set_float32_matmul_precision("high")
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(previous_precision)
+
+
+def is_recording(device_type: str) -> bool:
+    """Whether a CUDA graph is recorded now, for work on devices of a type."""
+    return device_type == "cuda" and torch.cuda.is_current_stream_capturing()

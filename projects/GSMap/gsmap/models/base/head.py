@@ -370,6 +370,7 @@ class MapHead(LossHead):
         bev_outputs: dict[str, Any],
         batch_data_samples: Samples,
         hooks: Sequence[FlowHook] = (),
+        layers: Sequence[Predictions] | None = None,
     ) -> Tensors:
         """Run the head and compute all losses, including those by auxiliary heads and hooks.
 
@@ -377,6 +378,7 @@ class MapHead(LossHead):
             bev_outputs: Outputs of the BEV encoder, with ``bev_feats`` (B, C, H, W).
             batch_data_samples: Samples with ground truth.
             hooks: Hooks into the flow, called after the hooks of ``flow_parts``.
+            layers: Predictions of each layer, if the head has already been run without hooks.
 
         Returns:
             Scalars by name.
@@ -387,8 +389,9 @@ class MapHead(LossHead):
         for part in cast(Sequence[FlowPart], self.flow_parts.values()):
             part_hooks.append(part.hook(self, truths))
         hooks = (*part_hooks, *hooks)
-        outputs = self(bev_outputs, hooks)
-        losses = self.losses_by_feat(outputs, truths, metas=metas, hooks=hooks)
+        if layers is None:
+            layers = self(bev_outputs, hooks)
+        losses = self.losses_by_feat(layers, truths, metas=metas, hooks=hooks)
         for hook in hooks:
             losses.update(hook.losses(self, truths))
         for name, head in self.aux_heads.items():

@@ -1,15 +1,13 @@
 """Image backbone and neck in half precision, for inference on a GPU."""
 
 import copy
-from typing import Any
 
 import torch
 from mmcv.cnn import fuse_conv_bn
-from mmdet.models.backbones import ResNet
-from mmdet.models.backbones.resnet import BasicBlock, Bottleneck
 from torch import Tensor, nn
 
 from gsmap.models.encoders.folded_backbone import can_be_folded
+from gsmap.models.encoders.fused_resnet import convolve_folded, fused_resnet, is_plain
 from gsmap.structures.tensors import tensor_versions
 
 
@@ -53,65 +51,13 @@ class HalfBackbone:
             self.neck = copy.deepcopy(neck)
             if self.neck is not None:
                 self.neck.half().to(memory_format=memory_format)  # type: ignore[call-overload]
-            self.fuses = folds and _is_plain(replica)
+            self.fuses = folds and is_plain(replica)
             self.state = state
         images = images.to(torch.float16, memory_format=memory_format)
         if self.fuses and images.is_cuda:
-            feats = fused_resnet(self.backbone, images)
+            feats = fused_resnet(self.backbone, images, convolve=convolve_folded)
         else:
             feats = self.backbone(images)
         if self.neck is not None:
             feats = self.neck(feats)
         return [feat.float() for feat in feats]
-
-
-def fused_resnet(backbone: ResNet, images: Tensor) -> tuple[Tensor, ...]:
-    """Feature maps of a folded ResNet, each block as fused convolutions of cuDNN.
-
-    Args:
-        backbone: ResNet whose batch norms are folded into its convolutions, on a GPU.
-        images: Its input, of the same type. (n, 3, H, W)
-
-    Returns:
-        The maps of ``backbone.out_indices``. (n, C, h, w) each
-    """
-    x = backbone.maxpool(_convolve(backbone.conv1, images))
-    feats = []
-    for index, name in enumerate(backbone.res_layers):
-        for block in getattr(backbone, name):
-            identity = x if block.downsample is None else block.downsample(x)
-            last = block.conv2
-            x = _convolve(block.conv1, x)
-            if isinstance(block, Bottleneck):
-                x = _convolve(block.conv2, x)
-                last = block.conv3
-            x = _convolve(last, x, identity)
-        if index in backbone.out_indices:
-            feats.append(x)
-    return tuple(feats)
-
-
-def _convolve(conv: nn.Conv2d, x: Tensor, identity: Tensor | None = None) -> Tensor:
-    """Convolution, bias, optional residual and ReLU as one operator."""
-    geometry: Any = {
-        "stride": conv.stride,
-        "padding": conv.padding,
-        "dilation": conv.dilation,
-        "groups": conv.groups,
-    }
-    if identity is None:
-        return torch.cudnn_convolution_relu(x, weight=conv.weight, bias=conv.bias, **geometry)
-    return torch.cudnn_convolution_add_relu(
-        x, weight=conv.weight, z=identity, alpha=1.0, bias=conv.bias, **geometry
-    )
-
-
-def _is_plain(backbone: nn.Module) -> bool:
-    """Whether a folded backbone is a ResNet of plain blocks, which `fused_resnet` requires."""
-    if not isinstance(backbone, ResNet) or backbone.deep_stem or backbone.plugins is not None:
-        return False
-    for name in backbone.res_layers:
-        for block in getattr(backbone, name):
-            if type(block) not in (BasicBlock, Bottleneck):
-                return False
-    return True

@@ -1,0 +1,232 @@
+"""ResNet on a GPU with each batch norm, residual and ReLU inside of its convolution."""
+
+from typing import Any, Protocol
+
+import torch
+import torch.nn.functional as F
+from mmdet.models.backbones import ResNet
+from mmdet.models.backbones.resnet import BasicBlock, Bottleneck
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from gsmap.structures.tensors import is_recording, tensor_versions
+
+Geometry = dict[str, Any]  # stride, padding, dilation and groups of a convolution
+
+
+class Convolve(Protocol):
+    """Convolution, batch norm, optional residual and optional ReLU as one operation."""
+
+    def __call__(
+        self,
+        conv: nn.Conv2d,
+        norm: nn.Module,
+        x: Tensor,
+        identity: Tensor | None = None,
+        relu: bool = True,
+    ) -> Tensor:
+        """Compute ``relu(norm(conv(x)) + identity)``.
+
+        Args:
+            conv: The convolution.
+            norm: The batch norm after it, or the identity if it is folded into the weights.
+            x: Input. (n, C, h, w)
+            identity: Residual in the shape of the output, or None.
+            relu: Whether the ReLU is applied.
+        """
+        ...
+
+
+def fused_resnet(backbone: ResNet, images: Tensor, convolve: Convolve) -> tuple[Tensor, ...]:
+    """Feature maps of a ResNet of plain blocks (`is_plain`).
+
+    Args:
+        backbone: The ResNet.
+        images: Its input. (n, 3, H, W)
+        convolve: Function that computes each convolution with its norm, residual and ReLU.
+
+    Returns:
+        The maps of ``backbone.out_indices``. (n, C, h, w) each
+    """
+    x = backbone.maxpool(convolve(backbone.conv1, backbone.norm1, images))
+    feats = []
+    for index, name in enumerate(backbone.res_layers):
+        for block in getattr(backbone, name):
+            identity = x
+            if block.downsample is not None:
+                *pooling, conv, norm = block.downsample
+                for layer in pooling:
+                    identity = layer(identity)
+                identity = convolve(conv, norm, identity, relu=False)
+            x = convolve(block.conv1, block.norm1, x)
+            if isinstance(block, Bottleneck):
+                x = convolve(block.conv2, block.norm2, x)
+                x = convolve(block.conv3, block.norm3, x, identity)
+            else:
+                x = convolve(block.conv2, block.norm2, x, identity)
+        if index in backbone.out_indices:
+            feats.append(x)
+    return tuple(feats)
+
+
+def is_plain(backbone: nn.Module) -> bool:
+    """Whether a backbone is a ResNet of plain blocks, which `fused_resnet` requires."""
+    if not isinstance(backbone, ResNet) or backbone.deep_stem or backbone.plugins is not None:
+        return False
+    for name in backbone.res_layers:
+        for block in getattr(backbone, name):
+            if type(block) not in (BasicBlock, Bottleneck) or block.with_cp:
+                return False
+    return backbone.dcn is None
+
+
+def convolve_folded(
+    conv: nn.Conv2d,
+    norm: nn.Module,
+    x: Tensor,
+    identity: Tensor | None = None,
+    relu: bool = True,
+) -> Tensor:
+    """Convolution on a GPU whose weights include the batch norm (`Convolve`)."""
+    if not relu:
+        return conv(x)
+    return _convolve_relu(x, conv.weight, conv.bias, identity, _geometry(conv))
+
+
+class FrozenNorms:
+    """Trains a ResNet whose batch norms have fixed statistics, as fused convolutions.
+
+    A norm with fixed statistics is a scale and a shift per channel. The scale multiplies the
+    weights of the convolution, with gradients, and the shift is its bias. Compared with separate
+    norms and ReLUs, most of the memory traffic of the backbone disappears. Weights of the
+    backbone, and so its checkpoints, are unchanged.
+    """
+
+    def __init__(self) -> None:
+        # Scale and shift of norms without gradients, with the versions of the norm's tensors.
+        self._constants: dict[nn.Module, tuple[list[tuple[int, int]], Tensor, Tensor]] = {}
+
+    def __call__(self, backbone: ResNet, images: Tensor, dtype: torch.dtype) -> tuple[Tensor, ...]:
+        """Compute the feature maps of normalised images.
+
+        Args:
+            backbone: The ResNet, which `has_frozen_norms`.
+            images: Normalised images. (n, 3, H, W)
+            dtype: Type in which the convolutions are computed.
+
+        Returns:
+            One map per output level, of type ``dtype``. (n, C, h, w) each
+        """
+        with torch.autocast(images.device.type, enabled=False):
+            return fused_resnet(backbone, images.to(dtype), convolve=self._convolve)
+
+    def _convolve(
+        self,
+        conv: nn.Conv2d,
+        norm: nn.Module,
+        x: Tensor,
+        identity: Tensor | None = None,
+        relu: bool = True,
+    ) -> Tensor:
+        """Convolution with its norm, with gradients (`Convolve`)."""
+        scale, shift = self._scale_and_shift(norm)
+        scaled = conv.weight * scale[:, None, None, None]
+        weight = scaled.to(x.dtype, memory_format=torch.channels_last)
+        bias = shift.to(x.dtype)
+        if not relu:
+            return F.conv2d(x, weight, bias, **_geometry(conv))
+        output: Tensor = _ConvolveReLU.apply(x, weight, bias, identity, _geometry(conv))
+        return output
+
+    def _scale_and_shift(self, norm: Any) -> tuple[Tensor, Tensor]:
+        """Scale and shift of a norm with fixed statistics. (C,) each"""
+        # A recorded step reads the norm's tensors, which may be loaded anew, at each replay.
+        if norm.weight.requires_grad or is_recording(norm.weight.device.type):
+            return _scale_and_shift(norm)
+        versions = tensor_versions(norm)
+        constants = self._constants.get(norm)
+        if constants is None or constants[0] != versions:
+            constants = (versions, *_scale_and_shift(norm))
+            self._constants[norm] = constants
+        return constants[1:]
+
+
+def has_frozen_norms(backbone: nn.Module | None) -> bool:
+    """Whether `FrozenNorms` would compute the output of a backbone in its present state."""
+    if backbone is None or not is_plain(backbone) or torch.compiler.is_compiling():
+        return False
+    for module in backbone.modules():
+        if module._forward_hooks or module._forward_pre_hooks:
+            return False
+        if isinstance(module, nn.modules.batchnorm._BatchNorm) and module.training:
+            return False
+    return True
+
+
+def _scale_and_shift(norm: Any) -> tuple[Tensor, Tensor]:
+    """Scale and shift of a norm with fixed statistics, from its tensors. (C,) each"""
+    scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
+    return scale, norm.bias - norm.running_mean * scale
+
+
+class _ConvolveReLU(torch.autograd.Function):
+    """Convolution, bias, optional residual and ReLU, of which only the output is kept."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        x: Tensor,
+        weight: Tensor,
+        bias: Tensor,
+        identity: Tensor | None,
+        geometry: Geometry,
+    ) -> Tensor:
+        output = _convolve_relu(x, weight, bias, identity, geometry)
+        ctx.save_for_backward(x, weight, output)
+        ctx.geometry = geometry
+        return output
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        x, weight, output = ctx.saved_tensors
+        needed = ctx.needs_input_grad
+        grad = torch.ops.aten.threshold_backward(grad, output, 0)
+        x_grad, weight_grad, bias_grad = torch.ops.aten.convolution_backward(
+            grad,
+            x,
+            weight,
+            [len(weight)],
+            transposed=False,
+            output_padding=[0, 0],
+            output_mask=list(needed[:3]),
+            **ctx.geometry,
+        )
+        identity_grad = grad if needed[3] else None
+        return x_grad, weight_grad, bias_grad, identity_grad, None
+
+
+def _convolve_relu(
+    x: Tensor, weight: Tensor, bias: Tensor | None, identity: Tensor | None, geometry: Geometry
+) -> Tensor:
+    """Convolution, bias, optional residual and ReLU; on a GPU one operator of cuDNN."""
+    if not x.is_cuda:
+        output = F.conv2d(x, weight, bias, **geometry)
+        if identity is not None:
+            output = output + identity
+        return output.relu_()
+    if identity is None:
+        return torch.cudnn_convolution_relu(x, weight=weight, bias=bias, **geometry)
+    return torch.cudnn_convolution_add_relu(
+        x, weight=weight, z=identity, alpha=1.0, bias=bias, **geometry
+    )
+
+
+def _geometry(conv: nn.Conv2d) -> Geometry:
+    """Stride, padding, dilation and groups of a convolution."""
+    return {
+        "stride": conv.stride,
+        "padding": conv.padding,
+        "dilation": conv.dilation,
+        "groups": conv.groups,
+    }
