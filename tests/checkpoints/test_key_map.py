@@ -11,7 +11,7 @@ from gsmap.checkpoints.key_rules import KeyMap
 def test_a_state_with_the_markers_of_a_table_is_read_by_it(key_map: KeyMap, side: int):
     keys = [f"{pair[side].replace('{i}', '0')}weight" for pair in key_map.markers]
     if side == 0:
-        keys.append(f"{key_map.sign}weight")
+        keys.append(f"{key_map.upstream_prefix}weight")
     assert find_key_map(keys) is key_map
 
 

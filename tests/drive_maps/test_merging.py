@@ -257,8 +257,8 @@ def test_what_a_frame_sees_and_how_often_is_that_of_all_elements_looked_at():
     drive = drive_of(0.1, scored=True)
     found = suppress(drive)
     points = found.points + np.random.default_rng(0).normal(0, 20, found.points.shape)
-    expected = np.sum([drive.sees(frame, points) for frame in drive.frames], axis=0)
-    np.testing.assert_array_equal(drive.times_seen(points), expected)
+    expected = np.sum([drive.in_range(frame, points) for frame in drive.frames], axis=0)
+    np.testing.assert_array_equal(drive.count_frames_in_range(points), expected)
     low, high = np.array([drive.x_range, drive.y_range]).T
     for frame in drive.frames:
         near = drive.nearby(frame, found)

@@ -13,7 +13,7 @@ from mmengine.hooks import Hook
 from mmengine.runner import Runner
 
 import gsmap.registered  # noqa: F401
-from gsmap.engine.run_log import MapRunner, _missed_elements
+from gsmap.engine.run_log import MapRunner, _missed_elements_warning
 
 
 @pytest.mark.parametrize("level", ["INFO", "DEBUG"])
@@ -70,12 +70,12 @@ def run_with(counts, queries):
 
 
 def test_elements_that_no_query_is_left_for_are_counted():
-    text = _missed_elements(*run_with([3, 43, 21, -1], 20))
+    text = _missed_elements_warning(*run_with([3, 43, 21, -1], 20))
     assert text.startswith(
         "2 of 4 training samples have more elements (up to 43) than the model has queries (20): "
         "24 elements can never be found."
     )
-    assert _missed_elements(*run_with([3, 20, -1], 20)) is None
+    assert _missed_elements_warning(*run_with([3, 20, -1], 20)) is None
 
 
 @pytest.mark.parametrize("loop", ["train", "test"])

@@ -68,7 +68,7 @@ def test_an_unused_key_has_no_place(name, key):
 @pytest.mark.parametrize("name", [name for name, example in EXAMPLES.items() if example["pairs"]])
 def test_an_unknown_key_is_refused_by_name(name):
     example = EXAMPLES[name]
-    keys = (*example["pairs"], *example["marks"], f"{TABLES[name].sign}riddle.x")
+    keys = (*example["pairs"], *example["marks"], f"{TABLES[name].upstream_prefix}riddle.x")
     state = {key: torch.ones(()) for key in keys}
     with pytest.raises(ValueError, match=rf"no {name} model has: .*riddle\.x"):
         ours_from_upstream(state)

@@ -117,7 +117,8 @@ def _vote(
         all_votes += weight * shapely.contains_xy(footprints[frame_index], x, y)
         support += (scores[rows][:, None] * contains).max(axis=0)
     is_chosen = votes > _MAJORITY * np.maximum(all_votes, votes)
-    confidence = np.minimum(support / np.maximum(drive.times_seen(spots), 1), 1.0)
+    num_frames = drive.count_frames_in_range(spots)
+    confidence = np.minimum(support / np.maximum(num_frames, 1), 1.0)
     outlines = []
     for part in shapely.get_parts(shapely.union_all(faces[is_chosen])):
         if part.area < MIN_AREA_M2:

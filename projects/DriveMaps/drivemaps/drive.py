@@ -90,8 +90,8 @@ class Drive:
     y_range: tuple[float, float]
     frames: Sequence[DriveFrame]
 
-    def sees(self, frame: DriveFrame, points: FloatArray) -> BoolArray:
-        """Find the points in the range of a frame.
+    def in_range(self, frame: DriveFrame, points: FloatArray) -> BoolArray:
+        """Mask of the points in the range of a frame.
 
         Args:
             frame: Frame of the drive.
@@ -111,7 +111,7 @@ class Drive:
         farthest_y = np.abs(self.y_range).max()
         return float(np.hypot(farthest_x, farthest_y)) + _SLACK_M
 
-    def times_seen(self, points: FloatArray) -> IntArray:
+    def count_frames_in_range(self, points: FloatArray) -> IntArray:
         """Count the frames that have each point in their range.
 
         Args:
@@ -124,7 +124,7 @@ class Drive:
         tree = cKDTree(points)
         for frame in self.frames:
             near = tree.query_ball_point(frame.origin, self.reach_m)
-            counts[near] += self.sees(frame, points[near])
+            counts[near] += self.in_range(frame, points[near])
         return counts
 
     def nearby(self, frame: DriveFrame, elements: MapElements) -> MapElements:

@@ -60,7 +60,8 @@ def merge_lines(drive: Drive, label: int, config: MergeConfig) -> list[tuple[Flo
     matches = match_vertices(lines, normals_of(lines))
     matched_scores = lines.scores[matches.segments]
     support = lines.scores + np.bincount(matches.vertices, matched_scores, minlength=num_vertices)
-    share = support / np.maximum(drive.times_seen(lines.points), 1)
+    num_frames = drive.count_frames_in_range(lines.points)
+    share = support / np.maximum(num_frames, 1)
     smooth_share = median_filter(share, 3)  # the vertex of a sharp corner has no match
     confidence = np.minimum(smooth_share, 1.0)
     is_confident = confidence >= config.min_confidence
@@ -126,9 +127,11 @@ def _select_parts(
         line_matches = slice(line_bounds[index], line_bounds[index + 1])
         vertices = matches.vertices[line_matches]
         segments = matches.segments[line_matches]
-        changes = np.diff(np.r_[False, is_free[line_start:line_end], False])
-        edges = line_start + np.flatnonzero(changes).reshape(-1, 2)
-        for start, end in edges.tolist():
+        # Runs of free vertices start and end where the flag changes.
+        padded_flags = np.r_[False, is_free[line_start:line_end], False]
+        changes = np.flatnonzero(np.diff(padded_flags))
+        runs = line_start + changes.reshape(-1, 2)
+        for start, end in runs.tolist():
             if arc_lengths(lines.points[start:end])[-1] < JOIN_M:
                 continue
             parts.append(slice(start, end))

@@ -10,7 +10,7 @@ from drivemaps.config import MergeConfig
 from drivemaps.drive import Drive, drive_map
 from drivemaps.line_merging import merge_lines
 from gsmap.structures.classes import AREA_CLASSES
-from gsmap.structures.elements import MapElements
+from gsmap.structures.elements import FloatArray, MapElements
 
 _RADIUS_M = 1.0  # a polyline within this distance of another one runs along it
 _MOST_SHARE = 0.5  # share of a polyline's length that may run along another one
@@ -72,7 +72,7 @@ def suppress(drive: Drive) -> MapElements:
         for points, label, score in frame.elements.rows:
             if len(points) > 1:
                 rows.append((points, label, score))
-    rows.sort(key=lambda row: -row[2])
+    rows.sort(key=_falling_score)
     lines = np.array([shapely.LineString(points) for points, _, _ in rows], dtype=object)
     strips = shapely.buffer(lines, _RADIUS_M)
     tree = shapely.STRtree(strips)
@@ -80,10 +80,20 @@ def suppress(drive: Drive) -> MapElements:
     selected = []
     for index, (points, label, score) in enumerate(rows):
         line = lines[index]
-        rivals = [i for i in tree.query(line) if is_selected[i] and rows[i][1] == label]
+        rivals = []  # selected polylines of the class
+        for near_index in tree.query(line):
+            _, near_label, _ = rows[near_index]
+            if is_selected[near_index] and near_label == label:
+                rivals.append(near_index)
         lengths_along = shapely.length(shapely.intersection(line, strips[rivals]))
         is_duplicate = (lengths_along > _MOST_SHARE * line.length).any()
         if line.length > 0.0 and not is_duplicate:
             is_selected[index] = True
             selected.append((label, points, score))
     return drive_map(selected)
+
+
+def _falling_score(row: tuple[FloatArray, int, float]) -> float:
+    """Key that sorts vertices, labels and scores by falling score."""
+    _, _, score = row
+    return -score

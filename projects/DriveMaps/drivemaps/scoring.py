@@ -97,8 +97,11 @@ def cut_to_frame(elements: MapElements, drive: Drive, frame: DriveFrame) -> MapE
     for line, label, score in drive.nearby(frame, elements).rows:
         local = frame.to_frame(line)
         if drive.classes[label] in AREA_CLASSES and len(local) > 3:
-            areas = shapely.get_parts(shapely.make_valid(shapely.Polygon(local)) & box)
-            pieces = [shapely.get_coordinates(a.exterior) for a in areas if a.area > 0.0]
+            area_in_range = shapely.make_valid(shapely.Polygon(local)) & box
+            pieces = []
+            for area in shapely.get_parts(area_in_range):
+                if area.area > 0.0:
+                    pieces.append(shapely.get_coordinates(area.exterior))
         else:
             pieces = clip_to_box(local, drive.x_range, drive.y_range)
         lines += pieces

@@ -28,7 +28,8 @@ def stitch(lines: Sequence[FloatArray]) -> list[FloatArray]:
         Joined lines; the last vertex of a ring equals its first. each (m, D)
     """
     is_closed = [bool(np.array_equal(line[0, :2], line[-1, :2])) for line in lines]
-    partner_of: dict[int, int] = {}  # by end; line i starts at end 2 * i and stops at 2 * i + 1
+    # End that each joined end is joined to. Line i has the ends 2 * i (first) and 2 * i + 1 (last).
+    partner_of: dict[int, int] = {}
     for first, second in _candidates(lines):
         first_line = first // 2
         second_line = second // 2

@@ -11,11 +11,11 @@ from gsmap.utils.errors import InputError
 from mapdata.folders.rig import PoseTrack
 
 VEHICLE_FRAMES = ("base_footprint", "base_link")
-_GAP_NS = 10**9
+_GAP_NS = 10**9  # longest gap between two poses in which the pose is interpolated
 _FOREVER_NS = 10**20
-_SELDOM_NS = 500_000_000  # longer average steps: each transform holds until the next one
-_STILL_M = 1e-3
-_STILL_JUMP_M = 0.1
+_SELDOM_NS = 500_000_000  # if the average step is longer, a transform holds until the next one
+_STILL_M = 1e-3  # smaller changes of a pose do not count as a motion
+_STILL_JUMP_M = 0.1  # smaller distances of successive poses do not count as jumps
 
 
 def is_static_topic(topic: str) -> bool:
@@ -35,7 +35,7 @@ class Transforms:
         times_ns: Times of the transforms, in the order of the bag. (n,)
         poses: Transforms from the child to the parent, in metres. each (4, 4)
         count: Number of messages.
-        changed: Number of static transforms that differ from the first one.
+        num_changes: Number of static transforms that differ from the first one.
     """
 
     topic: str
@@ -45,7 +45,7 @@ class Transforms:
     times_ns: list[int] = field(default_factory=list)
     poses: list[np.ndarray] = field(default_factory=list)
     count: int = 0
-    changed: int = 0
+    num_changes: int = 0
 
     def add(self, time_ns: int, pose: np.ndarray) -> None:
         """Add the transform of a message."""
@@ -54,7 +54,7 @@ class Transforms:
             self.times_ns.append(time_ns)
             self.poses.append(pose)
         elif np.abs(pose - self.poses[0]).max() > _STILL_M:
-            self.changed += 1
+            self.num_changes += 1
 
     @cached_property
     def moves(self) -> bool:
@@ -179,9 +179,10 @@ class FrameTree:
             )
         for name in known_names:
             self._choose_parents(name)
-            if any(not self._chosen[frame].is_static for frame in self.chain(name)[:-1]):
+            is_moving = any(not self._chosen[frame].is_static for frame in self.chain(name)[:-1])
+            if is_moving:
                 break
-        else:
+        else:  # none of them moves
             name = known_names[0]
             self._choose_parents(name)
         if name != known_names[0]:
@@ -197,16 +198,16 @@ class FrameTree:
         self.notes.clear()
 
         def rank(edge: Transforms) -> tuple[bool, int, str]:
-            is_beside = edge.child == vehicle or not self._leads(edge.parent, vehicle)
-            return is_beside, -edge.count, edge.topic
+            leads_to_vehicle = edge.child != vehicle and self._leads(edge.parent, vehicle)
+            return not leads_to_vehicle, -edge.count, edge.topic
 
         for child, sources in self.edges.items():
             best = min(sources.values(), key=rank)
             self._chosen[child] = best
-            if best.changed:
+            if best.num_changes:
                 self.notes.append(
-                    f"{best.changed} of the transforms from {child!r} to {best} differ from the "
-                    "first, which is used"
+                    f"{best.num_changes} of the transforms from {child!r} to {best} differ from "
+                    "the first, which is used"
                 )
             others = [str(edge) for edge in sources.values() if edge is not best]
             if others:
@@ -344,7 +345,7 @@ def odometry_poses(
     Returns:
         The poses, None without usable odometry, and notes on assumptions.
     """
-    # rank, position in ``odometries``, transform from the vehicle to the body
+    # Rank (0 is the best), index in ``odometries``, and transform from the vehicle to the body.
     candidates: list[tuple[int, int, np.ndarray]] = []
     notes = []
     for number, odometry in enumerate(odometries):
@@ -365,9 +366,12 @@ def odometry_poses(
             candidates.append((1, number, child_from_vehicle))
     if not candidates:
         return None, notes
-    rank, number, child_from_vehicle = min(
-        candidates, key=lambda candidate: (candidate[0], -len(odometries[candidate[1]].poses))
-    )
+
+    def order(candidate: tuple[int, int, np.ndarray]) -> tuple[int, int]:
+        rank, number, _ = candidate
+        return rank, -len(odometries[number].poses)
+
+    rank, number, child_from_vehicle = min(candidates, key=order)
     best = odometries[number]
     if rank == 2 and best.child not in VEHICLE_FRAMES:
         notes.append(f"{best} is taken for the poses of the vehicle's frame")

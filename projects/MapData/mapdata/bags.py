@@ -22,14 +22,14 @@ from mapdata.folders.rig import (
     RigCamera,
     RigFrame,
     nearest_images,
-    rectify_as_trained,
     rig_samples,
+    set_rectification_targets,
 )
 from mapdata.options import InputOptions
 from mapdata.ros_bag import library_errors
 
-_TOLERANCE_NS = 50_000_000
-_REACH_NS = 100_000_000  # of the first and the last pose
+_TOLERANCE_NS = 50_000_000  # largest difference in time of the images of one sample
+_REACH_NS = 100_000_000  # time for which the first and the last pose hold outside of their span
 _CHOOSE = "choose cameras with --topics"
 
 
@@ -99,15 +99,17 @@ def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
         vehicle = _choose_vehicle(content, wanted=options.vehicle_frame) if has_frames else ""
         rig = {topics[camera.name][0]: camera for camera, _ in calibrated_cameras}
         content.digest.update(calibration.read_bytes())
-    content.digest.update(rectify_as_trained(list(rig.values()), options.trained))
+    rectification_key = set_rectification_targets(list(rig.values()), options.trained)
+    content.digest.update(rectification_key)
 
     times_ns = {}
     for topic, camera in rig.items():
         times_ns[camera.name] = np.unique(content.images[topic].times_ns)
-    first = next((name for name in times_ns if "front" in name.lower()), next(iter(times_ns)))
+    first = _sampling_camera(list(times_ns))
     pose_at, pose_notes = _poses(content, vehicle=vehicle, ground=ground)
     requested_count = len(thin_out(times_ns[first], options.rate_hz))
-    wanted_ns = thin_out(_near_poses(times_ns[first], pose_at), options.rate_hz).tolist()
+    times_with_pose = _near_poses(times_ns[first], pose_at)
+    wanted_ns = thin_out(times_with_pose, options.rate_hz).tolist()
     frames = []
     nearest = nearest_images(times_ns, wanted_ns, tolerance_ns=_TOLERANCE_NS)
     for frame_ns, image_times in zip(wanted_ns, nearest, strict=True):
@@ -140,6 +142,14 @@ def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
         has_poses=pose_at is not None,
         notes=tuple(notes),
     )
+
+
+def _sampling_camera(names: Sequence[str]) -> str:
+    """Camera whose images define the times of the samples: a front camera, or else the first."""
+    for name in names:
+        if "front" in name.lower():
+            return name
+    return names[0]
 
 
 def _topic_of(name: str, place: str, images: Mapping[str, str], kinds: Mapping[str, str]) -> str:

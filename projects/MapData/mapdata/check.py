@@ -19,7 +19,7 @@ from gsmap.utils.progress import Progress
 from gsmap.utils.words import format_count
 from mapdata.command_line import add_workers_option
 
-_MOST_PROBLEMS = 10  # in a message
+_MOST_PROBLEMS = 10  # number of broken files that a message names
 
 
 def _open(path: Path) -> AnnotationFile:

@@ -9,8 +9,8 @@ from mapdata.local_map import COLLECTION, LocalPatch, is_line
 EDGES = "edges"
 PARALLEL = "parallel"
 CROSSINGS = (UNITED, EDGES, PARALLEL)
-EDGE_MARGIN_M = 0.2
-PARALLEL_COSINE_GAP = 0.01  # about 8 degrees
+EDGE_MARGIN_M = 0.2  # distance from the edge of the patch at which open outlines end
+PARALLEL_COSINE_GAP = 0.01  # one minus the cosine of the largest angle, about 8 degrees
 
 
 def long_edges(polygons: np.ndarray) -> np.ndarray:
@@ -83,9 +83,10 @@ def merge_parallel(pieces: np.ndarray, owner: np.ndarray) -> np.ndarray:
     """
     _, crossing_of_piece = np.unique(owner, return_inverse=True)
     crossings = shapely.multipolygons(pieces, indices=crossing_of_piece)
-    bounds = shapely.bounds(crossings)
-    near = (bounds[:, None, :2] <= bounds[None, :, 2:]).all(-1)
-    near &= near.T
+    bounds = shapely.bounds(crossings)  # smallest x, y and largest x, y (n, 4)
+    # Two boxes touch if each of them begins before the other ends, along both axes.
+    begins_before_end = (bounds[:, None, :2] <= bounds[None, :, 2:]).all(-1)  # (n, n)
+    near = begins_before_end & begins_before_end.T
     np.fill_diagonal(near, False)
     is_free = np.ones(len(crossings), dtype=bool)
     sides = np.zeros((len(crossings), 2))
@@ -97,7 +98,8 @@ def merge_parallel(pieces: np.ndarray, owner: np.ndarray) -> np.ndarray:
             continue
         is_free[i] = False
         others = np.flatnonzero(near[i] & is_free)
-        others = others[1.0 - np.abs(sides[others] @ sides[i]) < PARALLEL_COSINE_GAP]
+        cosines = np.abs(sides[others] @ sides[i])
+        others = others[1.0 - cosines < PARALLEL_COSINE_GAP]
         is_free[others] = False
         if len(others):
             crossing = shapely.union_all(crossings[[i, *others]])

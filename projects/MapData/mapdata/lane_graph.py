@@ -160,6 +160,15 @@ def _fold_points(nodes: Sequence[int], uses: np.ndarray) -> list[tuple[int, Edge
     return edges
 
 
+def _next_edge(edges: Iterator[Edge], visited: set[int]) -> Edge | None:
+    """Next edge that leads to a node that is not visited, or None."""
+    for edge in edges:
+        _, end = edge
+        if end not in visited:
+            return edge
+    return None
+
+
 def _paths_from(source: int, graph: dict[int, list[Edge]]) -> Iterator[list[int]]:
     """Yield the nodes of every simple path from a node to a node without outgoing edges."""
     path = [source]
@@ -169,7 +178,7 @@ def _paths_from(source: int, graph: dict[int, list[Edge]]) -> Iterator[list[int]
     while stack:
         length, node, edges = stack[-1]
         del path[length:]
-        edge = next((candidate for candidate in edges if candidate[1] not in visited), None)
+        edge = _next_edge(edges, visited)
         if edge is None:
             stack.pop()
             visited.discard(node)

@@ -22,9 +22,10 @@ from gsmap.utils.files import write_text
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-OVERLAP_DISTANCE_M = 5.0
-_DISTANCES_M = (5.0, 15.0, 30.0, 60.0)  # of the report; patches of 60 x 30 m can meet at 30 and 60
-# (x, y) of samples in metres, by split and map name
+OVERLAP_DISTANCE_M = 5.0  # a validation sample within this distance of training overlaps it
+# Distances of the report. Patches of 60 x 30 m can overlap up to a distance of 30 m or 60 m.
+_DISTANCES_M = (5.0, 15.0, 30.0, 60.0)
+# Positions (x, y) of samples in metres, by split and by map name.
 Positions = Mapping[str, Mapping[str, list[np.ndarray]]]
 _ByMap = Mapping[str, Sequence[np.ndarray] | np.ndarray]
 

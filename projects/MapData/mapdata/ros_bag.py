@@ -13,8 +13,9 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.extras import import_extra
 from mapdata.decompression import begin_bag, import_bounded
 
-_MOST_FIELDS = 10_000  # of the types of a bag; rosbags generates some lines of code for each
-_MOST_LETTERS = 100_000  # of a definition
+# Largest number of fields of all types of a bag; rosbags generates some lines of code for each.
+_MOST_FIELDS = 10_000
+_MOST_LETTERS = 100_000  # largest size of the definition of a type
 
 Parser = Callable[[bytes], Any]
 

@@ -46,9 +46,10 @@ def _select_scenes(
         covered |= near[scene]
         if selected.sum() >= count:
             return selected, ~covered
-        cost = (near & ~covered).sum(1)
+        num_lost = (near & ~covered).sum(1)  # scenes that training would lose with each scene
         others = np.flatnonzero(~selected)
-        scene = int(others[np.lexsort((rank[others], cost[others]))[0]])
+        order = np.lexsort((rank[others], num_lost[others]))  # by loss, then by rank
+        scene = int(others[order[0]])
 
 
 def split_scenes(

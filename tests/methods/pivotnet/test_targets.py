@@ -5,7 +5,7 @@ import pytest
 
 from gsmap.datasets.annotations.record import MapInstance
 from gsmap.engine.launch import read_config
-from gsmap.models.lines.targets import direct_line
+from gsmap.models.lines.targets import orient_line
 from gsmap.models.pivotnet.matching import match_pivots, path_costs
 from gsmap.models.pivotnet.targets import FormatPivotTargets, significances
 from gsmap.structures.grid import BEVGrid
@@ -50,7 +50,7 @@ def test_the_end_of_a_long_line_is_lost_unless_it_is_kept():
 
 def test_lines_across_start_at_the_right():
     across = np.array([[10.0, 2.0], [10.5, 9.0]])  # (u, v): metres from the front and from the left
-    assert direct_line(across, 1.0).tolist() == across[::-1].tolist()
+    assert orient_line(across, 1.0).tolist() == across[::-1].tolist()
 
 
 def test_no_element_and_elements_that_cannot_be():

@@ -116,9 +116,12 @@ class ExportedDetector(nn.Module):
             Fields of the elements in the order of ``output_names``, and the new memory by name.
         """
         # a tensor of four axes is normalised and padded image by image
-        images = self.model.data_preprocessor({"inputs": {"img": images}})["inputs"]["imgs"]
-        feats = self.model.bev_encoder.levels(self.model.extract_img_feats(images[None]))
-        if "can_bus" in inputs:  # as `without_history`, in operators of ONNX
+        batch = self.model.data_preprocessor({"inputs": {"img": images}})
+        images = batch["inputs"]["imgs"]
+        all_levels = self.model.extract_img_feats(images[None])
+        feats = self.model.bev_encoder.levels(all_levels)
+        if "can_bus" in inputs:
+            # Signals 0 to 2 and 17, which need earlier frames, become 0 (`without_history`).
             inputs["can_bus"] = nn.functional.pad(inputs["can_bus"][OF_ONE_FRAME], (3, 1))
         batched = {name: value[None] for name, value in inputs.items()}
         head = self.model.map_head
@@ -145,7 +148,8 @@ class ExportedDetector(nn.Module):
             predictions = head(recalled.outputs, **recalled.hooks)
         last_layer = predictions[-1]
         decoded = head.reference.decode(last_layer.references[0])
-        best = head.coder.best(head.coder.weigh_scores(last_layer.scores[0], decoded))
+        scores = head.coder.weigh_scores(last_layer.scores[0], decoded)
+        best = head.coder.best(scores)
         fields = head.select_detections(decoded, best)
         elements = [best.scores, best.labels, fields["pts"]]
         for name in head.reference.outputs[1:]:

@@ -114,7 +114,8 @@ class StaticFrame(nn.Module):
         """
         head = self.model.map_head
         decoded = head.reference.decode(references)
-        best = head.coder.best(head.coder.weigh_scores(scores, decoded))
+        weighted_scores = head.coder.weigh_scores(scores, decoded)
+        best = head.coder.best(weighted_scores)
         fields = {"scores_3d": best.scores, "labels_3d": best.labels}
         fields |= head.select_detections(decoded, best)
         layout = {}
@@ -203,7 +204,7 @@ class FastFrames:
         if any(sample.metainfo.get("image_steps") for sample in samples):
             preprocessor = self.frame.model.data_preprocessor
             pixels = torch.stack(upload(images, self.device))
-            images = preprocessor.run_noted_steps(pixels, samples)
+            images = preprocessor.run_deferred_steps(pixels, samples)
         else:
             images = torch.stack(list(images))
         self._add_shapes(batch, image_size=(images.shape[-2], images.shape[-1]))
@@ -305,8 +306,8 @@ class FastFrames:
         on_map = head.coder.keep_mask(fields["scores_3d"], fields["pts"])
         scores = fields.pop("scores_3d")[on_map]
         labels = fields.pop("labels_3d")[on_map]
-        visible = {name: value[on_map] for name, value in fields.items()}
-        visible = head.coder.unfold_lines(visible, labels)
-        visible.update(scores_3d=scores, labels_3d=labels)
-        instances = InstanceData(metainfo=dict(head.reference.metainfo), **visible)
+        detections = {name: value[on_map] for name, value in fields.items()}
+        detections = head.coder.unfold_lines(detections, labels)
+        detections.update(scores_3d=scores, labels_3d=labels)
+        instances = InstanceData(metainfo=dict(head.reference.metainfo), **detections)
         return self.frame.model.add_pred_to_datasample([sample], [instances])[0]

@@ -64,8 +64,8 @@ class LiveMap:
     """Predictor of the map around a vehicle, from images in memory.
 
     Use ``MapInferencer.live`` to create it. The calibration is prepared at the first frame, and
-    again if an image size changes. Frames are independent of each other, unless a stream is given.
-    It holds the state of a temporal model between frames.
+    again if an image size changes. Frames are independent of each other, unless a stream is given,
+    which holds the memory of a temporal model between frames.
 
     Args:
         inferencer: The trained model.

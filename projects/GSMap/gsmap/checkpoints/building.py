@@ -127,7 +127,8 @@ def _parts_under_construction(error: BaseException) -> list[_Part]:
             settings = frame.f_locals["cfg"]
             registry = frame.f_locals["registry"]
             kind = settings.get("type") if isinstance(settings, dict) else None
-            kind = registry.get(kind) if isinstance(kind, str) else kind
+            if isinstance(kind, str):
+                kind = registry.get(kind)
             parts.append(_Part(registry=registry, kind=kind))
         elif frame.f_globals.get("__name__") == _RUNNER and name.startswith(("build_", "__init__")):
             parts.append(_Part(registry=None, kind=None))
@@ -144,7 +145,9 @@ def _describe_fault(error: BaseException, parts: list[_Part]) -> str | None:
     Returns:
         The description; None if the error is a bug.
     """
-    text = str(error.args[0] if isinstance(error, KeyError) and error.args else error)
+    text = str(error)
+    if isinstance(error, KeyError) and error.args:
+        text = str(error.args[0])  # without the quotes of a KeyError
     scope = _frames(error)[0].f_globals
     of_config = scope.get("__name__", "").startswith(_CONFIGS)
     if of_config and isinstance(error, KeyError | AttributeError):

@@ -29,13 +29,18 @@ def key_maps() -> tuple[KeyMap, ...]:
         module = f"gsmap.models.{method.name}.keys"
         if find_spec(module) is not None:
             maps += import_module(module).KEY_MAPS
-    return tuple(sorted(maps, key=lambda key_map: key_map.markers == KeyMap.markers))
+    return tuple(sorted(maps, key=_has_default_markers))
+
+
+def _has_default_markers(key_map: KeyMap) -> bool:
+    """Whether a key map has no markers and so matches the keys of every model."""
+    return key_map.markers == KeyMap.markers
 
 
 def is_upstream(keys: Iterable[str]) -> bool:
     """Whether state keys have the format of the earlier systems."""
-    signs = tuple({key_map.sign for key_map in key_maps()})
-    return any(key.startswith(signs) for key in keys)
+    prefixes = tuple({key_map.upstream_prefix for key_map in key_maps()})
+    return any(key.startswith(prefixes) for key in keys)
 
 
 def find_key_map(keys: Iterable[str]) -> KeyMap:

@@ -25,17 +25,18 @@ class KeyMap:
         markers: Key prefixes in pairs (upstream, here). If all of them are present, the keys
             belong to this architecture, not to a method that it is built on. The empty prefix of
             the default is present in every key.
-        idle: Pattern of further upstream keys without a counterpart, which conversion back leaves
-            out.
-        sign: Prefix that only keys in upstream's format have, for telling the two formats apart.
+        ignored_pattern: Regular expression of further upstream keys without a counterpart, which
+            conversion back leaves out. The default matches nothing.
+        upstream_prefix: Prefix that only keys in upstream's format have, for telling the two
+            formats apart.
     """
 
     name: str
     rules: Rules
     unused: Mapping[str, Tensor | None] = field(default_factory=dict)
     markers: Rules = (("", ""),)
-    idle: str = "(?!)"
-    sign: str = "pts_bbox_head."
+    ignored_pattern: str = "(?!)"
+    upstream_prefix: str = "pts_bbox_head."
 
     def is_marked(self, keys: Collection[str], upstream: bool) -> bool:
         """Whether state keys contain all markers of this architecture.
@@ -52,7 +53,7 @@ class KeyMap:
 
     def is_unused(self, key: str) -> bool:
         """Whether an upstream key has no counterpart."""
-        return key in self.unused or re.match(self.idle, key) is not None
+        return key in self.unused or re.match(self.ignored_pattern, key) is not None
 
     def to_ours(self, key: str) -> str | None:
         """Key of this project for an upstream key, or None if it has no counterpart."""

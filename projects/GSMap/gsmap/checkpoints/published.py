@@ -165,7 +165,8 @@ def cache_file(address: str) -> Path:
 
 def _published_name(address: str) -> str:
     """File name in an address."""
-    return file_name(unquote(Path(urlsplit(address).path).name) or "weights.pth")
+    path = Path(urlsplit(address).path)
+    return file_name(unquote(path.name) or "weights.pth")
 
 
 def _has_published_digest(path: Path, name: str) -> bool:
@@ -234,11 +235,11 @@ def _open_address(address: str) -> HTTPResponse:
 def _download_error(address: str, reason: str) -> OSError:
     """Error of a failed download, with the folder in which to put the file."""
     name = _published_name(address)
-    folder = os.environ.get(WEIGHTS)
-    place = f"put {name} into {folder or f'a folder and set {WEIGHTS} to it'}"
+    place = os.environ.get(WEIGHTS) or f"a folder and set {WEIGHTS} to it"
     return OSError(
-        f"{address} cannot be fetched ({reason}): {place}, or set init_cfg.checkpoint (load_from, "
-        "if that names it) to a path; init_cfg=None of the part trains it from scratch."
+        f"{address} cannot be fetched ({reason}): put {name} into {place}, or set "
+        "init_cfg.checkpoint (load_from, if that names it) to a path; init_cfg=None of the part "
+        "trains it from scratch."
     )
 
 
@@ -260,7 +261,8 @@ def in_our_names(checkpoint: Any) -> Any:
     if isinstance(checkpoint.get("state_dict"), Mapping):
         state = checkpoint["state_dict"]
     elif isinstance(checkpoint.get("model"), Mapping):
-        checkpoint = state = checkpoint["model"]
+        checkpoint = checkpoint["model"]
+        state = checkpoint
     if "_conv_stem.weight" in state:
         renamed: dict[str, Tensor] = {}
         for key, value in state.items():

@@ -25,7 +25,7 @@ from gsmap.checkpoints.settings import (
     IMAGE_SIZE,
     MODEL_SETTINGS,
     SIGNALS,
-    STARTS,
+    TRAINING_SETTINGS,
     check_settings,
     differences,
     plain,
@@ -255,9 +255,9 @@ def adopt_settings(
 
     Test images are scaled to the size of the training images unless ``cfg_options`` set the scale.
     If the training samples had vehicle signals, signals are computed from poses where test samples
-    lack them. Settings of the start of training (`STARTS`) and ``temporal.elements`` keep the
-    values of the config. Loading refuses a checkpoint that lacks weights of the resulting model,
-    unless the config sets ``model.allow_untrained``.
+    lack them. Settings that only training uses (`TRAINING_SETTINGS`) and ``temporal.elements`` keep
+    the values of the config. Loading refuses a checkpoint that lacks weights of the resulting
+    model, unless the config sets ``model.allow_untrained``.
 
     Args:
         cfg: The config; its ``model`` and ``test_dataloader`` are changed.
@@ -283,7 +283,7 @@ def adopt_settings(
         return []
     model_overrides: dict[str, Any] = {}
     for name, value in overrides.items():
-        if name.startswith("model.") and not _is_start(name):
+        if name.startswith("model.") and not _is_training_setting(name):
             model_overrides[name] = value
     trained, model = _build_settings(
         path=path, settings=settings, config=config, overrides=model_overrides
@@ -291,7 +291,7 @@ def adopt_settings(
     result = plain(model.to_dict())
     lines: list[str] = []
     for name, (used, configured) in differences(result, others=config, name="model").items():
-        if not _is_start(name):
+        if not _is_training_setting(name):
             lines.append(f"{name}: {used}, as {path} was trained; the config has {configured}")
     for name, (used, in_training) in differences(result, others=trained, name="model").items():
         lines.append(f"{name}: {used}, as asked for; {path} was trained with {in_training}")
@@ -317,9 +317,9 @@ def _adopt_test_data(cfg: Config, checkpoint: Checkpoint, overrides: dict[str, A
         cfg.test_dataloader.dataset.setdefault("signals_from_poses", True)
 
 
-def _is_start(name: str) -> bool:
-    """Whether a dotted name belongs to a setting of the start of training."""
-    return not STARTS.isdisjoint(name.split("."))
+def _is_training_setting(name: str) -> bool:
+    """Whether a dotted name belongs to a setting that only training uses."""
+    return not TRAINING_SETTINGS.isdisjoint(name.split("."))
 
 
 def _build_settings(

@@ -11,8 +11,9 @@ from mmengine.config import Config, ConfigDict
 from gsmap.utils.errors import InputError
 
 MODEL_SETTINGS = "model_settings"  # key in a checkpoint's meta: JSON, since config text is code
-# Settings that only training uses. The settings of its start may load files.
-STARTS = {
+# Settings that only training uses, such as initial weights. A checkpoint must not set them, because
+# some of them load files.
+TRAINING_SETTINGS = {
     "init_cfg", "pretrained", "equal_weights", "uniform_positions", "allow_untrained", "autocast",
     "compiled",
 }  # fmt: skip
@@ -93,7 +94,7 @@ def check_settings(settings: Any, config: dict[str, Any]) -> dict[str, Any]:
         config: Settings of the model in the config, which are trusted, from `plain`.
 
     Returns:
-        The settings without `STARTS`.
+        The settings without `TRAINING_SETTINGS`.
 
     Raises:
         ValueError: If a key or a value is not allowed; the message contains its dotted name.
@@ -112,7 +113,7 @@ def _check_value(value: Any, name: str, known: set[str]) -> Any:
         known: Keys and strings of the config, which are allowed.
 
     Returns:
-        The value without `STARTS`, and with current types in place of old ones.
+        The value without `TRAINING_SETTINGS`, and with current types in place of old ones.
     """
     if name.count(".") > _DEEPEST:
         raise InputError(f"{name[:60]}... is nested too deep")
@@ -139,7 +140,7 @@ def _check_mapping(settings: dict[str, Any], name: str, known: set[str]) -> dict
             raise InputError(f"{name} has the key {key!r:.60}, which is no name of a setting")
     result: dict[str, Any] = {}
     for key, value in settings.items():
-        if key not in STARTS:
+        if key not in TRAINING_SETTINGS:
             result[key] = _check_value(value, name=f"{name}.{key}", known=known)
     return result
 
@@ -170,8 +171,9 @@ def _find_registered(kind: str) -> Any:
     scope, _, bare_name = kind.rpartition(".")
     for registry in (MODELS, TASK_UTILS):
         for holder in (registry, registry.root, *registry.root.children.values()):
-            reachable = scope == holder.scope if scope else holder in (registry, registry.root)
-            if not reachable:
+            if scope and scope != holder.scope:
+                continue
+            if not scope and holder not in (registry, registry.root):
                 continue
             holder.import_from_location()  # imports the modules of the holder's package
             if bare_name in holder.module_dict:

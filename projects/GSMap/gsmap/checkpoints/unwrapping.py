@@ -14,10 +14,10 @@ _DEEPEST = 3  # nested wrappers
 _OUTER_PREFIXES = ("model.", "network.", "net.")  # removed if all keys start with it
 _PARALLEL_PREFIX = "module."  # of parallel training; removed at the start of a key alone
 _WRAPPER_PARTS = ("_orig_mod", "_fsdp_wrapped_module", "_checkpoint_wrapped_module")
-_AVERAGED = "ema_"
-_MAX_KEYS_SHOWN = 8  # in a message
+_AVERAGED = "ema_"  # prefix of keys of exponential moving averages of weights
+_MAX_KEYS_SHOWN = 8  # number of keys that a message names
 _MOST_REPEATED = 4  # largest ratio of the bytes of all weights to the stored bytes
-_SPARE_BYTES = 1 << 26  # that may be repeated even if few bytes are stored
+_SPARE_BYTES = 1 << 26  # number of bytes that may be repeated in addition
 
 
 class UnfitError(InputError):

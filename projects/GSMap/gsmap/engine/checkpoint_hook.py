@@ -242,9 +242,10 @@ class AtomicCheckpointHook(CheckpointHook):
         """
         for name in getattr(self, "key_indicators", ()):
             if metrics and name not in metrics:
+                means = [metric for metric in metrics if metric.endswith("/mAP")]
                 raise InputError(
                     f"default_hooks.checkpoint.save_best names {name!r}, which the validation does "
-                    f"not measure; it has {', '.join(n for n in metrics if n.endswith('/mAP'))}."
+                    f"not measure; it has {', '.join(means)}."
                 )
         super().after_val_epoch(runner, metrics=metrics)
         if runner.rank == 0:

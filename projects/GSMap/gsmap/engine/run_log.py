@@ -52,10 +52,12 @@ class MapRunner(Runner):
     @master_only
     def dump_config(self) -> None:
         """Write the complete config to the work folder, unless it would replace its source."""
-        source = self.cfg.filename and Path(self.cfg.filename)
-        name = source.name if source else f"{self.timestamp}.py"
-        target = Path(self.work_dir, name)
-        if source and target.exists() and source.exists() and target.samefile(source):
+        if not self.cfg.filename:
+            write_text(Path(self.work_dir, f"{self.timestamp}.py"), text=self.cfg.dump())
+            return
+        source = Path(self.cfg.filename)
+        target = Path(self.work_dir, source.name)
+        if target.exists() and source.exists() and target.samefile(source):
             self.logger.info(f"{target} stays as it is; the whole config is in {self.log_dir}.")
             return
         write_text(target, text=self.cfg.dump())
@@ -179,7 +181,7 @@ class RunSummaryHook(Hook):
         }
         text = "".join(f"\n    {name:<12}{value}" for name, value in lines.items())
         runner.logger.info(f"This run{text}")
-        warning = _missed_elements(runner, model=model)
+        warning = _missed_elements_warning(runner, model=model)
         if warning:
             runner.logger.warning(warning)
 
@@ -230,7 +232,8 @@ def _describe_data(runner: Runner) -> dict[str, str]:
         f"x from {x_min:g} to {x_max:g} m, y from {y_min:g} to {y_max:g} m; "
         f"{', '.join(meta['classes'])}"
     )
-    lines["elements"] = f"up to {_element_counts(runner.train_dataloader).max()} in a sample"
+    most_elements = _element_counts(runner.train_dataloader).max()
+    lines["elements"] = f"up to {most_elements} in a sample"
     return lines
 
 
@@ -239,7 +242,7 @@ def _element_counts(loader: Any) -> np.ndarray:
     return np.maximum(innermost(loader.dataset).annotations.instance_counts(), 0)
 
 
-def _missed_elements(runner: Runner, model: Any) -> str | None:
+def _missed_elements_warning(runner: Runner, model: Any) -> str | None:
     """Return a warning if training samples have more elements than the model has queries."""
     groups = getattr(getattr(model, "map_head", None), "query_groups", None)
     if not groups or not hasattr(innermost(runner.train_dataloader.dataset), "annotations"):
@@ -250,8 +253,9 @@ def _missed_elements(runner: Runner, model: Any) -> str | None:
     if not excess.any():
         return None
     samples = format_count(len(counts), noun="training sample")
+    num_crowded = (excess > 0).sum()
     return (
-        f"{(excess > 0).sum()} of {samples} have more elements (up to {counts.max()}) than the "
+        f"{num_crowded} of {samples} have more elements (up to {counts.max()}) than the "
         f"model has queries ({queries}): {excess.sum()} elements can never be found. Set "
         "model.map_head.query_groups=[dict(num=...)] to more (in the template _queries), or take "
         "a smaller range."

@@ -26,7 +26,7 @@ def share_settings(cfg: Config) -> None:
         head_settings = _target_settings(head)
         if not head_settings:
             continue
-        for step in _find_steps(sections, names=_needs(head.get("type")).transforms):
+        for step in _find_steps(sections, names=_class_with_targets(head.get("type")).transforms):
             transform = class_of_type(step["type"], registry=TRANSFORMS)
             parameters = _defaults(transform)
             for name, value in head_settings.items():
@@ -38,7 +38,7 @@ def _check_agreement(cfg: Config, steps: list[Any]) -> None:
     """Require transforms with the values that follow from the settings of the head."""
     for head in _heads(cfg):
         head_settings = _target_settings(head)
-        for step in _find_steps(steps, names=_needs(head.get("type")).transforms):
+        for step in _find_steps(steps, names=_class_with_targets(head.get("type")).transforms):
             for name in head_settings.keys() & step.keys():
                 if _tuples_to_lists(step[name]) != _tuples_to_lists(head_settings[name]):
                     raise InputError(
@@ -50,7 +50,7 @@ def _check_agreement(cfg: Config, steps: list[Any]) -> None:
 
 def _target_settings(head: dict[str, Any]) -> dict[str, Any]:
     """Return the settings of transforms that follow from the config of a head."""
-    head_class = _needs(head.get("type"))
+    head_class = _class_with_targets(head.get("type"))
     try:
         return head_class.target_settings({**_defaults(head_class), **head})
     except (TypeError, ValueError):  # invalid settings, which the head reports when it is built
@@ -124,12 +124,12 @@ def needed_targets(cfg: Config) -> dict[str, Any]:
     for part in parts:
         if isinstance(part, dict):
             part_type = part.get("type")
-            for transform in _needs(part_type).transforms:
+            for transform in _class_with_targets(part_type).transforms:
                 targets[transform] = part_type
     return targets
 
 
-def _needs(kind: Any) -> type[NeedsTargets]:
+def _class_with_targets(kind: Any) -> type[NeedsTargets]:
     """Return the class of a part if it declares its targets, else `NeedsTargets`."""
     part_class = class_of_type(kind)
     if part_class is not None and issubclass(part_class, NeedsTargets):

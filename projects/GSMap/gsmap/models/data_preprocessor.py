@@ -43,13 +43,13 @@ class MapDataPreprocessor(Det3DDataPreprocessor):
             return super().collate_data(data)  # pads each image to the largest one
         data = self.cast_data(data)
         imgs = torch.stack(data["inputs"]["img"])
-        imgs = self.run_noted_steps(imgs, samples=data.get("data_samples") or ())
+        imgs = self.run_deferred_steps(imgs, samples=data.get("data_samples") or ())
         data["inputs"]["imgs"] = self.normalise(imgs)
         data.setdefault("data_samples", None)
         return data
 
     @staticmethod
-    def run_noted_steps(images: Tensor, samples: Sequence[Any]) -> Tensor:
+    def run_deferred_steps(images: Tensor, samples: Sequence[Any]) -> Tensor:
         """Run the steps that the pipeline has deferred to the device (`image_steps`).
 
         Args:
@@ -60,7 +60,7 @@ class MapDataPreprocessor(Det3DDataPreprocessor):
             Images as packed by the published pipelines. (B, V, 3, H', W')
         """
         steps = [sample.metainfo.get("image_steps") or () for sample in samples]
-        return take_noted_steps(images, steps)
+        return run_image_steps(images, steps)
 
     def normalise(self, images: Tensor) -> Tensor:
         """Convert the channels, normalise and pad. (..., 3, H, W) -> (..., 3, H', W') float32"""
@@ -77,7 +77,7 @@ class MapDataPreprocessor(Det3DDataPreprocessor):
         return torch.nn.functional.pad(images, pad=margins, value=self.pad_value)
 
 
-def take_noted_steps(images: Tensor, steps: Sequence[Sequence[Any]]) -> Tensor:
+def run_image_steps(images: Tensor, steps: Sequence[Sequence[Any]]) -> Tensor:
     """Run deferred steps on the device of the images.
 
     Args:
@@ -95,7 +95,7 @@ def take_noted_steps(images: Tensor, steps: Sequence[Sequence[Any]]) -> Tensor:
         samples = []
         for index, sample_steps in enumerate(steps):
             image = images[index : index + 1]
-            samples.append(take_noted_steps(image, steps=[sample_steps]))
+            samples.append(run_image_steps(image, steps=[sample_steps]))
         return torch.cat(samples)
     images = images.flatten(start_dim=0, end_dim=1)
     for step in batch_steps:

@@ -152,7 +152,7 @@ class MapDetector(Base3DDetector):
             for part in parts:
                 if part is not None:
                     part.compile(backend=self.compiler, mode=compile_mode)
-            self.compiled = False  # it is now
+            self.compiled = False  # so that a later call does not compile the modules again
         return self
 
     def extract_img_feats(self, imgs: Tensor) -> list[Tensor]:

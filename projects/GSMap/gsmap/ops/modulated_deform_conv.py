@@ -47,11 +47,12 @@ def modulated_deform_conv(
     tap_cols = torch.arange(weight.shape[3], device=images.device)
     taps = torch.meshgrid(tap_rows, tap_cols, indexing="ij")
     coordinates = []
+    shapes = ((-1, 1), (1, -1))  # of rows and of columns, for broadcasting
     for axis, (shift, tap) in enumerate(zip(shifts, taps, strict=True)):
         starts = torch.arange(out_size[axis], device=images.device) * stride[axis]
-        starts = (starts - padding[axis]).view((-1, 1) if axis == 0 else (1, -1))
+        starts = (starts - padding[axis]).view(shapes[axis])
         pixels = shift + starts + tap.reshape(-1, 1, 1) * dilation[axis]  # (B, G, K, h, w)
-        coordinates.append((2 * pixels + 1) / size[axis] - 1)
+        coordinates.append((2 * pixels + 1) / size[axis] - 1)  # [-1, 1] over the image
     rows, cols = coordinates
     locations = torch.stack([cols, rows], dim=-1).flatten(0, 1).flatten(1, 2)  # (B G, K h, w, 2)
     parts = images.reshape(batch * deform_groups, -1, size[0], size[1])
@@ -59,7 +60,8 @@ def modulated_deform_conv(
     samples = samples.view(batch, deform_groups, -1, num_taps, out_size[0], out_size[1])
     samples = samples * mask.unflatten(1, (deform_groups, 1, num_taps))
     columns = samples.reshape(batch, groups, -1, out_size[0] * out_size[1])
-    out = (weight.view(groups, len(weight) // groups, -1) @ columns).flatten(1, 2)  # (B, O, h w)
+    filters = weight.view(groups, len(weight) // groups, -1)
+    out = (filters @ columns).flatten(1, 2)  # (B, O, h w)
     if bias is not None:
         out = out + bias[:, None]
     return out.unflatten(2, out_size)

@@ -27,8 +27,8 @@ _CAMERA_KEYS = {
 }  # fmt: skip
 # A camera's axes (right, down, ahead) in a vehicle's (ahead, left, up).
 _AHEAD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
-_MOST_BYTES = 300_000  # of a file; YAML takes some milliseconds for a thousand bytes
-_MOST_VALUES = 100_000  # in a file
+_MOST_BYTES = 300_000  # largest file; YAML takes some milliseconds for a thousand bytes
+_MOST_VALUES = 100_000  # largest number of values in a file
 
 
 def read_rig(file: Path, ground: np.ndarray) -> tuple[list[tuple[RigCamera, str]], np.ndarray]:

@@ -32,15 +32,15 @@ from mapdata.folders.rig import (
     RigCamera,
     RigFrame,
     nearest_images,
-    rectify_as_trained,
     rig_samples,
+    set_rectification_targets,
 )
 from mapdata.unix_times import span_of
 
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
-_RATE_HZ = 10.0  # if a calibration file has no rate_hz
-_MOST_ANY = 2  # ``**`` of a pattern; the time grows with the depth of folders for each of them
-_MOST_SUFFIXES = 5  # in a message
+_RATE_HZ = 10.0  # rate of the images if a calibration file has no rate_hz
+_MOST_ANY = 2  # largest number of ``**`` in a pattern; each multiplies the time by the depth
+_MOST_SUFFIXES = 5  # number of suffixes that a message names
 
 
 def read_image_folder(
@@ -86,12 +86,12 @@ def read_image_folder(
         if poses is not None and pose_at is not None:
             frames, pose_notes = _frames_with_poses(frames, poses=poses, pose_at=pose_at)
             notes += pose_notes
-        target = rectify_as_trained(rig, trained or {})
+        target_key = set_rectification_targets(rig, trained or {})
         scene = folder.resolve().name
         samples = rig_samples(scene, rig, frames=frames, pose_at=pose_at)
         root = folder
         if any(camera.is_distorted for camera in rig):
-            digest = _digest(file, frames=frames, target=target)
+            digest = _digest(file, frames=frames, target_key=target_key)
             root = frames_dir / f"{file_name(scene)}-{digest}"
             for sample in samples:
                 notes += _rectify_images(sample, rig=rig, root=folder, target=root)
@@ -114,9 +114,9 @@ def _read_timing(content: Mapping[str, Any]) -> tuple[float | None, int]:
     return rate_hz, tolerance_ns
 
 
-def _digest(file: Path, frames: Sequence[RigFrame], target: bytes) -> str:
+def _digest(file: Path, frames: Sequence[RigFrame], target_key: bytes) -> str:
     """Digest of a calibration file, the images of frames, and the key of their rectification."""
-    digest = hashlib.sha256(file.read_bytes() + target)
+    digest = hashlib.sha256(file.read_bytes() + target_key)
     for frame in frames:
         for path, _ in frame.images.values():
             digest.update(f"{path}\n".encode())

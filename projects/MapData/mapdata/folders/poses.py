@@ -20,8 +20,8 @@ _TIME = "timestamp_ns"
 _FRAME = "frame"
 _SEPARATORS = ",;\t"
 _NUMBER = re.compile(r"(-?\d+)(\.0*)?")
-_LENGTH_TOLERANCE = 1e-2  # of a quaternion
-_MOST_COLUMNS = 12  # in a message
+_LENGTH_TOLERANCE = 1e-2  # largest difference of a quaternion's length from 1
+_MOST_COLUMNS = 12  # number of columns that a message names
 
 
 def read_poses(path: Path, time_of: Mapping[str, int], ground: np.ndarray) -> PoseTrack:

@@ -21,9 +21,9 @@ from mapdata.argoverse2.log import closest_ns
 PoseAt = Callable[[int], np.ndarray | None]
 FISHEYE_MODELS = ("equidistant", "fisheye")
 PLAIN_MODELS = ("plumb_bob", "rational_polynomial", "radtan", "")
-# valid numbers of coefficients
+# Valid numbers of distortion coefficients, by distortion model.
 _COUNTS = dict.fromkeys(PLAIN_MODELS, (4, 5, 8, 12, 14)) | dict.fromkeys(FISHEYE_MODELS, (4,))
-_LEAST_SHARE = 0.1  # of a rectified image that must come from the original
+_LEAST_SHARE = 0.1  # smallest share of a rectified image that the original image covers
 _GRID = 16  # width and height in pixels of the image on which this share is measured
 
 
@@ -141,7 +141,9 @@ class RigCamera:
         write_bytes(path, encode_jpeg(image, quality=95))
 
 
-def rectify_as_trained(rig: Sequence[RigCamera], trained: Mapping[str, Sequence[float]]) -> bytes:
+def set_rectification_targets(
+    rig: Sequence[RigCamera], trained: Mapping[str, Sequence[float]]
+) -> bytes:
     """Set the cameras of a model as the targets of rectification, by name.
 
     Args:

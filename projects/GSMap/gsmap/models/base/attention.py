@@ -74,7 +74,8 @@ def place_samples(
         Locations (x, y), [0, 1] over the map. (B, Q, heads, S, 2)
     """
     if frames is not None:
-        offsets = torch.sum(frames[:, :, None, None] * offsets[..., None, :], -1)
+        matrices = frames[:, :, None, None]  # (B, Q, 1, 1, 2, 2)
+        offsets = torch.sum(matrices * offsets[..., None, :], -1)  # products of matrix and vector
     size = constant(offsets, [shape[1], shape[0]])
     return reference[:, :, None, None, :2] + offsets / size
 

@@ -135,7 +135,8 @@ class MapAssigner:
         """
         num_layers = len(predictions.layers)
         num_queries = predictions.scores.shape[1] // num_layers
-        first_query = num_queries * torch.arange(num_layers)[:, None]  # of each layer
+        # Index of the first query of each layer among the queries of all layers.
+        first_query = num_queries * torch.arange(num_layers)[:, None]
         indices = []
         counts = []
         for index, (query, gt) in enumerate(pairs):
@@ -241,7 +242,7 @@ def solve_assignment(
         FloatingPointError: If a cost is not finite.
     """
     check_finite(costs, names, img_meta=img_meta)
-    repeated_costs = np.tile(costs.sum(0).numpy(), repeats)
+    repeated_costs = np.tile(costs.sum(0).numpy(), repeats)  # (N, repeats * K)
     rows, cols = linear_sum_assignment(repeated_costs)
     num_truths = max(costs.shape[2], 1)
     return torch.from_numpy(rows), torch.from_numpy(cols % num_truths)

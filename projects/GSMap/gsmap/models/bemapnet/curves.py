@@ -42,10 +42,13 @@ class Curve(nn.Module):
 
     def __init__(self, degree: int, pieces: int, to_end: bool = False) -> None:
         super().__init__()
-        all_points = torch.zeros(pieces, SAMPLES, pieces * degree + 1)
-        for i in range(pieces):
-            basis = torch.from_numpy(bernstein(degree)).float()
-            all_points[i, :, i * degree : (i + 1) * degree + 1] = basis
+        # Weights of the control points at 100 samples of each piece, for curves of k pieces.
+        piece_weights = torch.zeros(pieces, SAMPLES, pieces * degree + 1)
+        basis = torch.from_numpy(bernstein(degree)).float()  # (100, d + 1)
+        for index in range(pieces):
+            first_control = index * degree
+            piece_weights[index, :, first_control : first_control + degree + 1] = basis
+        sample_weights = piece_weights.flatten(0, 1)  # (k * 100, k * d + 1)
         weights = []
         for number in range(1, pieces + 1):
             if to_end:
@@ -53,7 +56,7 @@ class Curve(nn.Module):
                 steps = torch.linspace(0, last, steps=SAMPLES).round().long()
             else:
                 steps = torch.arange(SAMPLES) * number
-            weights.append(all_points.flatten(0, 1)[steps])
+            weights.append(sample_weights[steps])
         self.register_buffer("weights", torch.stack(weights), persistent=False)
         self.degree = degree
 

@@ -206,14 +206,14 @@ class BezierHead(LineHead):
             masks: Logits of the lines' masks. (B, n, H, W)
         """
         curve = cast(Curve, self.curves[label])
-        number = pieces.argmax(dim=-1)  # number of pieces less one (B, n)
+        piece_index = pieces.argmax(dim=-1)  # number of pieces less one (B, n)
         controls = control_points(joints, inner)
         return BezierLines(
             logits=logits,
             controls=controls,
-            control_mask=curve.control_mask(number),
+            control_mask=curve.control_mask(piece_index),
             piece_logits=pieces,
-            curves=curve(controls, number),
+            curves=curve(controls, piece_index),
             masks=masks,
         )
 
@@ -228,15 +228,17 @@ class BezierHead(LineHead):
         truths = []
         for label, curve in enumerate(cast(Iterable[Curve], self.curves)):
             is_class = instances.labels_3d == label
-            numbers = instances.num_pts[is_class]
+            counts = instances.num_pts[is_class]  # of control points
             largest = curve.weights.shape[-1]
-            if ((numbers > largest) | ((numbers - 1) % curve.degree != 0)).any():
+            has_too_many = counts > largest
+            has_half_pieces = (counts - 1) % curve.degree != 0
+            if (has_too_many | has_half_pieces).any():
                 raise InputError(
-                    f"lines of class {label} have {numbers.tolist()} control points, but the head "
+                    f"lines of class {label} have {counts.tolist()} control points, but the head "
                     f"has pieces of degree {curve.degree} and at most {largest} points: set "
                     "degrees and pieces of FormatBezierTargets to those of the head."
                 )
-            pieces = (numbers - 1) // curve.degree - 1
+            pieces = (counts - 1) // curve.degree - 1  # number of pieces less one
             num_missing = max(largest - points.shape[1], 0)
             controls = F.pad(points[is_class, :largest], (0, 0, 0, num_missing))
             controls = controls * curve.control_mask(pieces)[..., None]

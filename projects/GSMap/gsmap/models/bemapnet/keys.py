@@ -93,10 +93,10 @@ BEMAPNET = KeyMap(
         *mlps("output_head.npiece_heads.{i}.", "map_head.piece_branches.{i}."),
         *HEAD_RULES,
     ),
-    CLASS_WEIGHTS,
+    unused=CLASS_WEIGHTS,
     markers=((_NECK, "img_neck.rounds."),),
-    idle=r"bev_decoder\.bev_encoder\.tgt_pos_embed_layer\.",  # aliases in the release
-    sign=LINE_DECODER,
+    ignored_pattern=r"bev_decoder\.bev_encoder\.tgt_pos_embed_layer\.",  # aliases in the release
+    upstream_prefix=LINE_DECODER,
 )
 
 KEY_MAPS = (BEMAPNET,)

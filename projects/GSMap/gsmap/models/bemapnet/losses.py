@@ -122,10 +122,12 @@ class BezierLosses(LineLosses):
         truth = case.truth
         num_lines = lines.curves.shape[0]
         points = neighbourhood(lines.curves, truth.masks.shape[-2:])  # (n, 2500, 2)
-        values = point_sample(truth.masks[None], points.flatten(0, 1)[None])[0]  # (K, n * 2500)
-        values = values.unflatten(1, (num_lines, points.shape[1]))
+        all_points = points.flatten(0, 1)
+        values = point_sample(truth.masks[None], all_points[None])[0]  # (K, n * 2500)
+        values = values.unflatten(1, (num_lines, points.shape[1]))  # (K, n, 2500)
         controls_cost = self.controls * _mean_difference(lines.controls[:, None], truth.controls)
-        pieces_cost = -self.pieces * lines.piece_logits.softmax(dim=-1)[:, truth.pieces]
+        piece_probs = lines.piece_logits.softmax(dim=-1)  # (n, k)
+        pieces_cost = -self.pieces * piece_probs[:, truth.pieces]
         curve_cost = self.curve * _mean_difference(lines.curves[:, None], truth.curves)
         recovery_cost = self.recovery * recovery_loss(values).T
         curve_costs = torch.stack([controls_cost, pieces_cost, curve_cost, recovery_cost])

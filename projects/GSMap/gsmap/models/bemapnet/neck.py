@@ -78,12 +78,12 @@ class BiFPNRound(nn.Module):
             num_inputs = 2 if level == NUM_LEVELS - 1 else 3
             self.up.append(FusionConv(num_inputs, channels))
 
-    def forward(self, levels: Sequence[Tensor], again: Sequence[Tensor]) -> list[Tensor]:
+    def forward(self, levels: Sequence[Tensor], back_levels: Sequence[Tensor]) -> list[Tensor]:
         """Fuse the levels, the finest first. (B, C, h, w) each -> (B, C, h, w) each
 
         Args:
             levels: Inputs of the path from the coarsest to the finest level.
-            again: Inputs of the path back.
+            back_levels: Further inputs of the path from the finest to the coarsest level.
         """
         top_down = [levels[-1]]
         for conv, feats in zip(self.down, reversed(levels[:-1]), strict=True):
@@ -94,9 +94,9 @@ class BiFPNRound(nn.Module):
         for level, conv in enumerate(self.up, start=1):
             fine_feats = downsample(results[-1])
             if level == NUM_LEVELS - 1:
-                results.append(conv(again[level], fine_feats))
+                results.append(conv(back_levels[level], fine_feats))
             else:
-                results.append(conv(again[level], top_down[level], fine_feats))
+                results.append(conv(back_levels[level], top_down[level], fine_feats))
         return results
 
 
@@ -133,13 +133,14 @@ class BiFPN(BaseModule):
         sixth = downsample(self.coarser(feats[-1]))
         seventh = downsample(sixth)
         levels = [conv(level) for conv, level in zip(self.inputs, feats, strict=True)]
-        again = [conv(level) for conv, level in zip(self.again, feats[1:], strict=True)]
-        again.insert(0, levels[0])
+        back_levels = [levels[0]]
+        for conv, level in zip(self.again, feats[1:], strict=True):
+            back_levels.append(conv(level))
         levels += [sixth, seventh]
-        again += [sixth, seventh]
+        back_levels += [sixth, seventh]
         for fuse in self.rounds:
-            levels = fuse(levels, again)
-            again = levels
+            levels = fuse(levels, back_levels)
+            back_levels = levels
         resized_levels = []
         for level in levels:
             level = F.interpolate(level, size=self.size, mode="bilinear", align_corners=True)

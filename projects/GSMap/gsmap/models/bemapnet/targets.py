@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from mmdet3d.registry import TRANSFORMS
 
 from gsmap.models.lines.front import front_size
-from gsmap.models.lines.targets import FormatLineTargets, Points, direct_line
+from gsmap.models.lines.targets import FormatLineTargets, Points, orient_line
 from gsmap.structures.bezier import MAX_DEGREE, curve_points, fit_pieces, mean_deviation
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import is_closed
@@ -43,11 +43,14 @@ class FormatBezierTargets(FormatLineTargets):
         """Return the name and the values of the setting with one number for each class."""
         return "degrees", self.degrees
 
-    def most(self) -> int:
+    def max_points(self) -> int:
         """Return the largest number P of control points of a line."""
-        return max(d * k + 1 for d, k in zip(self.degrees, self.pieces, strict=True))
+        counts = []
+        for degree, num_pieces in zip(self.degrees, self.pieces, strict=True):
+            counts.append(degree * num_pieces + 1)
+        return max(counts)
 
-    def way(self, points: Points, label: int) -> Points:
+    def polyline(self, points: Points, label: int) -> Points:
         """Return points along the curve of control points. (P, 2) -> (n, 2)"""
         return curve_points(points, self.degrees[label])
 
@@ -63,7 +66,7 @@ class FormatBezierTargets(FormatLineTargets):
             Control points (from the front, from the left) in [0, 1]. (P, 2)
         """
         if self.sort_rings and is_closed(line):
-            line = direct_line(line, tolerance=0.0, sort_rings=True)
+            line = orient_line(line, tolerance=0.0, sort_rings=True)
         rows, columns = front_size(grid)
         size_m = (rows * self.pixel_m, columns * self.pixel_m)
         degree = self.degrees[label]
@@ -73,9 +76,12 @@ class FormatBezierTargets(FormatLineTargets):
             max_error_m=self.max_error_m,
             deviation=mean_deviation,
         )
-        if controls[0, 0] > controls[-1, 0]:
+        first_u = controls[0, 0]
+        last_u = controls[-1, 0]
+        if first_u > last_u:
             controls = controls[::-1]
-        return controls[: degree * self.pieces[label] + 1] / size_m
+        largest = degree * self.pieces[label] + 1
+        return controls[:largest] / size_m
 
 
 def check_curves(degrees: Sequence[int], pieces: Sequence[int]) -> None:

@@ -179,7 +179,7 @@ class BEVQueryEncoder(CameraEncoder):
             self.grid.width,
             init_cfg=start,
         )
-        self.level_embeds = nn.Parameter(torch.empty(4, embed_dims))  # only the first is used
+        self.level_embeds = nn.Parameter(torch.empty(4, embed_dims))  # of the first num_levels
         self.cams_embeds = nn.Parameter(torch.empty(num_cams, embed_dims))
         self.calibration = ("img_from_frame",)
         self.can_bus_mlp = None
@@ -231,7 +231,8 @@ class BEVQueryEncoder(CameraEncoder):
             raise InputError(
                 f"the encoder is built for {len(self.cams_embeds)} cameras, got {first.shape[1]}."
             )
-        codes = (self.cams_embeds + self.level_embeds[:, None])[..., None, None].to(first.dtype)
+        codes = self.cams_embeds + self.level_embeds[:, None]  # (4, V, C)
+        codes = codes[..., None, None].to(first.dtype)
         if isinstance(feats, Tensor):
             tokens: Any = feats + codes[0]
         else:

@@ -72,7 +72,12 @@ class SpatialCrossAttention(SamplingAttention):
             value = self.values(feats.flatten(3).transpose(2, 3)).float()  # (B, V, hw, heads, C')
             if self.fixed_sizes:
                 summed = summed + _sample_all_pairs(
-                    value, (height, width), offset, weight, projection, repeats
+                    value,
+                    (height, width),
+                    offsets=offset,
+                    weights=weight,
+                    projection=projection,
+                    repeats=repeats,
                 )
                 continue
             batch, num_views = feats.shape[:2]

@@ -124,7 +124,7 @@ class GeometryKernelAttention(nn.Module):
                 maps,
                 shape,
                 uv=projection.uv,
-                seen=pairs,
+                visible_cells=pairs,
                 weights=weights,
                 offsets=self.offsets,
                 bilinear=self.bilinear,

@@ -46,7 +46,8 @@ class HalfBackbone:
         if self.backbone is None or state != self.state:
             folds = can_be_folded(backbone)
             replica = copy.deepcopy(backbone)
-            replica = fuse_conv_bn(replica) if folds else replica
+            if folds:
+                replica = fuse_conv_bn(replica)
             self.backbone = replica.half().to(memory_format=memory_format)  # type: ignore[call-overload]
             self.neck = copy.deepcopy(neck)
             if self.neck is not None:

@@ -80,8 +80,10 @@ class LidarEncoder(BaseModule):
         points = self.voxel_encoder(voxels["voxels"], voxels["num_points"], coors)
         feats = self.middle_encoder(points, coors, batch_size)
         for part in (self.backbone, self.neck):
-            feats = feats if part is None else part(feats)
-        feats = feats[0] if isinstance(feats, (list, tuple)) else feats
+            if part is not None:
+                feats = part(feats)
+        if isinstance(feats, (list, tuple)):
+            feats = feats[0]
         if feats.shape[-2:] != self.bev_size:
             feats = F.interpolate(feats, self.bev_size, mode="bilinear", align_corners=False)
         return feats

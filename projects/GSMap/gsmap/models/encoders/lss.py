@@ -60,7 +60,9 @@ class LSSEncoder(CameraEncoder):
         self.depth_range = (float(low), float(high), float(step))
         self.num_bins = num_depth_bins(self.depth_range)
         self.camera_aware = camera_aware
-        self.calibration = ("frame_from_img", *(CAMERA_MATRICES if camera_aware else ()))
+        self.calibration = ("frame_from_img",)
+        if camera_aware:
+            self.calibration += CAMERA_MATRICES
         channels = {
             "in_channels": embed_dims,
             "context_channels": embed_dims,
@@ -114,7 +116,12 @@ class LSSEncoder(CameraEncoder):
         with torch.autocast(feats.device.type, enabled=False):
             kernel = cast(Tensor, self.downsample[0].weight)
             bev = bev_pool_conv3x3(
-                depth, context, indices, self.cells, kernel.float(), self.fixed_sizes
+                depth,
+                context,
+                cells=indices,
+                grid=self.cells,
+                weight=kernel.float(),
+                fixed_sizes=self.fixed_sizes,
             )
         return {
             "bev_feats": self.downsample[1:](bev),

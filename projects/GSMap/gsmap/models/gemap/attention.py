@@ -20,7 +20,7 @@ class _AttentionBlock(nn.Module):
 
     def forward(self, query: Tensor, attn_mask: Tensor | None = None) -> Tensor:
         """Apply both. The mask (Q, Q) is True where attention is blocked. (B, Q, C)"""
-        attended = self.attention(query, query, query, attn_mask=attn_mask, need_weights=False)[0]
+        attended, _ = self.attention(query, query, query, attn_mask=attn_mask, need_weights=False)
         query = self.norm1(attended) + query
         return self.norm2(self.ffn(query)) + query
 
@@ -79,10 +79,12 @@ class GeometryDecoupledAttention(nn.Module):
                 f"need two or more instances of num_points {self.num_points} queries each, "
                 f"got {count} queries."
             )
-        blocked = torch.eye(count // self.num_points, dtype=torch.bool, device=query.device)
+        num_instances = count // self.num_points
+        blocked = torch.eye(num_instances, dtype=torch.bool, device=query.device)
         if attn_mask is not None:
             blocked = blocked | attn_mask
         blocked = blocked.repeat_interleave(self.num_points, 0)
-        query = self.inter(query, blocked.repeat_interleave(self.num_points, 1))
-        query = self.intra(query.reshape(-1, self.num_points, query.shape[-1]))  # (B * N, P, C)
-        return query.reshape(batch, count, -1)
+        blocked = blocked.repeat_interleave(self.num_points, 1)  # (N * P, N * P)
+        query = self.inter(query, blocked)
+        by_instance = query.reshape(-1, self.num_points, query.shape[-1])  # (B * N, P, C)
+        return self.intra(by_instance).reshape(batch, count, -1)

@@ -22,7 +22,7 @@ _GEOMETRY_RULES = rules_of(
 GEMAP = KeyMap(
     "gemap",
     (*_GEOMETRY_RULES, *MAPTR.rules),
-    {
+    unused={
         **CODE_WEIGHTS,
         # On Argoverse 2, the simple objective uses the head of the full one with weights of zero.
         HEAD + "tau": None,  # not used in any computation
@@ -30,12 +30,12 @@ GEMAP = KeyMap(
         HEAD + "loss_pv_seg.loss_fn.pos_weight": None,
     },
     markers=_GEOMETRY_RULES[:1],
-    idle=GRID_OFFSETS,
+    ignored_pattern=GRID_OFFSETS,
 )
 GEMAP_FULL = KeyMap(
     "gemap-full",
     (*_GEOMETRY_RULES, *LIFTED_RULES, *DECODER_RULES),
-    {**LIFTED_UNUSED, HEAD + "tau": torch.full((1,), 0.1)},
+    unused={**LIFTED_UNUSED, HEAD + "tau": torch.full((1,), 0.1)},
     markers=(*_GEOMETRY_RULES[:1], LIFTED_MARKER),
 )
 

@@ -30,8 +30,10 @@ def shape_features(points: Tensor) -> Tensor:
     """
     edges = _edges(points.movedim(-1, 0))
     lengths = edges.norm(dim=0)
-    before = edges.roll(1, -1)
-    return torch.stack([lengths, *_turns(before, edges, lengths.roll(1, -1) * lengths)])
+    previous_edges = edges.roll(1, -1)
+    products = lengths.roll(1, -1) * lengths
+    cosines, sines = _turns(previous_edges, edges, products=products)
+    return torch.stack([lengths, cosines, sines])
 
 
 def relation_features(points: Tensor, pairs: Tensor) -> Tensor:
@@ -48,8 +50,8 @@ def relation_features(points: Tensor, pairs: Tensor) -> Tensor:
     points = points.movedim(-1, 0)  # sums over a last axis of two would be slow
     edges = _edges(points)
     lengths = edges.norm(dim=0)
-    first = (..., pairs[0], slice(None), None)
-    second = (..., pairs[1], None, slice(None))
+    first = (..., pairs[0], slice(None), None)  # selects (2, ..., R, P, 1)
+    second = (..., pairs[1], None, slice(None))  # selects (2, ..., R, 1, P)
     distances = (points[first] - points[second]).norm(dim=0)
     turns = _turns(edges[first], edges[second], products=lengths[first] * lengths[second])
     return torch.stack([distances, *turns])
@@ -94,14 +96,16 @@ def euclidean_relation_loss(pred: Tensor, target: Tensor, counts: Sequence[int])
     if sum(counts) != pred.shape[-3]:
         raise InputError(f"counts must add up to {pred.shape[-3]} matches, got {list(counts)}.")
     pairs = [torch.zeros(2, 0, dtype=torch.long)]
-    shares: list[float] = []
+    weights: list[float] = []
     first = 0
     for count in counts:
-        pairs.append(torch.triu_indices(count, count, 1) + first)
-        shares += [1 / max(count, 1) ** 2] * pairs[-1].shape[1]
+        sample_pairs = torch.triu_indices(count, count, 1) + first
+        pairs.append(sample_pairs)
+        weight = 1 / max(count, 1) ** 2
+        weights += [weight] * sample_pairs.shape[1]
         first += count
-    on_host = [torch.cat(pairs, dim=1), torch.tensor(shares, dtype=pred.dtype)]
-    pair_indices, pair_weights = upload(on_host, pred.device)
+    host_tensors = [torch.cat(pairs, dim=1), torch.tensor(weights, dtype=pred.dtype)]
+    pair_indices, pair_weights = upload(host_tensors, pred.device)
     pred_relations = relation_features(pred, pair_indices)
     target_relations = relation_features(target, pair_indices)
     distances = (pred_relations - target_relations).abs()  # (3, ..., R, P, P)
@@ -137,7 +141,8 @@ class EuclideanLoss(MapLoss):
         pred = pairs.by_layer(pairs.pred_pts[..., :2])
         target = pairs.by_layer(pairs.gt_pts[..., :2])
         shape = euclidean_shape_loss(pred, target)
-        counts = pairs.counts[: len(pairs.counts) // pairs.num_layers]
+        num_samples = len(pairs.counts) // pairs.num_layers
+        counts = pairs.counts[:num_samples]
         relation = euclidean_relation_loss(pred, target, counts)
         return self.loss_weight * (self.shape_weight * shape + self.relation_weight * relation)
 

@@ -80,11 +80,13 @@ class GSMapHead(MapHead):
         # Gaussians smaller than half a pixel of the masks have no gradient. On coarse rasters, the
         # initial Gaussian is larger than usual, so that it stays above the smallest one.
         min_scale_m = (reference or {}).get("min_scale_m", element_masks.half_pixel_m)
+        initial_along_m = max(1.0, 3 * min_scale_m)
+        initial_across_m = max(0.4, 1.5 * min_scale_m)
         reference = with_defaults(
             reference,
             type=GaussianReference,
             min_scale_m=min_scale_m,
-            init_scales_m=(max(1.0, 3 * min_scale_m), max(0.4, 1.5 * min_scale_m)),
+            init_scales_m=(initial_along_m, initial_across_m),
         )
         losses = set_points_weight(losses, PointsLoss, weight=points_weight, key="loss_weight")
         match_costs = set_points_weight(
@@ -148,7 +150,8 @@ class GSMapHead(MapHead):
             pairs: Matched pairs of the last layer.
         """
         space = self.reference.space
-        if space is None or not any(isinstance(loss, MaskLoss) for loss in self.losses.values()):
+        renders_masks = any(isinstance(loss, MaskLoss) for loss in self.losses.values())
+        if space is None or not renders_masks:
             return {}
         return gaussian_statistics(
             space.decode(pairs.pred_references),

@@ -47,7 +47,10 @@ def add_guidance(decoder: PARTS) -> PARTS:
     """
     layer = decoder.get("layer", {})
     kind = class_of(with_defaults(decoder, type=MapDecoder))
-    if kind is None or not issubclass(kind, MapDecoder) or kind.layer_class is MapDecoderLayer:
+    has_own_layers = False
+    if kind is not None and issubclass(kind, MapDecoder):
+        has_own_layers = kind.layer_class is not MapDecoderLayer
+    if not has_own_layers:
         return {**decoder, "layer": with_defaults(layer, type=GaussianDecoderLayer)}
     guidance = layer.get("guidance", {})
     if guidance is not None:

@@ -75,7 +75,8 @@ class GaussianMemory(QueryMemory):
         """
         points = super().transform_references(head, references, past)
         if self.covariance == "points":
-            return torch.cat([points[..., :-3], torch.zeros_like(points[..., -3:])], dim=-1)
+            initial_gaussians = torch.zeros_like(points[..., -3:])  # sigmas and theta
+            return torch.cat([points[..., :-3], initial_gaussians], dim=-1)
         space = require_gaussians(self, head).space
         scale = past.seconds.sqrt()
         with torch.autocast(points.device.type, enabled=False):
@@ -87,12 +88,12 @@ class GaussianMemory(QueryMemory):
             )
             return space.encode(gaussians, points)
 
-    def fuse_references(self, refined: Tensor, before: Tensor, head: FlowHead) -> Tensor:
+    def fuse_references(self, refined: Tensor, transformed: Tensor, head: FlowHead) -> Tensor:
         """Fuse refined Gaussians with the transformed ones, if their centres are on the map.
 
         Args:
             refined: References refined by the decoder. (B, K, P, D)
-            before: Transformed references of the previous frame. (B, K, P, D)
+            transformed: Transformed references of the previous frame. (B, K, P, D)
             head: The head.
 
         Returns:
@@ -102,8 +103,9 @@ class GaussianMemory(QueryMemory):
             return refined
         space = require_gaussians(self, head).space
         with torch.autocast(refined.device.type, enabled=False):
-            gaussians = fuse_gaussians(space.decode(before), space.decode(refined))
+            gaussians = fuse_gaussians(space.decode(transformed), space.decode(refined))
             fused = space.encode(gaussians, refined)
         # Centres outside of the map have been moved to its border, away from the element.
-        inside = (before[..., :2] - 0.5).abs().amax(-1, keepdim=True) < 0.5
+        distances = (transformed[..., :2] - 0.5).abs()  # from the middle of the map
+        inside = distances.amax(-1, keepdim=True) < 0.5
         return torch.where(inside, fused, refined)

@@ -37,7 +37,7 @@ def dense_clusters(points: Points, eps: float, min_neighbours: int) -> Indices:
     points = np.ascontiguousarray(points[order].T)  # (E, n): most pairs differ in the first axes
     low = np.searchsorted(points[0], points[0] - eps)
     high = np.searchsorted(points[0], points[0] + eps, side="right")
-    seeds = np.argsort(order)
+    seeds = np.argsort(order)  # position of each given point in the sorted order
     labels = np.empty(len(order), dtype=np.int64)
     labels[order] = _clusters(points, seeds, low, high, eps**2, min_neighbours)
     return labels

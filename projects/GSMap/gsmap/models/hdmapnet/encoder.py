@@ -108,6 +108,7 @@ class ViewTransformEncoder(CameraEncoder):
         self.view_pixel_m = bev_pixel_m / 0.6  # side of a cell of a camera map
         self.feature_size = (image_size[0] // stride, image_size[1] // stride)
         num_rows, num_columns = forward_size(self.grid)
+        # 2/3 of the size of the BEV, in cells that are 5/3 as long.
         self.view_size = (2 * num_rows // 5, 2 * num_columns // 5)
         if min(self.feature_size + self.view_size) < 1:
             raise InputError(

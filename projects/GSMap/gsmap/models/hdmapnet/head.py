@@ -170,7 +170,7 @@ class HDMapNetHead(DetectionHead):
         """
         maps = self(bev_outputs)
         results = []
-        for semantic, embedding, direction in zip(*maps, strict=True):
+        for semantic, embedding, direction in zip(*maps, strict=True):  # for each sample
             results.append(self.lines(LineMaps(semantic, embedding, direction=direction)))
         return results
 

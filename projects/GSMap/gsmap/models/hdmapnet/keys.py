@@ -29,7 +29,7 @@ HDMAPNET = KeyMap(
             "up2_direction.4.=maps.2.3.",
         ),
     ),
-    {
+    unused={
         **unused_classifier(_TRUNK),
         # an unused first block of the directions, which share the block of the embeddings
         **zeros(
@@ -43,7 +43,7 @@ HDMAPNET = KeyMap(
         ),
     },
     markers=((_VIEWS, "bev_encoder.views."),),
-    sign=_VIEWS,
+    upstream_prefix=_VIEWS,
 )
 
 KEY_MAPS = (HDMAPNET,)

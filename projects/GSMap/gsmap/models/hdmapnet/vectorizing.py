@@ -355,31 +355,34 @@ def _walk(
     config: VectorizeConfig,
 ) -> Iterator[IntArray]:
     """Yield the points after the last one, and mark their directions as used in place."""
+    remaining = points
     while True:
         column, row = last
         free = np.flatnonzero(~is_used[row, column])
         if not len(free):
             return
-        is_used[row, column, free[0]] = True
-        direction = directions[row, column, free[0]]
+        first_free = free[0]
+        is_used[row, column, first_free] = True
+        direction = directions[row, column, first_free]
         if direction == NONE:
             continue
         # Points near the line are left out for good: the line does not turn back to them.
-        points = points[_distances(points, last) > config.step_px - 1]
-        if not len(points):
+        remaining = remaining[_distances(remaining, last) > config.step_px - 1]
+        if not len(remaining):
             return
         # The released code computes the step in float32, which decides between pixels at equal
         # distances.
         angle = np.deg2rad(Float32(config.degrees * direction))
         step = Float32(config.step_px) * np.array([np.cos(angle), np.sin(angle)])
-        distances = _distances(points, last + step)
+        distances = _distances(remaining, last + step)
         nearest = distances.argmin()
         if distances[nearest] > config.jump_px:
             continue
-        back = last - points[nearest]
-        last = points[nearest]
+        back = last - remaining[nearest]
+        last = remaining[nearest]
         column, row = last
         back_angle = np.rad2deg(np.arctan2(back[1], back[0])) % 360
+        # A missing direction, -1, takes part with the angle of one step below 0.
         turn = np.abs(config.degrees * directions[row, column] - back_angle)
         back_way = np.minimum(turn, 360 - turn).argmin()
         is_used[row, column, back_way] = True

@@ -241,7 +241,9 @@ class LineHead(DetectionHead):
         distances = self.losses.distances(lines.masks, truth_masks)
         for index, token in enumerate(tokens):
             sample_lines = lines._make(values[index] for values in lines)
-            yield Case(sample_lines, truth=truths[index], apart=distances[index], token=token)
+            yield Case(
+                sample_lines, truth=truths[index], mask_distances=distances[index], token=token
+            )
 
     def semantic_loss(self, levels: Sequence[Tensor], truths: Sequence[Sequence[Any]]) -> Tensor:
         """Weighted loss of the class masks.
@@ -266,10 +268,13 @@ class LineHead(DetectionHead):
                 masks.append(truth[label].masks.sum(0).clamp(max=1))
             targets.append(torch.stack(masks))  # (B, H, W)
         terms = []
-        for weight, level in zip(self.level_weights[-len(levels) :], levels, strict=True):
+        level_weights = self.level_weights[-len(levels) :]
+        for level_weight, level in zip(level_weights, levels, strict=True):
             for label, target in enumerate(targets):
-                terms.append(weight * self.losses.mask_losses(level[:, label], target).mean())
-        return self.losses.semantic * torch.stack(terms).sum() / len(levels)
+                losses = self.losses.mask_losses(level[:, label], target)
+                terms.append(level_weight * losses.mean())
+        semantic_weight = self.losses.semantic
+        return semantic_weight * torch.stack(terms).sum() / len(levels)
 
     def line_losses(
         self,
@@ -294,15 +299,16 @@ class LineHead(DetectionHead):
         for layer, layer_weight in zip(outputs, self.layer_weights, strict=True):
             for label, lines in enumerate(layer.lines):
                 class_truths = [truth[label] for truth in truths]
-                groups.append(list(self.cases(lines, class_truths, tokens=tokens)))
-                cases.extend(groups[-1])
+                group = list(self.cases(lines, class_truths, tokens=tokens))
+                groups.append(group)
+                cases.extend(group)
                 weights.append(layer_weight / num_groups)
-        all_matches = self.losses.match(cases)
+        remaining_matches = self.losses.match(cases)
         totals: Tensors = {}
         matches = []
         for weight, group in zip(weights, groups, strict=True):
-            group_matches = all_matches[: len(group)]
-            all_matches = all_matches[len(group) :]
+            group_matches = remaining_matches[: len(group)]
+            remaining_matches = remaining_matches[len(group) :]
             for name, value in self.losses(group, group_matches).items():
                 totals[name] = totals.get(name, 0) + weight * value
             matches.append(group_matches)

@@ -19,13 +19,13 @@ class Case(NamedTuple):
     Attributes:
         lines: Predicted lines, tensors (n, ...).
         truth: Annotated lines, tensors (K, ...), with ``masks``.
-        apart: Distances between the masks. (n, K)
+        mask_distances: Distances between the masks. (n, K)
         token: Token of the sample.
     """
 
     lines: Any
     truth: Any
-    apart: Tensor
+    mask_distances: Tensor
     token: str
 
 
@@ -133,8 +133,8 @@ class LineLosses:
 
     def line_costs(self, case: Case) -> Tensor:
         """Weighted costs of classification and masks. (2, n, K)"""
-        score = case.lines.logits.softmax(-1)[:, LINE, None].expand_as(case.apart)
-        return torch.stack([-self.cls * score, self.mask * case.apart])
+        score = case.lines.logits.softmax(-1)[:, LINE, None].expand_as(case.mask_distances)
+        return torch.stack([-self.cls * score, self.mask * case.mask_distances])
 
     def class_loss(self, cases: Sequence[Case], rows: Sequence[Tensor]) -> Tensor:
         """Weighted cross-entropy of the classification.
@@ -178,6 +178,10 @@ def mask_distances(logits: Tensor, masks: Tensor) -> Tensor:
     logits = logits.flatten(1)
     masks = masks.flatten(1)
     shares = logits.sigmoid()
-    entropy = F.softplus(logits).sum(1, keepdim=True) - logits @ masks.T
+    # The cross-entropy of a pixel with logit x and target t is softplus(x) - x * t.
+    entropy_sums = F.softplus(logits).sum(1, keepdim=True) - logits @ masks.T
+    num_pixels = logits.shape[1]
     sizes = shares.sum(1, keepdim=True) + masks.sum(1)
-    return entropy / logits.shape[1] + 1 - (2 * shares @ masks.T + 1) / (sizes + 1)
+    overlaps = 2 * shares @ masks.T
+    dice = (overlaps + 1) / (sizes + 1)
+    return entropy_sums / num_pixels + 1 - dice

@@ -22,7 +22,7 @@ Points = NDArray[np.float64]
 Part = tuple[int, Points]  # class index, and a line (u, v) in [0, 1] from the front and the left
 
 
-def direct_line(line: Points, tolerance: float, sort_rings: bool = False) -> Points:
+def orient_line(line: Points, tolerance: float, sort_rings: bool = False) -> Points:
     """Order the points of a line from its rear end to its front end.
 
     If the ends are level, the line starts at the right end.
@@ -39,8 +39,11 @@ def direct_line(line: Points, tolerance: float, sort_rings: bool = False) -> Poi
         rearmost = int(line[:-1, 0].argmax())
         ring = np.roll(line[:-1], -rearmost, axis=0)
         ring = np.concatenate([ring, ring[:1]])
-        areas = ring[:-1, 1] * ring[1:, 0] - ring[1:, 1] * ring[:-1, 0]  # with u downwards
-        return ring if areas.sum() > 0 else ring[::-1]
+        u = ring[:, 0]  # increases to the rear
+        v = ring[:, 1]  # increases to the right
+        doubled_areas = v[:-1] * u[1:] - v[1:] * u[:-1]
+        is_clockwise = doubled_areas.sum() > 0
+        return ring if is_clockwise else ring[::-1]
     u_first, v_first = line[0]
     u_last, v_last = line[-1]
     is_level = abs(u_first - u_last) <= tolerance
@@ -116,7 +119,7 @@ class FormatLineTargets(BaseTransform):
         """Name and value of the setting that has a number for each class."""
         raise NotImplementedError
 
-    def most(self) -> int:
+    def max_points(self) -> int:
         """Largest number P of key points of a line."""
         raise NotImplementedError
 
@@ -133,7 +136,7 @@ class FormatLineTargets(BaseTransform):
         """
         raise NotImplementedError
 
-    def way(self, points: Points, label: int) -> Points:
+    def polyline(self, points: Points, label: int) -> Points:
         """Polyline through the key points of a line.
 
         Args:
@@ -155,17 +158,17 @@ class FormatLineTargets(BaseTransform):
         labels = []
         counts = []
         points_m = []
-        ways = []
+        polylines = []
         for label, line in parts:
             key_points = self.points(line, label, grid)
             labels.append(label)
             counts.append(len(key_points))
             points_m.append(grid.metres_from_front(key_points))
-            ways.append(self.way(key_points, label))
-        masks, redrawn = self.masks(parts, pivots=ways, size=front_size(grid))
+            polylines.append(self.polyline(key_points, label))
+        masks, redrawn = self.masks(parts, polylines=polylines, size=front_size(grid))
         results["gt_instances_3d"] = InstanceData(
             labels_3d=torch.tensor(labels, dtype=torch.int64),
-            pts=torch.from_numpy(pad_lines(points_m, self.most())).float(),
+            pts=torch.from_numpy(pad_lines(points_m, self.max_points())).float(),
             num_pts=torch.tensor(counts, dtype=torch.int64),
             masks=torch.from_numpy(masks),
             redrawn=torch.from_numpy(redrawn),
@@ -224,7 +227,7 @@ class FormatLineTargets(BaseTransform):
         return parts
 
     def masks(
-        self, parts: Sequence[Part], pivots: Iterable[Points], size: tuple[int, int]
+        self, parts: Sequence[Part], polylines: Iterable[Points], size: tuple[int, int]
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Draw the masks. Within a class, later lines cover earlier ones.
 
@@ -232,7 +235,7 @@ class FormatLineTargets(BaseTransform):
 
         Args:
             parts: Class and points of each line.
-            pivots: Polylines through the key points of each line.
+            polylines: Polyline through the key points of each line.
             size: Rows H and columns W of the masks.
 
         Returns:
@@ -246,9 +249,11 @@ class FormatLineTargets(BaseTransform):
         labels = np.array(part_labels, dtype=int)
         masks = draw_lines(lines, size, thickness_px=self.thickness_px)
         for index, mask in enumerate(masks):
-            earlier_of_class = labels[:index] == labels[index]
-            masks[:index][earlier_of_class] &= ~mask
+            earlier_masks = masks[:index]
+            has_equal_class = labels[:index] == labels[index]
+            earlier_masks[has_equal_class] &= ~mask
         is_empty = ~masks.any(axis=(1, 2))
         redrawn = np.isin(labels, labels[is_empty])
-        masks[redrawn] = draw_lines(pivots, size, thickness_px=self.thickness_px)[redrawn]
+        polyline_masks = draw_lines(polylines, size, thickness_px=self.thickness_px)
+        masks[redrawn] = polyline_masks[redrawn]
         return masks, redrawn

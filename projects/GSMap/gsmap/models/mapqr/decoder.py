@@ -129,11 +129,11 @@ class MapQRDecoderLayer(MapDecoderLayer):
     ) -> None:
         if embed_dims % 4:
             raise InputError(f"embed_dims must be divisible by 4, got {embed_dims}.")
-        scattered = {"type": "ScatterGatherAttention", "points_per_instance": num_points}
+        cross_attn_defaults = {"type": "ScatterGatherAttention", "points_per_instance": num_points}
         super().__init__(
             embed_dims,
             self_attn={"num_points": 1, **(self_attn or {})},
-            cross_attn={**scattered, **(cross_attn or {})},
+            cross_attn={**cross_attn_defaults, **(cross_attn or {})},
             **kwargs,
         )
         self.mask_groups = mask_groups
@@ -153,7 +153,9 @@ class MapQRDecoderLayer(MapDecoderLayer):
         """
         reference, bev_feats, *masks = inputs
         mask = masks[0] if self.mask_groups else None
-        query = self.norms[0](self.self_attn(query, torch.zeros_like(query), mask))
+        no_position = torch.zeros_like(query)
+        attended = self.self_attn(query, no_position, mask)
+        query = self.norms[0](attended)
         code = sine_code(reference[..., :2], query.shape[-1])
         position = self.position_proj(code)
         frames = None
@@ -163,7 +165,8 @@ class MapQRDecoderLayer(MapDecoderLayer):
         bev_context = self.cross_attn(
             query, reference, feats=bev_feats, frames=frames, position=position
         )
-        return self.norms[2](self.ffn(self.norms[1](query + bev_context)))
+        query = self.norms[1](query + bev_context)
+        return self.norms[2](self.ffn(query))
 
 
 @MODELS.register_module()

@@ -37,7 +37,8 @@ class MovingPillars:
         img_from_frame: Tensor,
         img_shape: tuple[int, int],
     ) -> None:
-        self.start = self.heights = start
+        self.start = start
+        self.heights = start
         self.low_m = z_range[0]
         self.extent_m = z_range[1] - z_range[0]
         self.img_shape = img_shape
@@ -53,9 +54,10 @@ class MovingPillars:
             offsets_m: Offsets in metres. (B, Q, Z)
             accumulate: Add them to the current heights, otherwise to the initial ones.
         """
-        before = self.heights if accumulate else self.start
-        self.heights = before + at_least_float32(offsets_m) / self.extent_m
-        z = (self.low_m + self.heights * self.extent_m)[:, None, ..., None]  # (B, 1, Q, Z, 1)
+        old_heights = self.heights if accumulate else self.start
+        self.heights = old_heights + at_least_float32(offsets_m) / self.extent_m
+        heights_m = self.low_m + self.heights * self.extent_m
+        z = heights_m[:, None, ..., None]  # (B, 1, Q, Z, 1)
         projected = self.feet[:, :, :, None] + z * self.upwards
         return visible_points(projected, self.img_shape)
 

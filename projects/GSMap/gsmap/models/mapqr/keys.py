@@ -24,9 +24,9 @@ MAPQR = KeyMap(
         *MASK_RULES,
         (DECODER + "pt_pos_query_projs.{i}.", LAYER + "position_proj."),
     ),
-    {**CODE_WEIGHTS, **MASK_WEIGHTS},
+    unused={**CODE_WEIGHTS, **MASK_WEIGHTS},
     markers=(_HEIGHTS,),
-    idle=GRID_OFFSETS,
+    ignored_pattern=GRID_OFFSETS,
 )
 
 KEY_MAPS = (MAPQR,)

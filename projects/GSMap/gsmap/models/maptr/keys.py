@@ -42,11 +42,13 @@ GRID_OFFSETS = (
 )
 _KERNELS = (ENCODER_LAYER + "attentions.1.attention.", OUR_ENCODER_LAYER + "cross_attn.")
 _DEFORMABLE = ENCODER_LAYER + "attentions.1.deformable_attention."
-MAPTR = KeyMap("maptr", (*_BEV_QUERY_RULES, _KERNELS), CODE_WEIGHTS, idle=GRID_OFFSETS)
+MAPTR = KeyMap(
+    "maptr", (*_BEV_QUERY_RULES, _KERNELS), unused=CODE_WEIGHTS, ignored_pattern=GRID_OFFSETS
+)
 MAPTR_BEVFORMER = KeyMap(
     "maptr-bevformer",
     (*_BEV_QUERY_RULES, (_DEFORMABLE, OUR_ENCODER_LAYER + "cross_attn.")),
-    CODE_WEIGHTS,
+    unused=CODE_WEIGHTS,
     markers=((_DEFORMABLE, OUR_ENCODER_LAYER + "cross_attn.sampling_offsets."),),
 )
 

@@ -56,7 +56,7 @@ MAPTRV2 = KeyMap(
             "norms.0.=self_attn.norm. norms.1.=norms.0. norms.2.=norms.1. norms.3.=norms.2.",
         ),
     ),
-    LIFTED_UNUSED,
+    unused=LIFTED_UNUSED,
     markers=(LIFTED_MARKER,),
 )
 

@@ -51,9 +51,10 @@ class RenderedDiceCost(MapCost):
         preds = pred_instances.pts
         is_polygon = self.renderer.is_polygon(gt_instances.labels)
         targets = self.renderer.render(gt_instances.first_pts, is_polygon)
-        none_filled = torch.zeros(len(preds), dtype=torch.bool, device=preds.device)
-        lines = self.renderer.render(preds, is_polygon=none_filled)  # (N, H, W)
-        polygons = self.renderer.render(preds, is_polygon=~none_filled)
+        all_lines = torch.zeros(len(preds), dtype=torch.bool, device=preds.device)
+        all_polygons = torch.ones_like(all_lines)
+        lines = self.renderer.render(preds, is_polygon=all_lines)  # (N, H, W)
+        polygons = self.renderer.render(preds, is_polygon=all_polygons)
         line_costs = pairwise_dice_loss(lines, targets)  # (N, K)
         polygon_costs = pairwise_dice_loss(polygons, targets)
         costs = torch.where(is_polygon, polygon_costs, line_costs)

@@ -52,8 +52,11 @@ class RefinedDecoded(Decoded):
 
     def of_queries(self, queries: slice) -> Decoded:
         """Select the output of some instance queries, with the whole segmentation."""
-        plain = Decoded(self.point_states, self.references, instance_states=self.instance_states)
-        return replace(self, **vars(plain.of_queries(queries)))
+        all_queries = Decoded(
+            self.point_states, self.references, instance_states=self.instance_states
+        )
+        selection = all_queries.of_queries(queries)
+        return replace(self, **vars(selection))
 
 
 @MODELS.register_module()
@@ -94,7 +97,8 @@ class MGMapDecoder(MapDecoder):
                 f"refinements use the branches of layers, each one, got {refinements} and "
                 f"{len(self.layers)} layers."
             )
-        self.branches = self.branches + self.branches[len(self.layers) - refinements :]
+        first_shared = len(self.layers) - refinements
+        self.branches = self.branches + self.branches[first_shared:]
         self.num_masks = num_masks
         self.patches = patches
         self.neck = EnhancedNeck(embed_dims)
@@ -140,8 +144,10 @@ class MGMapDecoder(MapDecoder):
             Outputs of the layers (`MaskedDecoded`) and of the stages (`RefinedDecoded`).
         """
         fused_feats, levels = self.neck(bev_feats)
-        masks = self.mask_net(fused_feats)[:, : query.shape[1] // self.num_points]  # (B, N, H, W)
-        mask_embeddings = self.activation(self.instance_features(fused_feats, masks))  # (B, N, C)
+        num_instances = query.shape[1] // self.num_points
+        masks = self.mask_net(fused_feats)[:, :num_instances]  # (B, N, H, W)
+        instance_feats = self.instance_features(fused_feats, masks)
+        mask_embeddings = self.activation(instance_feats)  # (B, N, C)
         query = query + mask_embeddings.repeat_interleave(self.num_points, dim=1)
         layers = super().forward(
             query,

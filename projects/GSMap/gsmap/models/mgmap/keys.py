@@ -53,10 +53,10 @@ MGMAP = KeyMap(
         ),
         *MAPTR.rules,
     ),
-    CODE_WEIGHTS,
+    unused=CODE_WEIGHTS,
     markers=(_ACTIVATION,),
     # modules that are never called, an alias of glimpse_transformer_0, and weights of a loss
-    idle=r"pts_bbox_head\.(conv_seg|glimpse_transformer|loss_fn_?|(cls|reg)_branches\.[6-9]|"
+    ignored_pattern=r"pts_bbox_head\.(conv_seg|glimpse_transformer|loss_fn_?|(cls|reg)_branches\.[6-9]|"
     r"transformer\.bevencode\.(fpn_conv|attention)|(rego_hs_fuser|layer_norms)_\d\.[1-5])\.|"
     + GRID_OFFSETS,
 )

@@ -33,7 +33,8 @@ class Gates(nn.Module):
         feats = feats * (mean + largest).sigmoid()
         cell_mean = feats.mean(dim=1, keepdim=True)
         cell_largest = feats.amax(dim=1, keepdim=True)
-        return feats * self.space(torch.cat([cell_mean, cell_largest], dim=1)).sigmoid()
+        cell_logits = self.space(torch.cat([cell_mean, cell_largest], dim=1))
+        return feats * cell_logits.sigmoid()
 
 
 class GatedBlock(BasicBlock):
@@ -51,9 +52,10 @@ class GatedBlock(BasicBlock):
 
     def forward(self, feats: Tensor) -> Tensor:
         """Apply the block. (B, inplanes, H, W) -> (B, planes, H / stride, W / stride)"""
-        inner = self.relu(self.norm1(self.conv1(feats)))
+        hidden = self.relu(self.norm1(self.conv1(feats)))
+        residual = self.gates(self.norm2(self.conv2(hidden)))
         shortcut = feats if self.downsample is None else self.downsample(feats)
-        return self.relu(self.gates(self.norm2(self.conv2(inner))) + shortcut)
+        return self.relu(residual + shortcut)
 
 
 class EnhancedNeck(nn.Module):
@@ -99,7 +101,8 @@ class EnhancedNeck(nn.Module):
             feats = stage(feats)
             maps.append(feats)
         size = bev_feats.shape[2:]
-        fused_feats = self.fusion(torch.cat([resize_map(feats, size) for feats in maps], dim=1))
+        resized_maps = [resize_map(feats, size) for feats in maps]
+        fused_feats = self.fusion(torch.cat(resized_maps, dim=1))
         maps.append(resize_map(fused_feats, stem.shape[2:]))
         levels = [level(feats) for level, feats in zip(self.levels, maps, strict=True)]
         return fused_feats, levels

@@ -45,13 +45,17 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
         reference_dims: int | None = 2,
         **kwargs: Any,
     ) -> None:
-        sampling = {"type": "MultiGranularityAttention", "num_levels": num_levels}
+        cross_attn_defaults = {
+            "type": "MultiGranularityAttention",
+            "num_levels": num_levels,
+            "num_points": num_points,
+        }
         super().__init__(
             embed_dims,
             ffn_dims=ffn_dims,
             dropout=dropout,
             self_attn={"num_points": 1, **(self_attn or {})},
-            cross_attn={**sampling, "num_points": num_points, **(cross_attn or {})},
+            cross_attn={**cross_attn_defaults, **(cross_attn or {})},
             **kwargs,
         )
         self.num_points = num_points

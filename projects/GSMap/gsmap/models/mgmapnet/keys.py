@@ -37,7 +37,7 @@ MGMAPNET = KeyMap(
             "gen_pos_embed.{i}.=reference_code.",
         ),
     ),
-    {
+    unused={
         **LIFTED_UNUSED,
         HEAD + "loss_seg.loss_fn.pos_weight": None,  # a loss without counterpart
         **zeros(

@@ -245,8 +245,10 @@ class PivotBEVEncoder(CameraEncoder):
         u_by_camera, v_by_camera = uv[..., 0, :].unbind(-1)  # (B, V, Q)
         u = u_by_camera.gather(1, camera)[:, 0]
         v = v_by_camera.gather(1, camera)[:, 0]
-        u = (u + camera[:, 0]) / matrices.shape[1]
-        return torch.stack([u, v], dim=-1), visible.gather(1, camera)[:, 0]
+        num_cams = matrices.shape[1]
+        u = (u + camera[:, 0]) / num_cams
+        is_inside = visible.gather(1, camera)[:, 0]
+        return torch.stack([u, v], dim=-1), is_inside
 
 
 def split_maps(tokens: Tensor, shapes: Shapes) -> list[Tensor]:

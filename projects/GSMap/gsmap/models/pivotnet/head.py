@@ -43,11 +43,13 @@ class PivotReference(Reference):
         """
         is_dropped = references[..., 2] <= 0
         index = torch.arange(is_dropped.shape[1], device=is_dropped.device)
-        order = (index + is_dropped * len(index)).argsort(dim=-1)  # pivots first
-        number = (~is_dropped).sum(dim=-1)
-        order = order.gather(1, index.minimum(number[:, None] - 1))
+        sort_keys = index + is_dropped * len(index)  # pivots first, both in their order
+        order = sort_keys.argsort(dim=-1)
+        num_pivots = (~is_dropped).sum(dim=-1)
+        last_pivot = num_pivots[:, None] - 1
+        order = order.gather(1, index.minimum(last_pivot))  # repeats the last pivot
         points = references[..., :2].gather(1, order[..., None].expand(-1, -1, 2))
-        return {"pts": self.grid.metres_from_front(points), "num_pts": number}
+        return {"pts": self.grid.metres_from_front(points), "num_pts": num_pivots}
 
 
 def pack_lines(lines: list[Lines]) -> LinePredictions:

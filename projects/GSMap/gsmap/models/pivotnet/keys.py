@@ -46,14 +46,14 @@ PIVOTNET = KeyMap(
         *mlps("output_head.pts_cls_heads.{i}.", "map_head.kind_branches.{i}."),
         *HEAD_RULES,
     ),
-    {
+    unused={
         **CLASS_WEIGHTS,
         # settings: order of the concatenated cameras, class weights of another loss
         BEV + "image_order": torch.arange(6),
         "post_processor.criterion.collinear_pt_weight": torch.tensor((0.2, 1.0)),
     },
     markers=((LINE_DECODER + "query_feat", "map_head.decoder.query.weight"),),
-    sign=LINE_DECODER,
+    upstream_prefix=LINE_DECODER,
 )
 
 KEY_MAPS = (PIVOTNET,)

@@ -40,7 +40,7 @@ class Pairs(NamedTuple):
     rows: Tensor  # indices of the predicted lines (M,)
     cols: Tensor  # indices of the annotated lines (M,)
     is_pivot: Tensor  # True for points that are matched with a pivot (M, p)
-    expected: Tensor  # target points, evenly spaced between pivots (M, p, 2)
+    target_points: Tensor  # evenly spaced between pivots (M, p, 2)
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class PivotLosses(LineLosses):
             u = np.interp(points, path, line[:, 0])
             v = np.interp(points, path, line[:, 1])
             target_points[pair] = torch.from_numpy(np.stack([u, v], axis=-1))
-        return Pairs(rows, cols, is_pivot=is_pivot, expected=target_points)
+        return Pairs(rows, cols, is_pivot=is_pivot, target_points=target_points)
 
     def __call__(self, cases: Sequence[Case], matches: Sequence[Pairs]) -> dict[str, Tensor]:
         """Compute the weighted losses of one layer and class.
@@ -124,11 +124,11 @@ class PivotLosses(LineLosses):
         for case, pairs in zip(cases, matches, strict=True):
             num_annotated += len(case.truth.numbers)
             rows.append(pairs.rows)
-            mask_distances.append(case.apart[pairs.rows, pairs.cols])
+            mask_distances.append(case.mask_distances[pairs.rows, pairs.cols])
             line_points.append(case.lines.points[pairs.rows])
             line_logits.append(case.lines.point_logits[pairs.rows])
             pivot_masks.append(pairs.is_pivot)
-            expected_points.append(pairs.expected)
+            expected_points.append(pairs.target_points)
         number = max(num_annotated, 1)
         logits = torch.cat(line_logits)  # (M, p, 2)
         is_pivot = torch.cat(pivot_masks)

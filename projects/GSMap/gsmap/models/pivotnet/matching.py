@@ -40,11 +40,11 @@ def sequence_costs(costs: Floats, lengths: NDArray[np.integer], end_weight: floa
     Returns:
         Mean cost of each pair of lines. (N, K)
     """
-    number = np.arange(len(lengths))
-    last = lengths - 1
-    total = path_costs(costs)[:, number, last, -1]
-    ends = costs[..., 0, 0] + costs[:, number, last, -1]
-    return (total + end_weight * ends) / (lengths + 2 * end_weight)
+    lines = np.arange(len(lengths))
+    last_pivots = lengths - 1
+    totals = path_costs(costs)[:, lines, last_pivots, -1]
+    ends = costs[..., 0, 0] + costs[:, lines, last_pivots, -1]
+    return (totals + end_weight * ends) / (lengths + 2 * end_weight)
 
 
 def match_pivots(costs: Floats) -> NDArray[np.int64]:

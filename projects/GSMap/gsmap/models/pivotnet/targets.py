@@ -8,7 +8,7 @@ from mmdet3d.registry import TRANSFORMS
 from numpy.typing import NDArray
 
 from gsmap.models.lines.front import front_size
-from gsmap.models.lines.targets import FormatLineTargets, Points, direct_line
+from gsmap.models.lines.targets import FormatLineTargets, Points, orient_line
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.errors import InputError
 
@@ -86,7 +86,7 @@ class FormatPivotTargets(FormatLineTargets):
         """Return the name and the values of the setting with one number for each class."""
         return "num_points", self.num_points
 
-    def most(self) -> int:
+    def max_points(self) -> int:
         """Return the largest number P of pivots of a line."""
         return max(self.num_points)
 
@@ -103,7 +103,7 @@ class FormatPivotTargets(FormatLineTargets):
         """
         size_m = np.array(front_size(grid)) * self.pixel_m
         largest = self.num_points[label]
-        line_m = direct_line(line * size_m, tolerance=1.0, sort_rings=self.sort_rings)
+        line_m = orient_line(line * size_m, tolerance=1.0, sort_rings=self.sort_rings)
         areas = significances(line_m)
         pivots = np.flatnonzero(areas >= self.min_area_m2)
         if self.keep_end and len(pivots) > largest:

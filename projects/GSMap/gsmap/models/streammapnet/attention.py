@@ -1,4 +1,4 @@
-"""StreamMapNet's multi-point attention, with one sample beside each point of a line."""
+"""StreamMapNet's multi-point attention, with one sample near each point of a line."""
 
 import torch
 from mmdet3d.registry import MODELS
@@ -10,7 +10,7 @@ from gsmap.structures.tensors import constant
 
 @MODELS.register_module()
 class LinePointAttention(BEVDeformableAttention):
-    """Deformable attention of instance queries with one sample beside each point of their lines.
+    """Deformable attention of instance queries with one sample near each point of their lines.
 
     Sample p lies at point p of the instance's reference plus a learned offset. Offsets count rows
     from the largest y of the map, as in the released weights. The arguments are described in

@@ -32,12 +32,12 @@ class StreamMapNetDecoderLayer(MapDecoderLayer):
         cross_attn: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
-        sampling = {"type": "LinePointAttention", "num_points": num_points}
+        cross_attn_defaults = {"type": "LinePointAttention", "num_points": num_points}
         super().__init__(
             embed_dims,
             ffn_dims=ffn_dims,
             self_attn={"num_points": 1, **(self_attn or {})},
-            cross_attn={**sampling, **(cross_attn or {})},
+            cross_attn={**cross_attn_defaults, **(cross_attn or {})},
             **kwargs,
         )
 

@@ -1,4 +1,4 @@
-"""StreamMapNet's BEV encoder: BEVFormer's on several levels, with rows from the largest y."""
+"""StreamMapNet's BEV encoder: BEVFormer's encoder on several levels of image features."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -33,9 +33,10 @@ class StreamMapNetEncoderLayer(BEVEncoderLayer):
 
 @MODELS.register_module()
 class StreamMapNetEncoder(BEVQueryEncoder):
-    """`BEVQueryEncoder` without the vehicle's motion, with weights from the largest y on.
+    """`BEVQueryEncoder` without the vehicle's motion (StreamMapNet).
 
-    Row 0 of its output is at the smallest y, as in all encoders.
+    Inside the encoder, row 0 is at the largest y, as in the released weights. Row 0 of its output
+    is at the smallest y, as in all encoders.
 
     Args:
         num_levels: Number of levels of image features.

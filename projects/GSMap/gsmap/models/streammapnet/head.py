@@ -65,7 +65,7 @@ class StreamMapNetHead(MapHead):
         self.coder = BestClassCoder(grid=self.grid, **coder_settings)
 
     def queries(self) -> tuple[Tensor, Tensor]:
-        """Return the queries, as the source of their first lines and as input of the decoder."""
+        """Return the query embeddings twice: for the initial lines, and as the decoder's input."""
         query = self.instance_embedding.weight
         if not self.training:
             query = query[: self.query_groups[0].num]

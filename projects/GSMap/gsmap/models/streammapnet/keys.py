@@ -36,13 +36,13 @@ STREAMMAPNET = KeyMap(
         ("head.query_update.fc.", "temporal.queries.fc."),
         ("stream_fusion_neck.", "temporal.bev."),
     ),
-    {  # cells, size and corner of the map, which are settings of a config
+    unused={  # cells, size and corner of the map, which are settings of a config
         "plane": torch.stack([_X, _Y, torch.zeros_like(_X), torch.ones_like(_X)], -1),
         "head.roi_size": torch.tensor((60.0, 30.0)),
         "head.origin": torch.tensor((-30.0, -15.0)),
     },
     markers=((_INPUT, "map_head.decoder.input_proj."),),
-    sign=_INPUT,
+    upstream_prefix=_INPUT,
 )
 
 KEY_MAPS = (STREAMMAPNET,)

@@ -70,10 +70,12 @@ class BEVMemory(nn.Module, AddsWeights):
         for conv in (self.convz, self.convr, self.convq):
             nn.init.kaiming_normal_(conv.weight, mode="fan_out", nonlinearity="relu")
         if present_share is not None:
-            constant_init(self.convz, 0.0, math.log(present_share / (1 - present_share)))
+            logit = math.log(present_share / (1 - present_share))
+            constant_init(self.convz, 0.0, bias=logit)
             with torch.no_grad():
                 self.convq.weight.zero_()
-                self.convq.weight[:, embed_dims:, 0, 0].fill_diagonal_(1.0)
+                present_weights = self.convq.weight[:, embed_dims:, 0, 0]  # (C, C)
+                present_weights.fill_diagonal_(1.0)
 
     def cells(self, height: int, width: int) -> Tensor:
         """Positions of the cells.
@@ -149,12 +151,13 @@ class BEVMemory(nn.Module, AddsWeights):
             if self.kept_dims is not None:
                 warped = torch.cat([warped, hidden[:, self.kept_dims :]], dim=1)
             hidden = torch.where(past.continues.view(-1, 1, 1, 1), warped, hidden)
-        both = torch.cat([hidden, feats], dim=1)
-        update = self.convz(both).sigmoid()
-        reset = self.convr(both).sigmoid()
+        inputs = torch.cat([hidden, feats], dim=1)
+        update = self.convz(inputs).sigmoid()
+        reset = self.convr(inputs).sigmoid()
         candidate = self.convq(torch.cat([reset * hidden, feats], dim=1))
         fused = torch.lerp(hidden, candidate, update)
-        return self.ln(fused.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+        fused = self.ln(fused.permute(0, 2, 3, 1))  # (B, H, W, C)
+        return fused.permute(0, 3, 1, 2)
 
     def remember(self, fused: Tensor) -> Tensor:
         """Memory for the next frame. (B, C, H, W) -> (B, kept_dims, H, W)"""

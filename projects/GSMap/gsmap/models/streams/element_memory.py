@@ -104,18 +104,18 @@ class ElementMemory:
         exists = labels >= 0
         is_confident = detections.scores_3d >= self.min_score
         gaussians = detected_gaussians(detections)
-        new = update_from_known_lines(
+        updated = update_from_known_lines(
             now=_select(gaussians, is_confident),
             labels=detections.labels_3d[is_confident],
             known=_select(previous, exists),
             known_labels=labels[exists],
             gate_m=self.gate_m,
         )
-        means = gaussians.means.index_put((is_confident,), new.means)
+        means = gaussians.means.index_put((is_confident,), updated.means)
         result = detections.clone()
         result.pts = torch.cat([means, detections.pts[..., 2:]], dim=-1)
-        result.scales = gaussians.scales.index_put((is_confident,), new.scales)
-        result.rotations = gaussians.rotations.index_put((is_confident,), new.rotations)
+        result.scales = gaussians.scales.index_put((is_confident,), updated.scales)
+        result.rotations = gaussians.rotations.index_put((is_confident,), updated.rotations)
         return result
 
     def remember(self, results: Sequence[InstanceData]) -> dict[str, Tensor]:

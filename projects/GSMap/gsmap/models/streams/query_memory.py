@@ -101,14 +101,14 @@ class QueryMemory(BaseModule, AddsWeights):
         """
         return head.reference.transform_references(references, past.now_from_then)
 
-    def fuse_references(self, refined: Tensor, before: Tensor, head: FlowHead) -> Tensor:
+    def fuse_references(self, refined: Tensor, transformed: Tensor, head: FlowHead) -> Tensor:
         """Combine the references of propagated queries before and after the decoder.
 
         The base class returns ``refined``.
 
         Args:
             refined: References after the last layer. (B, K, P, D)
-            before: Result of `transform_references`. (B, K, P, D)
+            transformed: Result of `transform_references`. (B, K, P, D)
             head: The head.
 
         Returns:
@@ -165,7 +165,7 @@ class Propagation(FlowHook):
         instances = head.decoder.by_instance(refined)
         propagated = instances[:, : self.memory.num]
         fused = self.memory.fuse_references(
-            refined=propagated, before=self.propagated.reference, head=head
+            refined=propagated, transformed=self.propagated.reference, head=head
         )
         propagated = torch.where(self.past.continues.view(-1, 1, 1, 1), fused, propagated)
         return torch.cat([propagated, instances[:, self.memory.num :]], dim=1).flatten(1, 2)

@@ -162,7 +162,8 @@ class PolylineGenerator(BaseModule):
         forbidden_y[0] = True  # the stop token
         forbidden = torch.stack([forbidden_x, forbidden_y])
         number = torch.arange(start, start + logits.shape[1], device=logits.device)
-        return logits.masked_fill(forbidden[number % 2], _FORBIDDEN)
+        axis = number % 2  # 0 for x, 1 for y
+        return logits.masked_fill(forbidden[axis], _FORBIDDEN)
 
     def states(self, bev_feats: Tensor, elements: Elements, tokens: Tensor) -> list[Tensor]:
         """Compute the states of all tokens after each layer, with causal attention.
@@ -186,7 +187,7 @@ class PolylineGenerator(BaseModule):
     def log_probs(self, bev_feats: Tensor, elements: Elements, tokens: Tensor) -> Tensor:
         """Compute the log-probabilities of the tokens at positions 0 to T of each line.
 
-        Those at position t depend on the given tokens before t.
+        The probabilities at position t depend on the given tokens before t.
 
         Args:
             bev_feats: BEV features of one sample. (C', H, W)

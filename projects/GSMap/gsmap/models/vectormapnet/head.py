@@ -155,14 +155,14 @@ class VectorMapNetHead(DetectionHead):
         with torch.autocast(feats.device.type, enabled=False):
             draw = self.generator.seeded_draw(seed)
             tokens = self.generator.generate(feats.float(), elements, draw=draw)
-        points, number = self.generator.lines(tokens)
+        points, num_points = self.generator.lines(tokens)
         lines = InstanceData(
             pts=points,
-            num_pts=number,
+            num_pts=num_points,
             labels_3d=detections.labels_3d,
             scores_3d=detections.scores_3d,
         )
-        return lines[number > 1]
+        return lines[num_points > 1]
 
     def boxes(self, detections: InstanceData) -> Tensor:
         """Return the boxes of elements, x0, y0, x1, y1 in whole pixels of the canvas. (n, 4)"""

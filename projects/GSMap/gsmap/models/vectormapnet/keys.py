@@ -50,7 +50,7 @@ VECTORMAPNET = KeyMap(
             "bbox_context_embed.=corner. vertex_embed.=vertex.",
         ),
     ),
-    {
+    unused={
         # settings: points of the planes, pixels of the canvas, and two settings of the noise
         "backbone.bev_planes": torch.stack((_PLANES[2], _PLANES[1], _PLANES[0]), -1),
         _ELEMENTS + "canvas_size": torch.tensor((200, 100)),
@@ -63,8 +63,9 @@ VECTORMAPNET = KeyMap(
         **zeros(_ELEMENTS, {"transformer.level_embeds": (1, 256), "label_embed.weight": (3, 256)}),
     },
     markers=((_LINES, "map_head.generator."),),
-    idle=r"head\.det_net\.pre_branches\.(cls|reg)\.[1-9]",  # aliases of the branch of index 0
-    sign=_LINES,
+    # aliases of the branch of index 0
+    ignored_pattern=r"head\.det_net\.pre_branches\.(cls|reg)\.[1-9]",
+    upstream_prefix=_LINES,
 )
 
 KEY_MAPS = (VECTORMAPNET,)

@@ -117,9 +117,8 @@ def bev_pool_conv3x3(
     lengths = _neighbours(counts)
     firsts = _neighbours(starts)
     total = int(lengths.sum())
-    shift = torch.repeat_interleave(
-        firsts - (lengths.cumsum(0) - lengths), repeats=lengths, output_size=total
-    )
+    range_starts = lengths.cumsum(0) - lengths
+    shift = torch.repeat_interleave(firsts - range_starts, repeats=lengths, output_size=total)
     tap = torch.repeat_interleave(
         torch.arange(9, device=cells.device).repeat(counts.numel()),
         repeats=lengths,
@@ -140,7 +139,9 @@ def bev_pool_conv3x3(
 
 def _neighbours(values: Tensor) -> Tensor:
     """Gather the 3 x 3 neighbours of each cell, zero outside. (B, H, W) -> (B H W 9,)"""
-    return F.pad(values, (1, 1, 1, 1)).unfold(1, 3, 1).unfold(2, 3, 1).flatten()
+    padded = F.pad(values, (1, 1, 1, 1))
+    windows = padded.unfold(1, 3, 1).unfold(2, 3, 1)  # (B, H, W, 3, 3)
+    return windows.flatten()
 
 
 def _check_shapes(probs: Tensor, context: Tensor, cells: Tensor) -> None:

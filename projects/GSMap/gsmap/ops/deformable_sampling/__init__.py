@@ -63,7 +63,9 @@ def deformable_sample(
         fused = choose_backend(backend, weights, fused=("triton",), kernel="deformable_sample")
         if fused == "triton":
             height, width = shape
-            sums = _deformable_sample(value, locations, weights, height, width, fused)
+            sums = _deformable_sample(
+                value, locations, weights=weights, height=height, width=width, backend=fused
+            )
             return sums.flatten(2)
     value = value.to(dtype)
     batch, num_cells, heads, channels = value.shape
@@ -131,5 +133,5 @@ def sum_rows(table: Tensor, rows: Tensor, weights: Tensor, backend: str = "auto"
     if not wants_gradient or choose_backend(backend, table, fused=("cpu",)) == "reference":
         out = F.embedding_bag(bags, table, per_sample_weights=factors, mode="sum")
     else:
-        out = _sum_rows(table, factors, bags, "cpu")
+        out = _sum_rows(table, factors, rows=bags, backend="cpu")
     return out.view((*rows.shape[:-1], table.shape[-1]))

@@ -57,7 +57,7 @@ def exp2_float32(x):
 
 
 @njit(nogil=True, cache=True, fastmath=FASTMATH, error_model="numpy")
-def _survey(gaussian, frame, size, spans, parabolas):
+def _row_geometry(gaussian, frame, size, spans, parabolas):
     """Compute the geometry of a Gaussian's ellipse in each of its rows.
 
     Args:
@@ -111,7 +111,7 @@ def _survey(gaussian, frame, size, spans, parabolas):
 def _accumulate(gaussian, frame, steps, mask, spans, parabolas, through):
     """Add one Gaussian to a mask R or, if ``through``, multiply it into a transmittance T."""
     size = mask.shape[0], mask.shape[1] - LANES
-    top, bottom, curvature, _, _ = _survey(
+    top, bottom, curvature, _, _ = _row_geometry(
         gaussian, frame, size=size, spans=spans, parabolas=parabolas
     )
     for row in range(top, bottom):
@@ -149,10 +149,14 @@ def _row_sums(grad, steps, start, curvature, base):
 def _gaussian_gradient(gaussian, frame, steps, grad, spans, parabolas, out):
     """Compute the gradient of one Gaussian (5,) from ``grad``, T dL/dR of its instance."""
     size = grad.shape[0], grad.shape[1] - LANES
-    top, bottom, curvature, cos, sin = _survey(
+    top, bottom, curvature, cos, sin = _row_geometry(
         gaussian, frame, size=size, spans=spans, parabolas=parabolas
     )
-    m_u = m_v = m_uu = m_uv = m_vv = 0.0
+    m_u = 0.0  # moments of w
+    m_v = 0.0
+    m_uu = 0.0
+    m_uv = 0.0
+    m_vv = 0.0
     for row in range(top, bottom):
         base = np.float32(parabolas[0, row])
         start = np.float32(parabolas[1, row])

@@ -61,8 +61,8 @@ def _touches(gaussian, left, right, low, high):
     mean_y = tl.load(gaussian + 1)
     half_x = tl.load(gaussian + 6)
     half_y = tl.load(gaussian + 7)
-    beside = (mean_x + half_x < left) | (mean_x - half_x > right)
-    misses = beside | (mean_y + half_y < low) | (mean_y - half_y > high)
+    is_beside = (mean_x + half_x < left) | (mean_x - half_x > right)
+    misses = is_beside | (mean_y + half_y < low) | (mean_y - half_y > high)
     total = mean_x + mean_y + half_x + half_y  # NaN if one of them is
     return (total != total) | (misses == 0)
 
@@ -189,8 +189,8 @@ def _find_hits(gaussians, first, count, left, right, low, high):
     mean_y = tl.load(box + 1, mask=exists, other=0.0)
     half_x = tl.load(box + 6, mask=exists, other=0.0)
     half_y = tl.load(box + 7, mask=exists, other=0.0)
-    beside = (mean_x + half_x < left) | (mean_x - half_x > right)
-    misses = beside | (mean_y + half_y < low) | (mean_y - half_y > high)
+    is_beside = (mean_x + half_x < left) | (mean_x - half_x > right)
+    misses = is_beside | (mean_y + half_y < low) | (mean_y - half_y > high)
     total = mean_x + mean_y + half_x + half_y  # NaN if one of them is
     hits = exists & ((total != total) | (misses == 0))
     return tl.sum(tl.where(hits, 1 << lane, 0))

@@ -34,14 +34,16 @@ def hard_voxelize(
     cells = cells[inside].long()
     x, y, z = cells.unbind(1)
     columns, rows = shape[:2].long()
-    keys, order = ((z * rows + y) * columns + x).sort(stable=True)
-    _, group, counts = keys.unique_consecutive(return_inverse=True, return_counts=True)
+    flat_cells = (z * rows + y) * columns + x
+    sorted_cells, order = flat_cells.sort(stable=True)
+    # A group is the run of points of one cell in the sorted order.
+    _, group, counts = sorted_cells.unique_consecutive(return_inverse=True, return_counts=True)
     starts = counts.cumsum(0) - counts
-    firsts, by_first = order[starts].sort()  # voxels in the order of their first points
+    firsts, by_first = order[starts].sort()  # groups in the order of their first points
     rank = torch.empty_like(by_first)
     rank[by_first] = torch.arange(len(by_first), device=points.device)
     voxel = rank[group]
-    slot = torch.arange(len(order), device=points.device) - starts[group]
+    slot = torch.arange(len(order), device=points.device) - starts[group]  # place in the voxel
     fits = (voxel < max_voxels) & (slot < max_points)
     num_voxels = min(max_voxels, len(firsts))
     voxels = points.new_zeros(num_voxels, max_points, points.shape[1])

@@ -9,8 +9,8 @@ from gsmap.structures.tensors import at_least_float32
 
 _sample_kernels = fused_operator(
     "kernel_sampling.sample_kernels",
-    "Tensor value, Tensor uv, Tensor weights, Tensor seen, Tensor offsets, int height, int width, "
-    "bool bilinear",
+    "Tensor value, Tensor uv, Tensor weights, Tensor visible_cells, Tensor offsets, int height, "
+    "int width, bool bilinear",
     lambda value, uv, weights, *_: (*weights.shape[:3], value.shape[4]),  # (B, Q, heads, C)
     differentiable=3,
     dtype=torch.float32,
@@ -27,7 +27,7 @@ def sample_kernels(
     value: Tensor,
     shape: tuple[int, int],
     uv: Tensor,
-    seen: Tensor,
+    visible_cells: Tensor,
     weights: Tensor,
     offsets: Tensor,
     bilinear: bool = False,
@@ -45,7 +45,7 @@ def sample_kernels(
         shape: Rows h and columns w of a map.
         uv: Projection (x, y) of each cell for each head, [0, 1] over the map; finite for visible
             cells. (B, V, Q, heads, 2)
-        seen: Whether a cell is visible to a camera, bool. (B, V, Q)
+        visible_cells: Whether a cell is visible to a camera, bool. (B, V, Q)
         weights: Weights of the pixels. (B, Q, heads, S)
         offsets: Offsets (dx, dy) of the pixels from the projection, in pixels. (S, 2)
         bilinear: Interpolate between pixels, which are zero outside of the map, instead of rounding
@@ -67,12 +67,22 @@ def sample_kernels(
     backend = choose_backend(backend, weights, fused=("triton",), kernel="sample_kernels")
     if backend == "triton":
         height, width = shape
-        return _sample_kernels(value, uv, weights, seen, offsets, height, width, bilinear, backend)
+        return _sample_kernels(
+            value,
+            uv,
+            weights=weights,
+            visible_cells=visible_cells,
+            offsets=offsets,
+            height=height,
+            width=width,
+            bilinear=bilinear,
+            backend=backend,
+        )
     return sample_kernels_reference(
         value.to(dtype),
         shape,
         uv=uv,
-        seen=seen,
+        visible_cells=visible_cells,
         weights=weights,
         offsets=offsets,
         bilinear=bilinear,

@@ -62,7 +62,7 @@ def sample_kernels_reference(
     value: Tensor,
     shape: tuple[int, int],
     uv: Tensor,
-    seen: Tensor,
+    visible_cells: Tensor,
     weights: Tensor,
     offsets: Tensor,
     bilinear: bool,
@@ -74,7 +74,7 @@ def sample_kernels_reference(
         shape: Rows h and columns w of a map.
         uv: Projection (x, y) of each cell for each head, [0, 1] over the map; finite for visible
             cells. (B, V, Q, heads, 2)
-        seen: Whether a cell is visible to a camera, bool. (B, V, Q)
+        visible_cells: Whether a cell is visible to a camera, bool. (B, V, Q)
         weights: Weights of the pixels. (B, Q, heads, S)
         offsets: Offsets (dx, dy) of the pixels from the projection, in pixels. (S, 2)
         bilinear: Interpolate between pixels instead of rounding to one.
@@ -83,7 +83,7 @@ def sample_kernels_reference(
         Sums. (B, Q, heads, C)
     """
     batch, views, num_pixels, heads, channels = value.shape
-    visible = seen.transpose(1, 2)[..., None, None]  # (B, Q, V, 1, 1)
+    visible = visible_cells.transpose(1, 2)[..., None, None]  # (B, Q, V, 1, 1)
     # Projections of invisible cells may have any value, also NaN.
     uv = torch.where(visible, uv.transpose(1, 2), 0.0)  # (B, Q, V, heads, 2)
     weights = weights[:, :, None] * visible  # (B, Q, V, heads, S)

@@ -62,7 +62,7 @@ def forward_kernel(
     value,
     uv,
     weights,
-    seen,
+    visible_cells,
     offsets,
     out,
     rows,
@@ -84,7 +84,7 @@ def forward_kernel(
         uv: Projection (x, y) of each cell for each head, [0, 1] over the map, float32.
             (B, V, Q, heads, 2)
         weights: Weights of the pixels, float32. (B, Q, heads, S)
-        seen: Whether a cell is visible to a camera, uint8. (B, V, Q)
+        visible_cells: Whether a cell is visible to a camera, uint8. (B, V, Q)
         offsets: Offsets (dx, dy) of the pixels from the projection, in pixels. (S, 2)
         out: Output for the sums, float32. (B, Q, heads, C)
         rows: Number of rows, B * Q * heads.
@@ -106,7 +106,7 @@ def forward_kernel(
     total = tl.zeros((ROWS, CP), dtype=tl.float32)
     for view in range(views):
         projection_index = (first_image + view) * queries + query
-        visible = tl.load(seen + projection_index, mask=valid, other=0) != 0
+        visible = tl.load(visible_cells + projection_index, mask=valid, other=0) != 0
         if tl.max(visible.to(tl.int32), axis=0) != 0:
             uv_offset = (projection_index * heads + head) * 2
             x = tl.load(uv + uv_offset, mask=visible, other=0.0) * width
@@ -158,7 +158,7 @@ def backward_kernel(
     value,
     uv,
     weights,
-    seen,
+    visible_cells,
     offsets,
     grad_value,
     grad_uv,
@@ -184,7 +184,7 @@ def backward_kernel(
         uv: Projection (x, y) of each cell for each head, [0, 1] over the map, float32.
             (B, V, Q, heads, 2)
         weights: Weights of the pixels, float32. (B, Q, heads, S)
-        seen: Whether a cell is visible to a camera, uint8. (B, V, Q)
+        visible_cells: Whether a cell is visible to a camera, uint8. (B, V, Q)
         offsets: Offsets (dx, dy) of the pixels from the projection, in pixels. (S, 2)
         grad_value: Output, float32, to which the gradient of the maps is added.
             (B, V, h * w, heads, C)
@@ -213,7 +213,7 @@ def backward_kernel(
     weight_grads = tl.zeros((ROWS, SP), dtype=tl.float32)
     for view in range(views):
         projection_index = (first_image + view) * queries + query
-        visible = tl.load(seen + projection_index, mask=valid, other=0) != 0
+        visible = tl.load(visible_cells + projection_index, mask=valid, other=0) != 0
         if tl.max(visible.to(tl.int32), axis=0) != 0:
             uv_offset = (projection_index * heads + head) * 2
             x = tl.load(uv + uv_offset, mask=visible, other=0.0) * width
@@ -289,7 +289,7 @@ def _plan_launch(value, weights):
     return rows, sizes, (triton.cdiv(rows, rows_per_program),)
 
 
-def sample_kernels(value, uv, weights, seen, offsets, height, width, bilinear):
+def sample_kernels(value, uv, weights, visible_cells, offsets, height, width, bilinear):
     """Sum weighted pixels around the projections of each BEV cell, over all cameras.
 
     Args:
@@ -297,7 +297,7 @@ def sample_kernels(value, uv, weights, seen, offsets, height, width, bilinear):
         uv: Projection (x, y) of each cell for each head, [0, 1] over the map, float32.
             (B, V, Q, heads, 2)
         weights: Weights of the pixels, float32. (B, Q, heads, S)
-        seen: Whether a cell is visible to a camera, bool. (B, V, Q)
+        visible_cells: Whether a cell is visible to a camera, bool. (B, V, Q)
         offsets: Offsets (dx, dy) of the pixels from the projection, in pixels. (S, 2)
         height: Rows h of a map.
         width: Columns w of a map.
@@ -316,7 +316,7 @@ def sample_kernels(value, uv, weights, seen, offsets, height, width, bilinear):
                 value.contiguous(),
                 uv.contiguous(),
                 weights=weights.contiguous(),
-                seen=seen.contiguous().view(torch.uint8),
+                visible_cells=visible_cells.contiguous().view(torch.uint8),
                 offsets=offsets.contiguous(),
                 out=out,
                 rows=rows,
@@ -332,7 +332,9 @@ def sample_kernels(value, uv, weights, seen, offsets, height, width, bilinear):
     return out
 
 
-def sample_kernels_backward(grads, value, uv, weights, seen, offsets, height, width, bilinear):
+def sample_kernels_backward(
+    grads, value, uv, weights, visible_cells, offsets, height, width, bilinear
+):
     """Compute the gradients of `sample_kernels`.
 
     Args:
@@ -341,7 +343,7 @@ def sample_kernels_backward(grads, value, uv, weights, seen, offsets, height, wi
         uv: Projection (x, y) of each cell for each head, [0, 1] over the map, float32.
             (B, V, Q, heads, 2)
         weights: Weights of the pixels, float32. (B, Q, heads, S)
-        seen: Whether a cell is visible to a camera, bool. (B, V, Q)
+        visible_cells: Whether a cell is visible to a camera, bool. (B, V, Q)
         offsets: Offsets (dx, dy) of the pixels from the projection, in pixels. (S, 2)
         height: Rows h of a map.
         width: Columns w of a map.
@@ -362,7 +364,7 @@ def sample_kernels_backward(grads, value, uv, weights, seen, offsets, height, wi
                 value.contiguous(),
                 uv=uv.contiguous(),
                 weights=weights.contiguous(),
-                seen=seen.contiguous().view(torch.uint8),
+                visible_cells=visible_cells.contiguous().view(torch.uint8),
                 offsets=offsets.contiguous(),
                 grad_value=grad_value,
                 grad_uv=grad_uv,

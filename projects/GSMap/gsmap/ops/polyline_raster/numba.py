@@ -25,7 +25,7 @@ INTEGER_FRAME = (-0.5, -0.5, 1.0, 1.0)  # the release samples pixel (row, col) a
 
 
 @njit(nogil=True, cache=True, fastmath=FASTMATH, error_model="numpy")
-def _visit_edge(start, end, index, frame, reach, eps, steps, distances, owners):
+def _visit_edge(start, end, index, frame, reach, eps, steps, distances, edge_indices):
     """Update the squared distances and nearest edges of pixels (H, W) by one edge."""
     x_min, y_min, step_x, step_y = frame
     height, width = distances.shape
@@ -56,7 +56,7 @@ def _visit_edge(start, end, index, frame, reach, eps, steps, distances, owners):
             right_x = min(right_x, crossing + half)
         left, right = pixel_range(left_x, right_x, origin=x_min, step=step_x, size=width)
         nearest = distances[row, left : max(left, right)]
-        owner = owners[row, left:right]
+        row_indices = edge_indices[row, left:right]
         first = np.float32(x_min + (left + 0.5) * step_x - x0)
         fy = np.float32(offset_y)
         for k in range(len(nearest)):
@@ -67,7 +67,7 @@ def _visit_edge(start, end, index, frame, reach, eps, steps, distances, owners):
             squared = dx * dx + dy * dy
             closer = squared < nearest[k]
             nearest[k] = squared if closer else nearest[k]
-            owner[k] = index if closer else owner[k]
+            row_indices[k] = index if closer else row_indices[k]
 
 
 @njit(nogil=True, cache=True)
@@ -101,22 +101,22 @@ def _buffers(shape):
     """Buffers of a thread: column indices, squared distances, nearest edges, inside."""
     steps = np.arange(shape[1]).astype(np.float32)
     distances = np.empty(shape, np.float32)
-    owners = np.empty(shape, np.int32)
+    edge_indices = np.empty(shape, np.int32)
     inside = np.empty(shape, np.uint8)
-    return steps, distances, owners, inside
+    return steps, distances, edge_indices, inside
 
 
 @njit(nogil=True, cache=True)
-def _survey(ring, closed, filled, frame, reach, eps, buffers):
+def _nearest_edges(ring, closed, filled, frame, reach, eps, buffers):
     """Compute squared distances, infinite beyond the reach, nearest edges and the inside if filled.
 
     Returns False, and leaves the buffers as they are, if a vertex is not finite.
     """
     if not np.isfinite(ring).all():
         return False
-    steps, distances, owners, inside = buffers
+    steps, distances, edge_indices, inside = buffers
     distances[:] = FAR
-    owners[:] = -1
+    edge_indices[:] = -1
     for i in range(len(ring) if closed else len(ring) - 1):
         j = i + 1 if i + 1 < len(ring) else 0
         _visit_edge(
@@ -128,7 +128,7 @@ def _survey(ring, closed, filled, frame, reach, eps, buffers):
             eps=eps,
             steps=steps,
             distances=distances,
-            owners=owners,
+            edge_indices=edge_indices,
         )
     if filled:
         _fill_inside(ring, frame, inside=inside)
@@ -136,13 +136,13 @@ def _survey(ring, closed, filled, frame, reach, eps, buffers):
 
 
 @njit(inline="always")
-def _measure(squared, nearest):
-    """D: the squared distance, or, if ``nearest`` > 0, the distance but at least ``nearest``."""
-    return max(math.sqrt(squared), nearest) if nearest > 0 else float(squared)
+def _clamped_distance(squared, min_distance):
+    """D: the squared distance; if ``min_distance`` > 0, the distance, but at least this value."""
+    return max(math.sqrt(squared), min_distance) if min_distance > 0 else float(squared)
 
 
 @njit(nogil=True, cache=True)
-def soft_forward(rings, polygons, reach, softness, nearest, masks, first, last):
+def soft_forward(rings, polygons, reach, softness, min_distance, masks, first, last):
     """Render the rings ``first`` to ``last - 1``: exp(-D / s), or sigmoid(+-D / s) for polygons.
 
     Args:
@@ -150,18 +150,18 @@ def soft_forward(rings, polygons, reach, softness, nearest, masks, first, last):
         polygons: Whether a ring is a polygon, bool. (N,)
         reach: Distance in pixels beyond which a mask is 0 or 1, of lines and of polygons. (2,)
         softness: Softness s of lines and of polygons, in the unit of D. (2,)
-        nearest: 0 if D is the squared distance to the nearest edge. Otherwise D is the distance,
-            and ``nearest`` its smallest value, at which it has no gradient.
+        min_distance: 0 if D is the squared distance to the nearest edge. Otherwise D is the
+            distance, and ``min_distance`` its smallest value, at which it has no gradient.
         masks: Output for the masks, float32; NaN for a ring with a vertex that is not finite.
             (N, H, W)
         first: First ring.
         last: One past the last ring.
     """
     buffers = _buffers(masks.shape[1:])
-    _, distances, owners, inside = buffers
+    _, distances, edge_indices, inside = buffers
     for n in range(first, last):
         kind = int(polygons[n])
-        is_finite = _survey(
+        is_finite = _nearest_edges(
             rings[n],
             closed=True,
             filled=kind,
@@ -176,19 +176,20 @@ def soft_forward(rings, polygons, reach, softness, nearest, masks, first, last):
         for row in range(masks.shape[1]):
             for col in range(masks.shape[2]):
                 fade = 0.0
-                if owners[row, col] >= 0:
-                    fade = math.exp(-_measure(distances[row, col], nearest) / softness[kind])
+                if edge_indices[row, col] >= 0:
+                    distance = _clamped_distance(distances[row, col], min_distance)
+                    fade = math.exp(-distance / softness[kind])
                 if kind:
                     fade = (1.0 if inside[row, col] else fade) / (1 + fade)
                 masks[n, row, col] = fade
 
 
 @njit(nogil=True, cache=True)
-def _scatter(ring, owner, x, y, weight, out):
+def _scatter(ring, edge_index, x, y, weight, out):
     """Add ``weight`` times the gradient of the squared distance to both ends of an edge."""
-    following = owner + 1 if owner + 1 < len(ring) else 0
-    x0 = float(ring[owner, 0])
-    y0 = float(ring[owner, 1])
+    following = edge_index + 1 if edge_index + 1 < len(ring) else 0
+    x0 = float(ring[edge_index, 0])
+    y0 = float(ring[edge_index, 1])
     ex = float(ring[following, 0]) - x0
     ey = float(ring[following, 1]) - y0
     fx = x - x0
@@ -204,12 +205,12 @@ def _scatter(ring, owner, x, y, weight, out):
     end_y = -2 * t * dy - slip * (fy - 2 * t * ey)
     out[following, 0] += weight * end_x
     out[following, 1] += weight * end_y
-    out[owner, 0] += weight * (slip * ex - 2 * dx - end_x)
-    out[owner, 1] += weight * (slip * ey - 2 * dy - end_y)
+    out[edge_index, 0] += weight * (slip * ex - 2 * dx - end_x)
+    out[edge_index, 1] += weight * (slip * ey - 2 * dy - end_y)
 
 
 @njit(nogil=True, cache=True)
-def soft_backward(rings, polygons, reach, softness, nearest, grads, out, first, last):
+def soft_backward(rings, polygons, reach, softness, min_distance, grads, out, first, last):
     """Compute the gradients of the rings ``first`` to ``last - 1``.
 
     Args:
@@ -217,7 +218,7 @@ def soft_backward(rings, polygons, reach, softness, nearest, grads, out, first, 
         polygons: Whether a ring is a polygon, bool. (N,)
         reach: Distance in pixels beyond which a mask is 0 or 1, of lines and of polygons. (2,)
         softness: Softness s of lines and of polygons, in the unit of D. (2,)
-        nearest: 0 for squared distances, otherwise the smallest distance, see `soft_forward`.
+        min_distance: 0 for squared distances, otherwise the smallest distance, see `soft_forward`.
         grads: Gradient of the masks, float32. (N, H, W)
         out: Output for the gradient of the rings, float64; NaN for a ring with a vertex that is not
             finite. (N, V, 2)
@@ -225,12 +226,12 @@ def soft_backward(rings, polygons, reach, softness, nearest, grads, out, first, 
         last: One past the last ring.
     """
     buffers = _buffers(grads.shape[1:])
-    _, distances, owners, inside = buffers
+    _, distances, edge_indices, inside = buffers
     for n in range(first, last):
         ring = rings[n]
         kind = int(polygons[n])
         out[n] = 0
-        is_finite = _survey(
+        is_finite = _nearest_edges(
             ring,
             closed=True,
             filled=kind,
@@ -244,17 +245,17 @@ def soft_backward(rings, polygons, reach, softness, nearest, grads, out, first, 
             continue
         for row in range(grads.shape[1]):
             for col in range(grads.shape[2]):
-                if owners[row, col] < 0 or grads[n, row, col] == 0:
+                if edge_indices[row, col] < 0 or grads[n, row, col] == 0:
                     continue
-                distance = _measure(distances[row, col], nearest)
+                distance = _clamped_distance(distances[row, col], min_distance)
                 fade = math.exp(-distance / softness[kind])
                 slope = -fade
                 if kind:
                     slope = (1.0 if inside[row, col] else -1.0) * fade / (1 + fade) ** 2
                 weight = grads[n, row, col] * slope / softness[kind]
-                if nearest > 0:
-                    weight *= 0.5 / distance if distance > nearest else 0.0
-                _scatter(ring, owners[row, col], x=col, y=row, weight=weight, out=out[n])
+                if min_distance > 0:
+                    weight *= 0.5 / distance if distance > min_distance else 0.0
+                _scatter(ring, edge_indices[row, col], x=col, y=row, weight=weight, out=out[n])
 
 
 @njit(nogil=True, cache=True)
@@ -277,7 +278,7 @@ def draw(polylines, filled, frame, half_width, pixel, masks, first, last):
     for n in range(first, last):
         kind = filled[n]
         reach = pixel if kind else half_width + pixel
-        is_finite = _survey(
+        is_finite = _nearest_edges(
             polylines[n],
             closed=kind,
             filled=kind,
@@ -325,9 +326,11 @@ def soft_rasters(rings, is_polygon, height, width, softness, plain):
     """
     masks = torch.empty(len(rings), height, width, dtype=torch.float32)
     reach = _reach(softness, plain)
-    nearest = DISTANCE_EPS if plain else 0.0
+    min_distance = DISTANCE_EPS if plain else 0.0
     pixels = height * width
-    run_in_threads(soft_forward, pixels, rings, is_polygon, reach, tuple(softness), nearest, masks)
+    run_in_threads(
+        soft_forward, pixels, rings, is_polygon, reach, tuple(softness), min_distance, masks
+    )
     return masks
 
 
@@ -348,10 +351,10 @@ def soft_rasters_backward(grads, rings, is_polygon, height, width, softness, pla
     """
     out = torch.empty(rings.shape, dtype=torch.float64)
     reach = _reach(softness, plain)
-    nearest = DISTANCE_EPS if plain else 0.0
+    min_distance = DISTANCE_EPS if plain else 0.0
     pixels = height * width
     run_in_threads(
-        soft_backward, pixels, rings, is_polygon, reach, tuple(softness), nearest, grads, out
+        soft_backward, pixels, rings, is_polygon, reach, tuple(softness), min_distance, grads, out
     )
     return (out.float(),)
 

@@ -22,15 +22,15 @@ def _edge_distances(pixels: Tensor, starts: Tensor, ends: Tensor, eps: float = 0
     shape = (len(starts), *pixels.shape[:2])
     with torch.no_grad():
         nearest = pixels.new_full(shape, torch.inf)
-        owner = torch.zeros(shape, dtype=torch.long, device=pixels.device)
+        edge_index = torch.zeros(shape, dtype=torch.long, device=pixels.device)
         for first, start, end in _edge_blocks(shape, starts, ends=ends):
             squared, index = _segment_distance(pixels, start, end=end, eps=eps).min(1)
             closer = squared < nearest
             nearest = torch.where(closer, squared, nearest)
-            owner = torch.where(closer, index + first, owner)
-        owner = owner.flatten(1)[..., None].expand(-1, -1, 2)  # (K, HW, 2)
-    start = starts.gather(1, owner).reshape((*shape, 2))
-    end = ends.gather(1, owner).reshape((*shape, 2))
+            edge_index = torch.where(closer, index + first, edge_index)
+        point_index = edge_index.flatten(1)[..., None].expand(-1, -1, 2)  # (K, HW, 2)
+    start = starts.gather(1, point_index).reshape((*shape, 2))
+    end = ends.gather(1, point_index).reshape((*shape, 2))
     return _segment_distance(pixels, start, end=end, eps=eps)
 
 

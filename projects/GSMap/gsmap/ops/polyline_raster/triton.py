@@ -50,13 +50,13 @@ def _ends(ring, edge, count):
 
 
 @triton.jit
-def _survey(ring, edges, count, x, y, eps, TILE: tl.constexpr):
+def _nearest_edges(ring, edges, count, x, y, eps, TILE: tl.constexpr):
     """Squared distances to the nearest edges, their indices, the inside, and a term for NaN.
 
     The term is added to the mask: it is NaN if a vertex is not finite, otherwise zero.
     """
     nearest = tl.full((TILE, TILE), float("inf"), dtype=tl.float32)
-    owner = tl.full((TILE, TILE), 0, dtype=tl.int32)
+    edge_index = tl.full((TILE, TILE), 0, dtype=tl.int32)
     inside = tl.full((TILE, TILE), 0, dtype=tl.int32)
     poison = 0.0
     for edge in range(edges):
@@ -72,18 +72,18 @@ def _survey(ring, edges, count, x, y, eps, TILE: tl.constexpr):
         squared = dx * dx + dy * dy
         closer = squared < nearest
         nearest = tl.where(closer, squared, nearest)
-        owner = tl.where(closer, edge, owner)
+        edge_index = tl.where(closer, edge, edge_index)
         straddles = (offset_y < 0) != (offset_y < edge_y)
         rise = tl.where(edge_y == 0, 1.0, edge_y)
         inside ^= (straddles & (offset_x < edge_x * offset_y / rise)).to(tl.int32)
-    return nearest, owner, inside != 0, poison
+    return nearest, edge_index, inside != 0, poison
 
 
 @triton.jit
-def _distance(squared, nearest, PLAIN: tl.constexpr):
-    """D: the squared distance or, if ``PLAIN``, the distance but at least ``nearest``."""
+def _distance(squared, min_distance, PLAIN: tl.constexpr):
+    """D: the squared distance or, if ``PLAIN``, the distance but at least ``min_distance``."""
     if PLAIN:
-        squared = tl.maximum(tl.sqrt(squared), nearest)
+        squared = tl.maximum(tl.sqrt(squared), min_distance)
     return squared
 
 
@@ -97,7 +97,7 @@ def soft_forward_kernel(
     width,
     line_softness,
     polygon_softness,
-    nearest,
+    min_distance,
     PLAIN: tl.constexpr,
     TILE: tl.constexpr,
 ):
@@ -112,18 +112,18 @@ def soft_forward_kernel(
         width: Columns W of the raster.
         line_softness: Softness s of lines, in the unit of D.
         polygon_softness: Softness s of polygons, in the unit of D.
-        nearest: Smallest distance of a pixel from an edge, in pixels.
+        min_distance: Smallest distance of a pixel from an edge, in pixels.
         PLAIN: Whether D is the distance to the nearest edge instead of its square.
         TILE: Side of a tile in pixels.
     """
     n = tl.program_id(1).to(tl.int64)
     x, y, index, valid = _tile_pixels(height, width, TILE=TILE)
-    squared, _, inside, poison = _survey(
+    squared, _, inside, poison = _nearest_edges(
         rings + n * count * 2, count, count=count, x=x, y=y, eps=EPS, TILE=TILE
     )
     filled = tl.load(polygons + n) != 0
     softness = tl.where(filled, polygon_softness, line_softness)
-    fade = tl.exp(-_distance(squared, nearest, PLAIN=PLAIN) / softness)
+    fade = tl.exp(-_distance(squared, min_distance, PLAIN=PLAIN) / softness)
     area = tl.where(inside, 1.0, fade) / (1 + fade)
     mask = tl.where(filled, area, fade) + poison
     tl.store(masks + n * height * width + index, mask, mask=valid)
@@ -146,7 +146,7 @@ def soft_backward_kernel(
     width,
     line_softness,
     polygon_softness,
-    nearest,
+    min_distance,
     PLAIN: tl.constexpr,
     TILE: tl.constexpr,
 ):
@@ -163,26 +163,28 @@ def soft_backward_kernel(
         width: Columns W of the raster.
         line_softness: Softness s of lines, in the unit of D.
         polygon_softness: Softness s of polygons, in the unit of D.
-        nearest: Smallest distance of a pixel from an edge, in pixels.
+        min_distance: Smallest distance of a pixel from an edge, in pixels.
         PLAIN: Whether D is the distance to the nearest edge instead of its square.
         TILE: Side of a tile in pixels.
     """
     n = tl.program_id(1).to(tl.int64)
     x, y, index, valid = _tile_pixels(height, width, TILE=TILE)
     ring = rings + n * count * 2
-    squared, owner, inside, _ = _survey(ring, count, count=count, x=x, y=y, eps=EPS, TILE=TILE)
+    squared, edge_index, inside, _ = _nearest_edges(
+        ring, count, count=count, x=x, y=y, eps=EPS, TILE=TILE
+    )
     filled = tl.load(polygons + n) != 0
     softness = tl.where(filled, polygon_softness, line_softness)
-    distance = _distance(squared, nearest, PLAIN=PLAIN)
+    distance = _distance(squared, min_distance, PLAIN=PLAIN)
     fade = tl.exp(-distance / softness)
     area = tl.where(inside, fade, -fade) / ((1 + fade) * (1 + fade))
     grad = tl.load(grads + n * height * width + index, mask=valid, other=0.0)
     weight = grad * tl.where(filled, area, -fade) / softness  # gradient of D
     if PLAIN:
-        weight *= tl.where(distance > nearest, 0.5 / distance, 0.0)  # of D squared
+        weight *= tl.where(distance > min_distance, 0.5 / distance, 0.0)  # of D squared
     out = sums + (n * tl.num_programs(0) + tl.program_id(0)) * count * 4
     for first in range(0, count, CHUNK):
-        bit = owner - first
+        bit = edge_index - first
         in_chunk = (weight != 0) & (bit >= 0) & (bit < CHUNK)
         pixel_bits = tl.where(in_chunk, 1 << tl.where(in_chunk, bit, 0), 0)
         row_bits = tl.reduce(pixel_bits, 1, combine_fn=_or)
@@ -202,7 +204,7 @@ def soft_backward_kernel(
             # the ends. Computed from (dx, dy) instead of EPS, the slip also covers rounding.
             between = (along >= 0) & (along <= 1)
             slip = tl.where(between, 2 * (dx * edge_x + dy * edge_y) / length2, 0.0)
-            share = tl.where(owner == edge, weight, 0.0)
+            share = tl.where(edge_index == edge, weight, 0.0)
             end_x = -2 * t * dx - slip * (offset_x - 2 * t * edge_x)
             end_y = -2 * t * dy - slip * (offset_y - 2 * t * edge_y)
             tl.store(out + edge * 4, tl.sum(share * (slip * edge_x - 2 * dx - end_x)))
@@ -250,7 +252,7 @@ def draw_kernel(
     x = x_min + (cols + 0.5) * step_x
     y = y_min + (rows + 0.5) * step_y
     closed = (tl.load(filled + n) != 0).to(tl.int32)
-    squared, _, inside, poison = _survey(
+    squared, _, inside, poison = _nearest_edges(
         polylines + n * count * 2, count - 1 + closed, count=count, x=x, y=y, eps=0.0, TILE=TILE
     )
     distance = tl.sqrt(squared)
@@ -294,7 +296,7 @@ def soft_rasters(rings, is_polygon, height, width, softness, plain):
             width=width,
             line_softness=line_softness,
             polygon_softness=polygon_softness,
-            nearest=DISTANCE_EPS,
+            min_distance=DISTANCE_EPS,
             PLAIN=plain,
             TILE=TILE,
             **OPTIONS,
@@ -335,7 +337,7 @@ def soft_rasters_backward(grads, rings, is_polygon, height, width, softness, pla
             width=width,
             line_softness=line_softness,
             polygon_softness=polygon_softness,
-            nearest=DISTANCE_EPS,
+            min_distance=DISTANCE_EPS,
             PLAIN=plain,
             TILE=TILE,
             **OPTIONS,

@@ -19,13 +19,13 @@ import torch
 from numba import njit
 
 from gsmap.ops._numba import FASTMATH, run_in_threads
-from gsmap.ops.raster_loss.reference import SEEN, SSIM_C1, SSIM_C2
+from gsmap.ops.raster_loss.reference import MIN_COVERAGE, SSIM_C1, SSIM_C2
 
 ONE = np.float32(1)
 TWO = np.float32(2)
 C1 = np.float32(SSIM_C1)
 C2 = np.float32(SSIM_C2)
-SEEN_FLOAT32 = np.float32(SEEN)
+COVERAGE = np.float32(MIN_COVERAGE)
 TAPS = 6  # taps of the window that are added at a time, without a detour through memory
 
 
@@ -138,7 +138,7 @@ def _dissimilarity(maps, pixels):
         )
         total += ONE - (top_mean * top_cov) / (low_mean * low_var)
         near_target += 1.0 if t > 0 else 0.0
-        near_either += 1.0 if max(p, t) > SEEN_FLOAT32 else 0.0
+        near_either += 1.0 if max(p, t) > COVERAGE else 0.0
     return total, near_target, near_either
 
 
@@ -182,7 +182,7 @@ def _fill_products(pred, target, weight, out):
 
 
 @njit(nogil=True, cache=True)
-def _survey(preds, targets, weight, radius, products, spans, sums):
+def _prepare_instance(preds, targets, weight, radius, products, spans, sums):
     """Compute the spans and products of an instance, and the sums that need no window."""
     _find_spans(preds, targets, radius=radius, spans=spans)
     products[:] = 0
@@ -230,7 +230,7 @@ def loss_forward(preds, targets, window, radius, weight, results, first, last):
     """
     products, _, line, maps, spans = _buffers(preds.shape[1:], len(window))
     for n in range(first, last):
-        _survey(
+        _prepare_instance(
             preds[n],
             targets[n],
             weight=weight,
@@ -279,7 +279,7 @@ def loss_backward(preds, targets, window, radius, weight, factors, grads, first,
     unused = np.zeros(7)
     for n in range(first, last):
         grads[n] = factors[n, 1]  # outside the spans w is 1 and only the sum of w p depends on p
-        _survey(
+        _prepare_instance(
             preds[n],
             targets[n],
             weight=weight,

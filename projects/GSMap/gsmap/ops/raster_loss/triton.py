@@ -15,7 +15,7 @@ import torch
 import triton
 import triton.language as tl
 
-from gsmap.ops.raster_loss.reference import SEEN, SSIM_C1, SSIM_C2
+from gsmap.ops.raster_loss.reference import MIN_COVERAGE, SSIM_C1, SSIM_C2
 
 BLOCK = 256
 OPTIONS = {"num_warps": 4, "enable_fp_fusion": True}
@@ -23,7 +23,7 @@ OPTIONS = {"num_warps": 4, "enable_fp_fusion": True}
 EXACT_OPTIONS = {**OPTIONS, "enable_fp_fusion": False}
 C1 = tl.constexpr(SSIM_C1)
 C2 = tl.constexpr(SSIM_C2)
-SEEN_MEAN = tl.constexpr(SEEN)
+COVERAGE = tl.constexpr(MIN_COVERAGE)
 
 
 @triton.jit
@@ -154,7 +154,7 @@ def sums_kernel(
     tl.store(out + 3, tl.sum((1 + excess) * t))
     tl.store(out + 4, tl.sum(excess))
     tl.store(out + 5, tl.sum((ok & (mean_t > 0)).to(tl.float32)))
-    either = (mean_p > SEEN_MEAN) | (mean_t > SEEN_MEAN)
+    either = (mean_p > COVERAGE) | (mean_t > COVERAGE)
     tl.store(out + 6, tl.sum((ok & either).to(tl.float32)))
 
 

@@ -50,7 +50,7 @@ def pairwise_soft_iou(preds: Tensor, targets: Tensor, backend: str = "auto") -> 
         minima = pairwise_minima_reference(preds, targets)
     else:
         minima = _pairwise_minima(preds.detach(), targets.detach(), backend)
-    return _iou(minima, preds.sum(-1)[:, None], targets=targets.sum(-1))
+    return _iou(minima, preds.sum(-1)[:, None], target_sums=targets.sum(-1))
 
 
 def soft_iou(preds: Tensor, targets: Tensor) -> Tensor:
@@ -64,12 +64,12 @@ def soft_iou(preds: Tensor, targets: Tensor) -> Tensor:
         Soft IoU in [0, 1]. (M,)
     """
     minima = torch.minimum(preds, targets).sum((1, 2))
-    return _iou(minima, preds.sum((1, 2)), targets=targets.sum((1, 2)))
+    return _iou(minima, preds.sum((1, 2)), target_sums=targets.sum((1, 2)))
 
 
-def _iou(minima: Tensor, preds: Tensor, targets: Tensor) -> Tensor:
+def _iou(minima: Tensor, pred_sums: Tensor, target_sums: Tensor) -> Tensor:
     """Soft IoU from the sums of minima and of both masks; 0 for empty masks."""
-    maxima = preds + targets - minima  # since min(a, b) + max(a, b) = a + b
+    maxima = pred_sums + target_sums - minima  # since min(a, b) + max(a, b) = a + b
     return minima / (maxima + _EPS)
 
 
