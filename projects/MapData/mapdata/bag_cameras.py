@@ -10,9 +10,10 @@ from gsmap.utils.errors import InputError
 from mapdata.bag_images import image_size, trouble_with
 from mapdata.folders.rig import RigCamera
 
+# Words of a topic whose images are rectified, and words that negate the word after them.
 _RECTIFIED = ("rect", "rectified")
 _NOT = ("un", "non", "not", "no")
-_MOST_SIZES = 5
+_MOST_SIZES = 5  # number of images whose size is read
 
 
 @dataclass

@@ -19,8 +19,10 @@ from mapdata.ros_bag import library_errors
 
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-_AFTER_STAMP = 12  # bytes of a message of ROS up to the end of its stamp
-_RULES = b"2"  # version of the rules for making images, so that images of others are not reused
+_STAMP_END = 12  # index of the first byte after the stamp of a camera info, in ROS 1 and 2
+# Version of the rules for making images, a part of the digest: images that were made by another
+# version are made again.
+_RULES = b"2"
 
 
 @dataclass
@@ -200,14 +202,14 @@ def read_content(bag: Bag, topics: Mapping[str, tuple[str, str]]) -> BagContent:
         if info_topic:
             image_topics_of[info_topic].append(image_topic)
     connections = _readable_connections(bag, topics=topics, content=content)
-    known_infos: dict[str, bytes] = {}
+    known_infos: dict[str, bytes] = {}  # content of the stored camera info without its stamp
     for connection, recorded_ns, raw in read_messages(bag, connections):
         topic = connection.topic
         kind = connection.msgtype
         content.digest.update(f"{topic} {kind} {len(raw)}\n".encode())
         content.digest.update(raw)
-        if topic in known_infos and raw[_AFTER_STAMP:] == known_infos[topic]:
-            continue  # the stored camera info once more
+        if topic in known_infos and raw[_STAMP_END:] == known_infos[topic]:
+            continue  # it repeats the stored camera info
         try:
             with explain_errors(f"the message at {recorded_ns} ns", "it is damaged"):
                 with library_errors():
@@ -215,7 +217,7 @@ def read_content(bag: Bag, topics: Mapping[str, tuple[str, str]]) -> BagContent:
                 if topic in image_topics_of:
                     for image_topic in image_topics_of[topic]:
                         if content.add_info(image_topic, message):
-                            known_infos[topic] = bytes(raw[_AFTER_STAMP:])
+                            known_infos[topic] = bytes(raw[_STAMP_END:])
                 else:
                     content.add(message, topic, kind=kind, recorded_ns=recorded_ns)
         except ValueError as error:

@@ -15,7 +15,7 @@ from mapdata.ros_bag import RosBag
 Bag = RosBag | McapBag
 SUFFIXES = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"
-_MOST_BYTES = 300_000  # of metadata; YAML takes some milliseconds for a thousand bytes
+_MOST_BYTES = 300_000  # largest metadata; YAML takes some milliseconds for a thousand bytes
 _ALIAS = re.compile(r"(^|[\s\[{,:-])\*\w", flags=re.MULTILINE)
 _PACKED = (".zstd", ".zst", ".lz4", ".gz", ".bz2", ".xz", ".zip", ".tar")
 _STARTS = {".mcap": MAGIC, ".db3": b"SQLite format 3\0", ".bag": b"#ROSBAG V2.0"}

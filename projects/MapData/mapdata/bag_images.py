@@ -13,19 +13,22 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.files import write_bytes
 from mapdata.folders.rig import RigCamera
 
+# OpenCV's code of the conversion to BGR, by ROS' name of the encoding; None needs no conversion.
 _TO_BGR: dict[str, int | None] = {
     "bgr8": None, "8UC3": None, "rgb8": cv2.COLOR_RGB2BGR, "rgba8": cv2.COLOR_RGBA2BGR,
     "bgra8": cv2.COLOR_BGRA2BGR, "mono8": cv2.COLOR_GRAY2BGR, "8UC1": cv2.COLOR_GRAY2BGR,
-    # OpenCV names a pattern by its second row
+    # ROS names a Bayer pattern by its first two rows, OpenCV by the second and third pixel of
+    # the second row.
     "bayer_rggb8": cv2.COLOR_BayerBG2BGR, "bayer_bggr8": cv2.COLOR_BayerRG2BGR,
     "bayer_gbrg8": cv2.COLOR_BayerGR2BGR, "bayer_grbg8": cv2.COLOR_BayerGB2BGR,
     "yuv422_yuy2": cv2.COLOR_YUV2BGR_YUYV, "yuyv": cv2.COLOR_YUV2BGR_YUYV,
     "yuv422": cv2.COLOR_YUV2BGR_UYVY, "uyvy": cv2.COLOR_YUV2BGR_UYVY,
 }  # fmt: skip
-_CHANNELS = {
+_CHANNELS = {  # bytes of a pixel, by encoding; 1 for any other
     "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4,
     "yuv422_yuy2": 2, "yuyv": 2, "yuv422": 2, "uyvy": 2,
 }  # fmt: skip
+# Formats of compressed messages that are no pictures.
 _DEPTHS = ("16UC1", "32FC1")
 _VIDEO = ("h264", "h265", "hevc", "av1", "vp8", "vp9", "theora", "ffmpeg")
 

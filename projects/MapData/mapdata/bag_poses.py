@@ -12,7 +12,7 @@ from mapdata.folders.rig import PoseTrack
 
 VEHICLE_FRAMES = ("base_footprint", "base_link")
 _GAP_NS = 10**9  # longest gap between two poses in which the pose is interpolated
-_FOREVER_NS = 10**20
+_FOREVER_NS = 10**20  # gap of a static transform, longer than any recording
 _SELDOM_NS = 500_000_000  # if the average step is longer, a transform holds until the next one
 _STILL_M = 1e-3  # smaller changes of a pose do not count as a motion
 _STILL_JUMP_M = 0.1  # smaller distances of successive poses do not count as jumps

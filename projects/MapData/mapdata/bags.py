@@ -89,8 +89,8 @@ def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
         if not images:
             images = image_topics(kinds)
         topics = {}
-        for camera, place in calibrated_cameras:
-            topic = _topic_of(camera.name, place, images=images, kinds=kinds)
+        for camera, images_setting in calibrated_cameras:
+            topic = _topic_of(camera.name, images_setting, images=images, kinds=kinds)
             topics[camera.name] = (topic, "")
         content = read_content(bag, topics)
         for name, pair in topics.items():
@@ -152,9 +152,18 @@ def _sampling_camera(names: Sequence[str]) -> str:
     return names[0]
 
 
-def _topic_of(name: str, place: str, images: Mapping[str, str], kinds: Mapping[str, str]) -> str:
-    """Topic of a calibrated camera's images: named by its calibration, or found by its name."""
-    topic = place if place in kinds else images.get(name)
+def _topic_of(
+    name: str, images_setting: str, images: Mapping[str, str], kinds: Mapping[str, str]
+) -> str:
+    """Topic of a calibrated camera's images: named by its calibration, or found by its name.
+
+    Args:
+        name: Name of the camera.
+        images_setting: Its setting ``images`` in the calibration file, a topic or anything else.
+        images: Topics of images, by camera.
+        kinds: Type of the messages, by topic.
+    """
+    topic = images_setting if images_setting in kinds else images.get(name)
     if topic is None:
         raise InputError(
             f"camera {name!r} of the calibration has no images: the bag's are {sorted(images)}; "

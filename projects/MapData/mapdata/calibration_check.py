@@ -19,8 +19,8 @@ from gsmap.visualization.camera_view import camera_views
 from gsmap.visualization.figure import compose_figure
 from gsmap.visualization.style import MapStyle
 
-_REACH_M = 30.0  # of the ground lines, ahead of and behind the vehicle
-_SIDE_REACH_M = 15.0  # to the left and right of it
+_REACH_M = 30.0  # length of the ground lines ahead of and behind the vehicle
+_SIDE_REACH_M = 15.0  # length of the ground lines to its left and right
 _WEDGE_M = 6.0  # length of a field of view in the panel from above
 _WIDTH_PX = 3200  # six cameras of about 750 px, large enough to see an error of a few centimetres
 # Classes of the drawn lines; "cameras" are the fields of view. The order decides the colours.

@@ -154,10 +154,10 @@ def add_log_options(parser: argparse.ArgumentParser, usual_rate: str) -> None:
     add = parser.add_argument
     add("--root", type=Path, required=True, help="folder that holds train, val and test")
     add("--split", default="val", choices=("train", "val", "test"))
-    which = "only these (ids, or their first characters)"
-    add("--logs", nargs="+", default=(), metavar="LOG", help=which)
-    rate = f"samples or pictures per second, such as 2.5hz, or all (default: {usual_rate})"
-    add("--rate", type=parse_rate, default=argparse.SUPPRESS, dest="rate_hz", help=rate)
+    logs_help = "only these (ids, or their first characters)"
+    add("--logs", nargs="+", default=(), metavar="LOG", help=logs_help)
+    rate_help = f"samples or pictures per second, such as 2.5hz, or all (default: {usual_rate})"
+    add("--rate", type=parse_rate, default=argparse.SUPPRESS, dest="rate_hz", help=rate_help)
 
 
 def parse_rate(text: str) -> float | None:

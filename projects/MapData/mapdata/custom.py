@@ -40,11 +40,11 @@ _UNKNOWN_ROAD = (
     "%s does not say how high the road is in the frame 'ego': pictures and inference will take it "
     "to be 0.31 m below the origin (Argoverse 2's axle); AnnotationMeta(ground_z_m=...) says it."
 )
-_LOST = (
+_ALL_ELEMENTS_LOST = (
     "%d of %d records lose all of their elements (the first is %r), as none lies in x_range and "
     "y_range: points must be in metres of the frame, not of the world, and not in millimetres."
 )
-_MEETING_M = 0.1  # ends of lines within this distance are one place
+_SAME_PLACE_M = 0.1  # ends of lines within this distance are one place
 _GLOBAL = "global_instances"
 _KEYS = sorted([*(field.name for field in fields(MapSample)), _GLOBAL])
 Record = TypeVar("Record")
@@ -144,7 +144,7 @@ def _samples(
             _LOGGER.warning(_UNMOUNTED, sample.token, height_m)
         yield sample
     if empty_tokens:
-        _LOGGER.warning(_LOST, len(empty_tokens), count, empty_tokens[0])
+        _LOGGER.warning(_ALL_ELEMENTS_LOST, len(empty_tokens), count, empty_tokens[0])
 
 
 def _clip_elements(
@@ -207,7 +207,7 @@ def _snap_ends(lines: Sequence[Points]) -> None:
 def _nearby_place(places: Sequence[np.ndarray], point: np.ndarray) -> np.ndarray | None:
     """First place that meets a point in the plane. (dim,)"""
     for place in places:
-        if np.linalg.norm(place[:2] - point[:2]) <= _MEETING_M:
+        if np.linalg.norm(place[:2] - point[:2]) <= _SAME_PLACE_M:
             return place
     return None
 

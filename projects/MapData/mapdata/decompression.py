@@ -14,8 +14,9 @@ from typing import Any, ClassVar
 from gsmap.utils.errors import InputError
 from gsmap.utils.extras import import_extra
 
-FREE_BYTES = 1 << 26  # may be decompressed from any bag
-TIMES = 100  # further bytes for each compressed byte
+# Number of bytes that any bag may become, and of further bytes for each of its compressed bytes.
+FREE_BYTES = 1 << 26
+TIMES = 100
 _DECOMPRESSING = {  # modules that decompress, by the module that is imported
     "rosbags.rosbag1": ("rosbags.rosbag1.reader",),
     "rosbags.rosbag2": ("rosbags.rosbag2.reader", "rosbags.rosbag2.storage_mcap"),
@@ -25,7 +26,7 @@ _DECOMPRESSING = {  # modules that decompress, by the module that is imported
 
 
 class _Bag:
-    """Number of bytes read from the current bag."""
+    """Number of compressed (packed) and decompressed (unpacked) bytes of the current bag."""
 
     packed: ClassVar[int] = 0
     unpacked: ClassVar[int] = 0

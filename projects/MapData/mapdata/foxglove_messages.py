@@ -28,6 +28,7 @@ def foxglove_parser(name: str, descriptors: bytes) -> Callable[[bytes], Any]:
 
 
 def _header(message: Any) -> Any:
+    """Header of ROS with the time and the frame of a message of Foxglove."""
     stamp = SimpleNamespace(sec=message.timestamp.seconds, nanosec=message.timestamp.nanos)
     return SimpleNamespace(stamp=stamp, frame_id=getattr(message, "frame_id", ""))
 
@@ -62,6 +63,7 @@ def _camera_info(message: Any) -> Any:
 
 
 def _transforms(message: Any) -> Any:
+    """Convert a message with one transform or a list of transforms."""
     items = message.transforms if hasattr(message, "transforms") else [message]
     return SimpleNamespace(transforms=[_transform(item) for item in items])
 
@@ -73,6 +75,7 @@ def _transform(item: Any) -> Any:
     return SimpleNamespace(header=header, child_frame_id=item.child_frame_id, transform=transform)
 
 
+# ROS' type of a message and the function that converts it, by Foxglove's type.
 _KINDS: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "foxglove.CompressedImage": ("sensor_msgs/msg/CompressedImage", _compressed_image),
     "foxglove.RawImage": ("sensor_msgs/msg/Image", _raw_image),

@@ -10,7 +10,7 @@ import shapely
 from gsmap.structures.polylines import Points, clip_to_box
 from gsmap.utils.errors import InputError
 
-# shapely type ids
+# Kinds of geometries, as numbered by ``shapely.get_type_id``.
 LINE = 1
 POLYGON = 3
 COLLECTION = 7

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from gsmap.datasets.annotations.record import MapSample
 
-_EXAMPLES = 3
+_EXAMPLES = 3  # number of places that the summary names for each reason
 
 
 @dataclass

@@ -27,11 +27,11 @@ MAX_LIDAR_OFFSET_NS = int(SynchronizationDB.MAX_LIDAR_ANYCAM_TIMESTAMP_DIFF)  # 
 
 POSE_TABLE = "city_SE3_egovehicle.feather"
 
-# logs with an unusable map or unusable sensor data
+# Logs with an unusable map or unusable sensor data.
 BROKEN_LOGS = (
     "01bb304d-7bd8-35f8-bbef-7086b688e35e", "453e5558-6363-38e3-bf9b-42b5ba0a6f1d",
 )  # fmt: skip
-# logs whose map was changed on purpose, as listed by Argoverse 2
+# Logs whose map was changed on purpose, as listed by Argoverse 2.
 MAP_CHANGE_LOGS = (
     "75e8adad-50a6-3245-8726-5e612db3d165", "54bc6dbc-ebfb-3fba-b5b3-57f88b4b79ca",
     "af170aac-8465-3d7b-82c5-64147e94af7d", "6e106cf8-f6dd-38f6-89c8-9be7a71e7275",
@@ -112,9 +112,7 @@ class Argoverse2Log:
         cameras = {}
         with explain_errors(folder, "download the log again"):
             intrinsics = _read_feather(intrinsics_path)
-            _read_feather(
-                extrinsics_path
-            )  # for its validation only; av2 reads the table without one
+            _read_feather(extrinsics_path)  # only to validate it: av2 reads it without validation
             calibrated_names = set(intrinsics["sensor_name"])
             for name in RING_CAMERAS:
                 if name in calibrated_names:

@@ -5,8 +5,8 @@ import shapely
 
 from mapdata.local_map import POLYGON, LocalPatch
 
-DUPLICATE_IOU = 0.9
-DUPLICATE_BUFFER_M = 1.0
+DUPLICATE_IOU = 0.9  # smallest IoU of the strips around two lines that are duplicates
+DUPLICATE_BUFFER_M = 1.0  # half the width of these strips
 
 
 def clip_lines(lines: np.ndarray, patch: LocalPatch) -> np.ndarray:
@@ -57,7 +57,7 @@ def drop_duplicates(lines: np.ndarray) -> np.ndarray:
     area = shapely.area(strips)
     first, second = _possible_duplicates(shapely.bounds(strips), area)
     keep = np.ones(len(lines), dtype=bool)
-    # the pairs of line i are starts[i] to starts[i + 1]
+    # The pairs whose first strip is i have the indices starts[i] to starts[i + 1] - 1.
     starts = np.searchsorted(first, np.arange(len(lines) + 1))
     for i in np.flatnonzero(np.diff(starts)).tolist():
         if not keep[i]:

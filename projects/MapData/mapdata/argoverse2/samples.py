@@ -29,8 +29,8 @@ from mapdata.argoverse2.log import (
 from mapdata.argoverse2.map import Argoverse2Map, check_rules, find_map
 from mapdata.command_line import FileOptions
 
-THIN_OVER = ("log", "split")
-_NEEDS_NONE = "`create_data.py av2 --at poses:10` needs none"
+THIN_OVER = ("log", "split")  # values of the option ``thin_over``
+_NEEDS_NONE = "`create_data.py av2 --at poses:10` needs none"  # hint on missing sensor data
 
 
 @dataclass(frozen=True)

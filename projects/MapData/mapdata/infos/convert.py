@@ -40,8 +40,8 @@ from mapdata.summary import ConversionSummary
 from mapdata.unix_times import in_nanoseconds
 
 NUSCENES_SIZE = (1600, 900)  # width and height of the images in pixels
-_RING_SIZE = (2048, 1550)  # of Argoverse 2
-_RING_FRONT_SIZE = (1550, 2048)  # of Argoverse 2's upright front camera
+_RING_SIZE = (2048, 1550)  # the same for Argoverse 2
+_RING_FRONT_SIZE = (1550, 2048)  # the same for Argoverse 2's upright front camera
 _NEEDED = {
     "lidar": "token, timestamp, lidar_path, lidar2ego_* and ego2global_* (translation, rotation), "
     "and cams with data_path, cam_intrinsic and sensor2lidar_*",

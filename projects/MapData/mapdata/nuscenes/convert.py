@@ -122,16 +122,16 @@ def _select_splits(options: NuScenesOptions) -> tuple[SplitList, str]:
         return read_split_file(splits_path), ""
     official = create_splits_scenes()
     scenes = {}
-    for each in options.versions:
-        if each not in _OFFICIAL_SPLITS:
+    for version_name in options.versions:
+        if version_name not in _OFFICIAL_SPLITS:
             raise InputError(
-                f"version {each!r} has no official splits: give --split-file, or write "
+                f"version {version_name!r} has no official splits: give --split-file, or write "
                 f"{splits_path} (docs/data.md says how)."
             )
-        for part in _OFFICIAL_SPLITS[each]:
+        for part in _OFFICIAL_SPLITS[version_name]:
             scenes[part] = official[part]
-    # The identity of the list is of these three splits for all versions: the mini splits are parts
-    # of them.
+    # The identity is that of these three splits, also for the mini version, as the mini splits are
+    # parts of them.
     all_scenes = {part: official[part] for part in ("train", "val", "test")}
     return SplitList(OFFICIAL, scenes), list_identity(OFFICIAL, all_scenes)
 
@@ -209,9 +209,9 @@ class _Conversion:
         self.options = options
         self.summary = ConversionSummary(options.classes)
         self.scenes: list[_Scene] = []
-        for each in options.versions:
+        for version_name in options.versions:
             tables = NuScenesTables(
-                each, options.root, max_sweeps=options.max_sweeps, frame=options.frame
+                version_name, options.root, max_sweeps=options.max_sweeps, frame=options.frame
             )
             for scene in tables.scene:
                 self.scenes.append((scene, tables))
@@ -272,9 +272,10 @@ class _Conversion:
         )
         useful_workers = _count_samples(scenes) // _FRAMES_PER_WORKER
         workers = max(1, min(options.workers, len(scenes), useful_workers))
-        # Samples are read ahead of the results, because the workers need their poses.
-        samples, samples_ahead = tee(map(self._scene_samples, scenes))
-        poses = map(_stack_poses, samples_ahead)
+        # The samples of each scene are read once, for the workers, which need their poses. ``tee``
+        # keeps them until the workers return the map elements of the scene.
+        samples, samples_for_workers = tee(map(self._scene_samples, scenes))
+        poses = map(_stack_poses, samples_for_workers)
         results = ordered_map(partial(_extract_instances, local_map), poses, workers=workers)
         for scene_samples, instances in zip(samples, results, strict=True):
             yield from zip(scene_samples, instances, strict=True)

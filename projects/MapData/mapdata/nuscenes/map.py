@@ -43,8 +43,8 @@ LINE_LAYERS = ("road_divider", "lane_divider")
 SURFACE_LAYERS = ("road_segment", "lane")
 MAP_CLASSES = ("divider", "ped_crossing", "boundary", *AREA_CLASSES[1:4], "centerline")
 CROSSING = "ped_crossing"
-OUTLINE_MARGIN_M = 0.2
-CENTERLINE_STEP_M = 0.5
+OUTLINE_MARGIN_M = 0.2  # distance from the edge of the patch at which outlines are cut
+CENTERLINE_STEP_M = 0.5  # distance between the points of a centre line
 
 
 @dataclass

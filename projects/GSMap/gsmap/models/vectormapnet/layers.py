@@ -99,7 +99,8 @@ class GatedLayer(nn.Module):
         query = self.norms[1](states).flatten(0, 1)[None]  # (1, n * T, C)
         attention_output = self.cross_attn(query, memory).view(states.shape)
         states = states + self.gates[1] * self.dropout(attention_output)
-        return states + self.gates[2] * self.dropout(self.ffn(self.norms[2](states)))
+        ffn_output = self.ffn(self.norms[2](states))
+        return states + self.gates[2] * self.dropout(ffn_output)
 
 
 def append_cache(cache: Cache | None, new: Cache) -> Cache:

@@ -84,7 +84,8 @@ def dice_loss(preds: Tensor, targets: Tensor) -> Tensor:
         Losses in [0, 1]. (n,)
     """
     overlap = (preds * targets).sum((1, 2))
-    return 1 - (2 * overlap + 1) / (preds.sum((1, 2)) + targets.sum((1, 2)) + 1)
+    sizes = preds.sum((1, 2)) + targets.sum((1, 2))
+    return 1 - (2 * overlap + 1) / (sizes + 1)
 
 
 def pairwise_dice_loss(preds: Tensor, targets: Tensor) -> Tensor:
@@ -100,4 +101,5 @@ def pairwise_dice_loss(preds: Tensor, targets: Tensor) -> Tensor:
     preds = preds.flatten(1)
     targets = targets.flatten(1)
     overlap = preds @ targets.T
-    return 1 - (2 * overlap + 1) / (preds.sum(-1)[:, None] + targets.sum(-1) + 1)
+    sizes = preds.sum(-1)[:, None] + targets.sum(-1)
+    return 1 - (2 * overlap + 1) / (sizes + 1)
