@@ -241,7 +241,7 @@ def _views_of(
     views = 0
     found = []
     for entry in detections:
-        if not entry.drive.sees(entry.frame, outline).all():
+        if not entry.drive.in_range(entry.frame, outline).all():
             continue
         views += 1
         shares = _shared_shares(area, entry.areas)

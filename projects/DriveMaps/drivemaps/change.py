@@ -129,7 +129,7 @@ def views_of_passes(points: FloatArray, passes: list[Pass]) -> IntArray:
         return np.zeros((len(passes), 0), np.int64)
     counts = []
     for one_pass in passes:
-        counts.append(one_pass.drive.times_seen(points))
+        counts.append(one_pass.drive.count_frames_in_range(points))
     return np.stack(counts)
 
 
