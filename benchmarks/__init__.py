@@ -1,1 +1,1 @@
-"""Measurements of speed and memory: one subcommand of ``python -m benchmarks`` each."""
+"""Measurements of speed and memory. Each is a subcommand of ``python -m benchmarks``."""

@@ -1,4 +1,4 @@
-"""Speed and memory of tools/evaluate.py at many sizes, beside the reference's algorithms."""
+"""Speed and memory of tools/evaluate.py, and its speed relative to the reference evaluators."""
 
 import argparse
 import os

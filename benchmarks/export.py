@@ -1,4 +1,4 @@
-"""Exported models in ONNX Runtime against torch, batch 1, on the CPU."""
+"""Time of a frame of exported models in ONNX Runtime and in torch, batch 1, on the CPU."""
 
 import argparse
 import tempfile

@@ -1,4 +1,4 @@
-"""Triton kernels beside the plain path: errors against float64, medians forward and backward.
+"""Errors of Triton kernels against float64, and their times relative to plain torch.
 
 Sizes come from the published configs. Each line is printed, and written to ``--out``, as soon as it
 is measured; a line names the kernel that fails, and the command then ends with 1. The last line
@@ -74,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--device", default="cuda", help="cuda, or cpu in Triton's interpreter")
     parser.add_argument("--reduced", action="store_true", help="small sizes, one repeat")
     parser.add_argument(
-        "--kernels", nargs="+", choices=sorted(backends.TRITON_KERNELS), help="these alone"
+        "--kernels", nargs="+", choices=sorted(backends.TRITON_KERNELS), help="measure only these"
     )
     parser.add_argument("--out", type=Path, help="append each line to this file, too")
 

@@ -1,4 +1,4 @@
-"""Latency of one frame: images in memory in, map elements out."""
+"""Latency of one frame, from images in memory to map elements."""
 
 import argparse
 from functools import partial

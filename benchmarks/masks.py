@@ -1,4 +1,4 @@
-"""Effect of the raster loss on Gaussians that lie off their line, by its reduction."""
+"""Effect of the raster loss on Gaussians off their line, for each reduction over pixels."""
 
 import argparse
 import math

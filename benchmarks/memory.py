@@ -10,7 +10,7 @@ from benchmarks.measure import in_own_process
 from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
 
 TRAINVAL_SAMPLES = 34_149
-_REFERENCES = {
+_REFERENCES = {  # fields of each table that refer to other records
     "sample": ("scene_token", "prev", "next"),
     "sample_data": ("sample_token", "ego_pose_token", "prev", "next"),
     "ego_pose": (),

@@ -1,7 +1,7 @@
-"""Speed of generating MiniCity: images per second of one core's time, everything included.
+"""Speed of generating MiniCity, in images per second of one core's processor time.
 
-Everything: town, ground, six cameras with JPEG, LiDAR sweeps, boxes and records. CPU time is
-measured, so other work on the machine hardly matters.
+The time includes town, ground, six cameras with JPEG, LiDAR sweeps, boxes and records. Processor
+time hardly depends on other work of the machine.
 """
 
 import argparse

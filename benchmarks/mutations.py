@@ -50,10 +50,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--modules", nargs="+", help="only these, such as gsmap.structures.grid")
     parser.add_argument("--number", type=int, default=60, help="mutants, spread over the rooms")
-    parser.add_argument("--seed", type=int, default=0, help="which places are drawn")
-    parser.add_argument(
-        "--seconds", type=float, default=300.0, help="limit of the nearest tests, and of the others"
-    )
+    parser.add_argument("--seed", type=int, default=0, help="seed of the selection of mutants")
+    parser.add_argument("--seconds", type=float, default=300.0, help="time limit of the tests")
 
 
 def run(args: argparse.Namespace) -> None:

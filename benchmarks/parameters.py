@@ -1,4 +1,4 @@
-"""Parameters of a config's model by module; papers count all, the trainable, or all entries."""
+"""Number of parameters of a config's model by module, in the three ways of counting of papers."""
 
 import argparse
 

@@ -1,7 +1,8 @@
 """Time of one forward pass of a config's model by part, each also as a ratio to the image backbone.
 
-Random weights, random images, cameras in a ring; batch 1, float32. CPU seconds of all threads (on a
-GPU: wall seconds), the fastest of all repeats, as other processes only slow a part down.
+Weights and images are random, and the cameras form a ring; the batch has one sample in float32. The
+time is the processor time of all threads, or on a GPU the wall-clock time. It is the shortest of
+all repeats, because other processes can only slow a part down.
 """
 
 import argparse

@@ -1,8 +1,8 @@
-"""Both evaluations with the algorithms of the reference, slow on purpose, for comparison alone.
+"""AP_chamfer and AP_raster by the algorithms of the reference evaluators, for comparison.
 
-Every line is resampled by one shapely call per point, every threshold computes all distances
-again, and strips are shapely buffers in a search tree; masks are whole canvases, dilated by a grey
-morphology, compared as run-length codes.
+The algorithms are slow. AP_chamfer resamples lines by one shapely call per point, computes all
+distances again for each threshold, and searches touching strips, which are shapely buffers, in a
+tree. AP_raster draws and dilates a whole canvas for each element, and compares run-length codes.
 """
 
 from collections.abc import Sequence
@@ -26,7 +26,8 @@ from gsmap.evaluation.core.raster_ap import (
 from gsmap.structures.elements import MapElements
 
 Frame = tuple[MapElements, MapElements]  # predictions, ground truth
-FILLS_AS_RELEASED = (4, 8) <= tuple(map(int, cv2.__version__.split(".")[:2])) <= (4, 10)
+_OPENCV_VERSION = tuple(int(part) for part in cv2.__version__.split(".")[:2])
+FILLS_AS_RELEASED = (4, 8) <= _OPENCV_VERSION <= (4, 10)
 """Whether the installed OpenCV fills polygons like the versions behind the released figures."""
 
 
@@ -54,7 +55,7 @@ def _chamfer_hits(pred: list[np.ndarray], gt: list[np.ndarray], threshold: float
     Returns:
         Whether each prediction matches a ground truth that no earlier one matches.
     """
-    distances = np.full((len(pred), len(gt)), 100.0)
+    distances = np.full((len(pred), len(gt)), 100.0)  # metres, beyond each threshold
     strips = [_strip(line) for line in gt]
     tree = shapely.STRtree(strips)
     for i, line in enumerate(pred):

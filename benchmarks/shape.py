@@ -1,4 +1,4 @@
-"""Straightness of predicted lines, to which neither metric is sensitive.
+"""Straightness of predicted lines, to which AP_chamfer and AP_raster are not sensitive.
 
 AP_chamfer and AP_raster compare sets of points and pixels. A line whose points run back and forth
 along its ground truth scores as well as one that follows it.

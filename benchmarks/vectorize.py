@@ -1,4 +1,4 @@
-"""Time to vectorise the maps of a trained model, in their size and in the paper's."""
+"""Time to vectorise the maps of a trained model, at their size and at the size of the paper."""
 
 import argparse
 import time

@@ -20,10 +20,8 @@ def main(argv: list[str] | None = None) -> str:
     )
     parser.add_argument("results", type=Path, help="results in MapTR's JSON form")
     parser.add_argument("out", type=output_file, help="file to write")
-    parser.add_argument("--degree", type=int, default=3, help="of the curves, 1 to 5")
-    parser.add_argument(
-        "--max-error", type=float, default=0.1, help="of a curve from its line, in metres"
-    )
+    parser.add_argument("--degree", type=int, default=3, help="degree of the curves, 1 to 5")
+    parser.add_argument("--max-error", type=float, default=0.1, help="largest error in metres")
     args = parser.parse_args(argv)
     summary = compact_results(args.results, args.out, args.degree, args.max_error)
     old_mb = args.results.stat().st_size / 1e6

@@ -61,7 +61,7 @@ def parse_args() -> argparse.Namespace:
         "--calibration", type=Path, help="samples for --int8; the config's training set by default"
     )
     parser.add_argument(
-        "--calibration-samples", type=int, default=32, help="how many of them, evenly spread"
+        "--calibration-samples", type=int, default=32, help="number of them, evenly spread"
     )
     parser.add_argument(
         "--samples", type=Path, help="samples to compare on; the config's test set by default"

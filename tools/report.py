@@ -49,7 +49,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument(
         "--image-width",
         type=int,
-        help="largest width of a page's images in pixels (320); of the camera ahead twice that",
+        help="largest width of a page's images in pixels (320); doubled for the camera ahead",
     )
     parser.add_argument("--no-images", action="store_true", help="leave the camera images out")
     parser.add_argument(

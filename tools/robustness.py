@@ -45,7 +45,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("config", help="config, by file or name, or the name of a trained model")
     parser.add_argument("checkpoint", nargs="?", help="not needed with the name of a model")
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
-    parser.add_argument("--samples", type=int, help="that many, evenly spread; default: all")
+    parser.add_argument("--samples", type=int, help="number of samples, evenly spread (all)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the random corruptions")
     parser.add_argument("--out", type=Path, required=True, help="folder of table and plot")
     parser.add_argument(
@@ -106,7 +106,8 @@ def average_precisions(model: Any, settings: Any, samples: int | None) -> dict[s
     metric = METRICS.build({"type": "MapMetric", "eval": ["chamfer"]})
     metric.dataset_meta = dataset.metainfo
     count = min(samples or len(dataset), len(dataset))
-    for index in np.linspace(0, len(dataset) - 1, count).round().astype(int).tolist():
+    indices = np.linspace(0, len(dataset) - 1, count).round().astype(int)
+    for index in indices.tolist():
         predictions = model.test_step(pseudo_collate([dataset[index]]))
         metric.process(None, [sample.to_dict() for sample in predictions])
     figures = metric.evaluate(count)

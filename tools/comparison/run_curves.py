@@ -19,6 +19,7 @@ from gsmap.utils.files import read_text
 from gsmap.visualization.plots import finish_panel, finish_shares, panel_grid
 from gsmap.visualization.style import RUN_COLOURS, MapStyle
 
+# Keys of records that are no metrics.
 _TIMING = ("data_time", "time", "step", "epoch", "iter", "memory")
 
 

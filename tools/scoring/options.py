@@ -101,7 +101,10 @@ def add_rules(parser: argparse.ArgumentParser) -> None:
     """Add the rules of the metrics."""
     group = parser.add_argument_group("rules of metrics")
     group.add_argument(
-        "--thresholds", nargs="+", type=float, help="of AP_chamfer, in metres (0.5 1.0 1.5)"
+        "--thresholds",
+        nargs="+",
+        type=float,
+        help="largest distances of a match in AP_chamfer, in metres (0.5 1.0 1.5)",
     )
     group.add_argument("--hard", action="store_true", help="AP_chamfer at 0.2, 0.5 and 1.0 m")
     group.add_argument(
@@ -126,7 +129,9 @@ def add_rules(parser: argparse.ArgumentParser) -> None:
         "Argoverse 2: -30 -15 30 15",
     )
     group.add_argument(
-        "--gt-points", type=int, help="resample ground truth to that many points first (raw)"
+        "--gt-points",
+        type=int,
+        help="resample ground truth to this number of points first (no resampling)",
     )
     group.add_argument(
         "--keep-pred-points",
@@ -141,7 +146,7 @@ def add_rules(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--min-score",
         type=float,
-        help="of predictions that topology counts (0.4), and metrics of AP per sample (0: all)",
+        help="smallest score of predictions in topology (0.4) and in metrics of AP per sample (0)",
     )
 
 
@@ -156,12 +161,12 @@ def add_analysis(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="intervals of 95 %% of every AP, of N resamples of the scenes (1000)",
     )
-    group.add_argument("--seed", type=int, default=0, help="of the resamples")
+    group.add_argument("--seed", type=int, default=0, help="seed of the resamples")
     group.add_argument(
         "--against",
         type=Path,
         metavar="OTHER",
-        help="second result file: what the first has more in every AP, with its interval",
+        help="second result file: every AP of the first minus the second, with its interval",
     )
     group.add_argument(
         "--by",
@@ -191,13 +196,12 @@ def add_analysis(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--uncertainty",
         action="store_true",
-        help="whether Gaussians say how far off matched vertices are: likelihood, coverage, ranks",
+        help="how well sigmas describe the errors of vertices: likelihood, coverage, ranks",
     )
     group.add_argument(
         "--law",
         choices=LAW_NAMES,
-        help="with --uncertainty: distribution of the errors (that of the model's calibration, as "
-        "the results say, or normal)",
+        help="with --uncertainty: law of the errors (that of the calibration, or normal)",
     )
     group.add_argument(
         "--reliability", type=output_file, help="with --uncertainty: draw its curves"

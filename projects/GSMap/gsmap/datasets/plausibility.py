@@ -31,7 +31,7 @@ def calibration_warnings(
     Args:
         samples: Samples of one or more drives.
         frame: Annotation frame of the samples, ``lidar`` or ``ego``.
-        ground_z_m: Height of the road in the frame in metres, as in ``AnnotationMeta``.
+        ground_z_m: Height of the road in the frame in metres; None for the usual height.
 
     Returns:
         Warnings without repetitions, one line each.
@@ -48,7 +48,7 @@ def calibration_warnings(
 
 
 def _warnings(sample: MapSample, frame: str, ground_z_m: float | None) -> Iterator[str]:
-    """Yield the warnings about all cameras of a sample; arguments as in the public function."""
+    """Yield the warnings about all cameras of a sample; see `calibration_warnings`."""
     ground_from_sample = ground_from_frame(sample, frame=frame, ground_z_m=ground_z_m)
     poses = {}  # transforms from each camera to the ground
     for camera in sample.cameras:

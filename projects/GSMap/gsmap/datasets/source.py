@@ -24,7 +24,7 @@ class Source:
             config.
         has_poses: Whether the pose of the vehicle is known.
         notes: Messages of the reader for the user.
-        ground_z_m: Height of the road in the frame in metres, as in ``AnnotationMeta``.
+        ground_z_m: Height of the road in the frame in metres; None for the usual height.
     """
 
     samples: Sequence[MapSample]
@@ -83,7 +83,7 @@ def usual_mount(frame: str, ground_z_m: float | None = None) -> np.ndarray:
 
     Args:
         frame: ``lidar``, a roof LiDAR mounted like in nuScenes, or ``ego``.
-        ground_z_m: Height of the road in the frame in metres, as in ``AnnotationMeta``.
+        ground_z_m: Height of the road in the frame in metres; None for the usual height.
 
     Returns:
         Transform in metres to the ground below the rear axle (x ahead, y left, z up). (4, 4)
@@ -98,7 +98,7 @@ def ground_from_frame(sample: MapSample, frame: str, ground_z_m: float | None = 
     Args:
         sample: Sample, whose ``ego_from_frame`` is the mounting of the sensor if it is known.
         frame: Annotation frame of the sample, ``lidar`` or ``ego``.
-        ground_z_m: Height of the road in the frame in metres, as in ``AnnotationMeta``.
+        ground_z_m: Height of the road in the frame in metres; None for the usual height.
 
     Returns:
         Transform in metres to the ground below the rear axle (x ahead, y left, z up). (4, 4)
@@ -115,7 +115,7 @@ class Mount:
 
     Args:
         frame: Annotation frame, ``lidar`` or ``ego``.
-        ground_z_m: Height of the road in the frame in metres, as in ``AnnotationMeta``.
+        ground_z_m: Height of the road in the frame in metres; None for the usual height.
         ground_from_frame: Transform in metres from the frame to the ground below the rear axle (x
             ahead, y left, z up); None for the usual transform. (4, 4)
     """
@@ -133,7 +133,7 @@ class Mount:
 
     @property
     def ego_from_frame(self) -> np.ndarray:
-        """Transform from the frame to the vehicle in metres, as in ``MapSample``. (4, 4)"""
+        """Transform from the frame to the vehicle in metres. (4, 4)"""
         road_z_m = frame_view(self.frame, self.ground_z_m).ego_ground_z_m
         return _shift_up(road_z_m) @ self.matrix
 
@@ -144,7 +144,7 @@ class Mount:
 
         Args:
             frame: Annotation frame of the samples, ``lidar`` or ``ego``.
-            ground_z_m: Height of the road in the frame in metres, as in ``AnnotationMeta``.
+            ground_z_m: Height of the road in the frame in metres; None for the usual height.
         """
         if frame != self.frame:
             return False
@@ -168,7 +168,7 @@ def change_frame(
         frame: Annotation frame of the sample, ``lidar`` or ``ego``.
         wanted: Annotation frame of the result. A name, ``lidar`` or ``ego``, stands for a frame at
             the usual place in the vehicle.
-        ground_z_m: Height of the road in ``frame`` in metres, as in ``AnnotationMeta``.
+        ground_z_m: Height of the road in ``frame`` in metres; None for the usual height.
 
     Returns:
         Sample in the new frame, without ground truth; ``sample`` if it needs no transformation.

@@ -60,8 +60,8 @@ class VectorizedMapDataset(BaseDataset):
         pose_only_signals: Whether to replace the vehicle signals of all samples by signals that
             are computed from the pose alone, like in MapTR's code for Argoverse 2
             (`vehicle_signals.pose_only_signals`).
-        ground_z_m: Height of the road in the frame in metres, as in ``AnnotationMeta``, for a file
-            without it. For other files it must agree with the file.
+        ground_z_m: Height of the road in the frame in metres, for a file that does not have it. For
+            other files it must agree with the file.
         broken_samples: ``raise`` for an error at a sample with a missing or damaged file; ``skip``
             to log and count the sample and use another one instead, in training only.
         max_refetch: Largest number of consecutive samples to skip.

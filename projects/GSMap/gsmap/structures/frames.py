@@ -1,4 +1,4 @@
-"""Orientation of annotation frames to the driver and the ground, for displays with ahead at top."""
+"""Axes of annotation frames and the ground plane in them, for displays."""
 
 from dataclasses import dataclass, replace
 

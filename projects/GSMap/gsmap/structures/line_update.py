@@ -1,4 +1,4 @@
-"""Update of predicted lines of Gaussians by lines of previous frames."""
+"""Kalman update of predicted lines, whose points are Gaussians, by lines of previous frames."""
 
 from typing import NamedTuple
 

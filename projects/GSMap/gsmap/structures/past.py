@@ -1,4 +1,4 @@
-"""Memory of the streams of a batch."""
+"""Memory of previous frames, as a model with memory receives it for a batch."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

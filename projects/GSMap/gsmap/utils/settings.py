@@ -1,4 +1,4 @@
-"""Checks of settings."""
+"""Checks of numbers in settings."""
 
 from gsmap.utils.errors import InputError
 

@@ -103,7 +103,8 @@ def write_drive_film(
         result_frames = drive_frames(Path(result_path), file, file.meta.classes)
         drives[name] = [frame for frame in result_frames if frame.scene == scene]
     row_of_token = {token: row for row, token in enumerate(file.column("token"))}
-    first_drive = next(iter(drives.values()))  # the drives of all results have equal samples
+    # All results have the samples of the drive.
+    first_drive = next(iter(drives.values()))
     rows = [row_of_token[frame.token] for frame in first_drive[:max_frames]]
     all_times_ns = file.column("timestamp_ns")
     times_ns = [all_times_ns[row] for row in rows]

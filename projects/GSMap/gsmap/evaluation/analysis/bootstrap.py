@@ -235,7 +235,7 @@ def resampled_figures(report: MetricReport, resamples: Weights) -> dict[str, Flo
     class_aps: dict[str, FloatArray] = {}
     figures: dict[str, FloatArray] = {}
     for name, ranked in report.detections.items():
-        if report.sample_aps:
+        if report.sample_aps:  # the metric is the mean of AP over the samples
             aps = _mean_of_samples(
                 report.sample_aps[name], scenes=scenes, scene_copies=scene_copies
             )

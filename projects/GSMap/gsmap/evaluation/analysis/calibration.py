@@ -178,10 +178,18 @@ def rank_correlation(first: FloatArray, second: FloatArray) -> float:
 def uncertainty_figures(vertices: Vertices, law: str = "normal") -> dict[str, float]:
     """Compute the scores of one or more vertices.
 
-    ``coverage@1`` and ``coverage@2`` are the shares of errors within the central intervals of 68.3
-    and 95.4 % of the law: one and two sigma of the normal law, 0.81 and 2.18 sigma of Laplace's.
-    ``sparsification_error`` is the mean gap between the sparsification curves in the order of
-    sigmas and in the order of errors, divided by the mean error.
+    The figures of each direction are:
+
+    * ``nll``: mean negative log-likelihood of the errors.
+    * ``coverage@1`` and ``coverage@2``: shares of errors within the central intervals of 68.3 and
+      95.4 % of the law, which are one and two sigma of the normal law, and 0.81 and 2.18 sigma of
+      Laplace's law.
+    * ``sigma_m`` and ``error_m``: mean sigma and mean error in metres.
+    * ``reliability_error``: mean gap between the shares of `reliability` and their levels.
+    * ``sparsification_error``: mean gap between the sparsification curves in the order of sigmas
+      and in the order of errors, divided by the mean error.
+    * ``rank_correlation`` and ``distance_rank_correlation``: rank correlations of sigmas and of
+      distances from the vehicle with errors.
 
     Args:
         vertices: Matched vertices, at least one.
@@ -196,8 +204,9 @@ def uncertainty_figures(vertices: Vertices, law: str = "normal") -> dict[str, fl
         errors = vertices.errors[:, axis]
         sigmas = vertices.sigmas[:, axis]
         gaps = sparsification(errors, order=sigmas) - sparsification(errors, order=errors)
+        log_densities = LAWS[law].logpdf(errors / sigmas)
         values = {
-            "nll": (np.log(sigmas) - LAWS[law].logpdf(errors / sigmas)).mean(),
+            "nll": (np.log(sigmas) - log_densities).mean(),
             "coverage@1": (errors <= one * sigmas).mean(),
             "coverage@2": (errors <= two * sigmas).mean(),
             "sigma_m": sigmas.mean(),

@@ -152,8 +152,8 @@ def beside_a_segment(points: FloatArray, line: FloatArray, half_width_m: float) 
 def pair_distances(pred: Lines, gt: Lines, max_distance: float) -> FloatArray:
     """Compute the Chamfer distances between lines of equal class.
 
-    No point of a line is nearer than the bounding box of the other line in the plane, which bounds
-    the distance from below. Few pairs are left to compute in full.
+    The mean distance of the points of a line from the bounding box of the other line, in the plane,
+    is a lower bound. Pairs whose bound exceeds ``max_distance`` are not computed in full.
 
     Args:
         pred: N predicted lines.

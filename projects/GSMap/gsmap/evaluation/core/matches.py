@@ -75,7 +75,8 @@ class ClassDetections:
         thresholds: Thresholds of a match, ascending: metres for AP_chamfer, IoU for AP_raster. (T,)
         scores: Confidence in [0, 1]. (N,)
         hits: Whether the prediction matches, at each threshold. (N, T)
-        quality: As in ``FrameMatches``. (N,)
+        quality: Distance of the match in metres for AP_chamfer, IoU for AP_raster; NaN without one.
+            (N,)
         ranks: Rank of the prediction within its class and sample, from 0. (N,)
         num_gts: Number of ground truths.
         samples: Index of the prediction's sample, in the order of the tokens. (N,)

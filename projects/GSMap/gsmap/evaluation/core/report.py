@@ -29,8 +29,8 @@ class MetricReport:
         tokens: Tokens of the samples, sorted.
         sample_aps: AP of each class in each sample, for a metric that is the mean over samples; NaN
             where a sample does not count. C x (S, T)
-        by_distance: Whether thresholds are distances in metres, the last the loosest; IoUs, the
-            first the loosest, if False.
+        by_distance: True if thresholds are distances in metres, of which the last is the loosest;
+            False if they are IoUs, of which the first is the loosest.
     """
 
     name: str

@@ -55,7 +55,8 @@ class PageOptions:
             ahead, which is drawn large; 0 leaves images out.
         allow_mismatch: Whether samples without results count as samples without predictions, and
             results without ground truth are ignored; otherwise both are errors.
-        by: Groups of samples with separate AP, as in `read_groups`.
+        by: Groups of samples with separate AP: ``scene``, ``map``, ``distance``, or a JSON file
+            with the group of each scene or sample.
         allow_other_split: Whether models may be of another split than the annotation file.
         law: Distribution of the errors of vertices, ``normal`` or ``laplace``, for results with
             Gaussians; by default the distribution of their calibration, or else ``normal``.

@@ -86,7 +86,8 @@ def score_result(
         path: Results in MapTR's JSON form, with or without Gaussians.
         truth: Ground truth of each sample, by token.
         meta: Metadata of the annotation file.
-        allow_mismatch: Whether samples may differ from the ground truth, as in ``mismatch_notes``.
+        allow_mismatch: Whether samples may differ from the ground truth. A sample without results
+            then counts as without predictions, and results without ground truth are ignored.
         allow_other_split: Whether the model may be of another split than the ground truth.
         law: Distribution of the errors; by default the one of the calibration of the model, or
             the normal one.

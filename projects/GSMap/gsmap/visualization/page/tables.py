@@ -138,7 +138,7 @@ def difference_table(
 
 
 def _columns(report: MetricReport, class_name: str) -> list[tuple[str, str, float, int]]:
-    """Heading, metric key, factor and digits of each column, as in ``format_table``."""
+    """Heading, metric key, factor and digits of each column of a table of classes."""
     thresholds = report.detections[class_name].thresholds
     unit = _UNITS[report.name]
     if report.name == "chamfer":
