@@ -1,5 +1,6 @@
 """Programs that tests run in processes of their own."""
 
+import atexit
 import os
 import runpy
 import socket
@@ -77,6 +78,7 @@ def run_tool(*words: object) -> subprocess.CompletedProcess:
 def _exit_code_of(work: Callable[[], object], argv: list[str]) -> int:
     """Do a forked process's work with streams of its own; return what it exits with."""
     sys.argv = argv
+    atexit._clear()  # of the process of the tests
     sys.stdout, sys.stderr = (TextIOWrapper(FileIO(n, "w", closefd=False)) for n in (1, 2))
     os.chdir(REPO)
     if torch := sys.modules.get("torch"):

@@ -23,6 +23,7 @@ from gsmap.ops.polyline_raster import draw_polylines
 from gsmap.ops.raster_loss import raster_loss
 from gsmap.ops.soft_iou import pairwise_soft_iou
 from gsmap.structures.grid import BEVGrid
+from gsmap.utils.cli import end_process
 
 BACKENDS = ["reference", "cpu"]
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
@@ -336,7 +337,7 @@ def _train_one_rank(rank, folder):
     masks = render_gaussians(values[..., :2], values[..., 2:4].exp(), values[..., 4], ODD_GRID)
     masks.square().sum().backward()
     torch.save(model.weight.grad, f"{folder}/{rank}.pt")
-    torch.distributed.destroy_process_group()
+    end_process(0)  # before DistributedDataParallel deletes the process group
 
 
 @pytest.mark.slow

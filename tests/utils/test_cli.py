@@ -9,6 +9,7 @@ import threading
 from pathlib import Path
 
 import pytest
+from processes import run_python
 
 from gsmap.utils.cli import output_file, run_command
 from gsmap.utils.errors import InputError, InputTypeError, NotFiniteError, WorkError
@@ -262,6 +263,42 @@ def test_ctrl_c_that_arrives_while_an_error_is_told_is_one_line(capsys, monkeypa
         signal.signal(signal.SIGINT, before)
     assert left.value.code == 130
     assert capsys.readouterr().err == "interrupted: nothing half-written is left\n"
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize(
+    ("end", "code", "said"),
+    [
+        ("return 'done'", 0, ""),
+        ("raise InputError('no such split')", 2, "error: no such split\n"),
+        ("sys.exit(3)", 3, ""),
+        ("sys.exit('stopped')", 1, "stopped\n"),
+        ("1 / 0", 1, "ZeroDivisionError: division by zero\n"),
+    ],
+)
+def test_a_rank_ends_without_the_end_of_the_interpreter(end, code, said):
+    """Threads of gloo may abort the process there, or stop it for good."""
+    program = f"""
+import atexit, ctypes, sys, threading
+from gsmap.utils.cli import run_command
+from gsmap.utils.errors import InputError
+abort = ctypes.cast(ctypes.CDLL(None).abort, ctypes.c_void_p)
+assert ctypes.pythonapi.Py_AtExit(abort) == 0
+atexit.register(sys.stdout.write, "exit function")
+def write():
+    threading.main_thread().join()
+    sys.stdout.write("thread, ")
+def command():
+    threading.Thread(target=write).start()
+    {end}
+run_command(command, clean_up_on_kill=False)
+"""
+    done = run_python("-c", program)
+    assert done.returncode == code
+    assert done.stderr.endswith(said)
+    assert bool(done.stderr) == bool(said)
+    printed = "done\n" if code == 0 else ""
+    assert done.stdout == f"{printed}thread, exit function"
 
 
 @pytest.mark.faults

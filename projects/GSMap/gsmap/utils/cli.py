@@ -2,6 +2,7 @@
 
 import _thread
 import argparse
+import atexit
 import errno
 import logging
 import math
@@ -16,7 +17,7 @@ from functools import partial
 from importlib.machinery import ExtensionFileLoader
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, NoReturn
 
 from gsmap.utils.faults import user_message
 from gsmap.utils.handover import report_lost_batches
@@ -95,7 +96,6 @@ def _paths_in(value: Any) -> Iterator[Path]:
         yield from _paths_in(list(value.values()))
 
 
-@protect_inputs()
 def run_command(command: Callable[[], str | None], clean_up_on_kill: bool = True) -> None:
     """Run a command, print its result, and report user errors in one line.
 
@@ -116,8 +116,54 @@ def run_command(command: Callable[[], str | None], clean_up_on_kill: bool = True
     Args:
         command: Function that returns the text to print, or None.
         clean_up_on_kill: Whether the clean-up runs after ``kill``. The ranks of a training wait for
-            each other and should die at once instead.
+            each other and should die at once instead; `end_process` ends them in any case.
     """
+    try:
+        _run(command, clean_up_on_kill=clean_up_on_kill)
+    except BaseException as error:
+        if clean_up_on_kill:
+            raise
+        end_process(_exit_code(error))
+    if not clean_up_on_kill:
+        end_process(0)
+
+
+def end_process(code: int) -> NoReturn:
+    """End the process after its exit functions, without the end of the interpreter.
+
+    The threads of gloo, and the thread of a data loader that pins memory, take the lock of the
+    interpreter in C++ destructors. At the end of the interpreter, Python stops a thread that waits
+    for this lock. In a destructor this aborts the process, and the main thread may wait forever
+    for such a thread if it deletes a process group.
+
+    Args:
+        code: Exit code.
+    """
+    try:
+        threading._shutdown()  # type: ignore[attr-defined]
+        atexit._run_exitfuncs()
+        sys.stdout.flush()
+        sys.stderr.flush()
+    finally:
+        os._exit(code)
+
+
+def _exit_code(error: BaseException) -> int:
+    """Return the exit code of Python for an exception, and print its message or traceback."""
+    if not isinstance(error, SystemExit):
+        sys.excepthook(type(error), error, error.__traceback__)
+        return 1
+    if error.code is None:
+        return 0
+    if isinstance(error.code, int):
+        return error.code
+    sys.stderr.write(f"{error.code}\n")
+    return 1
+
+
+@protect_inputs()
+def _run(command: Callable[[], str | None], clean_up_on_kill: bool) -> None:
+    """Run a command, and raise ``SystemExit`` if it fails; see `run_command`."""
     escape_output()
     os.environ.setdefault("NO_COLOR", "1")  # colours are control characters
     handler = _SignalHandler()
