@@ -116,7 +116,7 @@ def run_command(command: Callable[[], str | None], clean_up_on_kill: bool = True
     Args:
         command: Function that returns the text to print, or None.
         clean_up_on_kill: Whether the clean-up runs after ``kill``. The ranks of a training wait for
-            each other and should die at once instead; `end_process` ends them in any case.
+            each other and should die at once instead. If False, `end_process` ends the process.
     """
     try:
         _run(command, clean_up_on_kill=clean_up_on_kill)
