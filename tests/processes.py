@@ -81,8 +81,6 @@ def _exit_code_of(work: Callable[[], object], argv: list[str]) -> int:
     atexit._clear()  # of the process of the tests
     sys.stdout, sys.stderr = (TextIOWrapper(FileIO(n, "w", closefd=False)) for n in (1, 2))
     os.chdir(REPO)
-    if torch := sys.modules.get("torch"):
-        torch.set_num_threads(1)  # a fork has none of the threads of before
     code: Any = 1
     try:
         work()

@@ -23,6 +23,7 @@ COMMANDS = {
         "minicity.argoverse2_render",
         "render camera images for real Argoverse 2 logs",
     ),
+    "py123d": ("mapdata.py123d.convert", "convert logs of py123d"),
     "infos": ("mapdata.infos.convert", "convert an info file of MapTR or MapTRv2"),
     "split": ("mapdata.splitter", "split scenes by place, at a distance from each other"),
     "overlap": ("mapdata.overlap", "list the validation samples that lie near training"),

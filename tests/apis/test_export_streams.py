@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+import torch
 from export_cases import POINTS_M, SCORES, SMALL, compare, export, shake
 from method_cases import cases_of_methods
 from model_cases import IMAGE_SHAPE, NUM_CAMS, build_small
 from processes import REPO
 
-from gsmap.apis.export import export_onnx, largest_differences
+from gsmap.apis.export import ExportedDetector, export_onnx, largest_differences
 from gsmap.apis.map_inferencer import MapInferencer
 from gsmap.apis.onnx_inferencer import OnnxInferencer
 from gsmap.datasets.elements import elements_of_predictions
@@ -93,6 +94,18 @@ def test_the_state_is_one_flat_set_of_inputs_and_outputs(with_memory):
     for name in names:
         assert inputs[f"memory_{name}"] == outputs[f"new_memory_{name}"]
     assert with_memory.metadata["max_gap_s"] == 2.0
+
+
+def test_every_example_of_inputs_has_the_memory():
+    model = build_small(temporal={"bev": {}, "queries": {"num": 3}, "embed_dims": 16}).eval()
+    exported = ExportedDetector(model).eval()
+    first = exported.example_inputs(NUM_CAMS, image_size=IMAGE_SHAPE)
+    names = exported.input_names, exported.output_names
+    second = exported.example_inputs(NUM_CAMS, image_size=IMAGE_SHAPE)
+    assert (exported.input_names, exported.output_names) == names
+    assert len(first) == len(names[0])
+    torch.testing.assert_close(second, first)
+    assert len(exported(*second)) == len(names[1])
 
 
 def test_a_stream_of_a_file_follows_the_rules_of_streams(with_memory):

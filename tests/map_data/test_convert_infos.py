@@ -230,6 +230,17 @@ def test_images_have_their_own_size_if_they_are_there(size, recorded, tmp_path):
     assert ("FRONT: image not there (taken to have 1600 x 900 pixels)" in summary) == (size is None)
 
 
+def test_no_image_outside_of_the_data_root_is_opened(tmp_path):
+    root = tmp_path / "root"
+    root.mkdir()
+    (tmp_path / "secret.jpg").write_bytes(b"nothing")
+    camera = pickle.loads(own_info(root, None).read_bytes())["infos"][0]["cams"]["FRONT"]
+    for name in ("../secret.jpg", "samples/../../secret.jpg"):
+        path = own_info(root, None, cams={"FRONT": {**camera, "data_path": name}})
+        with pytest.raises(ValueError, match=r"path '.*secret.jpg' does not lie under .*root"):
+            convert_infos(path, root / "a.arrow", root, "val")
+
+
 @pytest.mark.parametrize("unit", [1, 10**3, 10**6, 10**9])
 def test_times_of_info_files_may_have_any_unit(unit, tmp_path):
     path = own_info(tmp_path, None, timestamp=17 * 10**17 // unit)

@@ -74,6 +74,21 @@ def test_height_is_interpolated_where_a_line_is_cut(tmp_path: Path):
     np.testing.assert_allclose(line.points, [[20, 0, 0], [30, 0, 1]])
 
 
+def test_no_image_outside_of_the_data_root_is_opened(tmp_path: Path):
+    root = tmp_path / "root"
+    root.mkdir()
+    cv2.imwrite(str(tmp_path / "secret.png"), np.zeros((6, 8, 3), np.uint8))
+    camera = record()["cameras"][0] | {"path": "../secret.png"}
+    unsized = {key: value for key, value in camera.items() if key not in ("width", "height")}
+    distorted = camera | {"distortion": [0.1, 0, 0, 0]}
+    for changed in (unsized, distorted):
+        with pytest.raises(
+            ValueError, match=r"record 't' .* camera 'front': the path must lie below .*root"
+        ):
+            from_records(root / "a.arrow", [record(cameras=[changed])], META, root)
+    assert list(root.iterdir()) == []
+
+
 @pytest.mark.parametrize("frame", ["ego", "lidar"])
 def test_an_unknown_mounting_is_not_the_identity(frame: str, tmp_path: Path, caplog):
     """Lines must lie on the road: 1.84 m below a LiDAR by default, not at its own height."""

@@ -66,7 +66,8 @@ infer: VAL --model C K --out out.json --device tpu | the device that was asked f
 infer: VAL --model C K --out out.json --cfg-options modl.x=1 | 'modl'; did you mean 'model'?
 infer: VAL --model C K --out out.json --cfg-options model.map_hed.num=3 | MapDetector has no setting 'map_hed'; did you mean 'map_head'?
 infer: VAL --model C K --out out.json --cfg-options model.map_head.type=GSMapHed | there is no model of type 'GSMapHed'; did you mean 'GSMapHead'?
-infer: VAL --model C K --out out.json --cfg-options model.map_head.embed_dims=abc | tiny.py: GaussianReference of GSMapHead of MapDetector cannot be made
+infer: VAL --model C K --out out.json --cfg-options model.map_head.embed_dims=-16 | tiny.py: GaussianReference of GSMapHead of MapDetector cannot be made from these settings (model.map_head.embed_dims=-16)
+infer: VAL --model C K --out out.json --cfg-options model.map_head.embed_dims=abc | --cfg-options model.map_head.embed_dims must be a number, got 'abc'
 infer: VAL --model C K --out out.json --cfg-options model.classes=[a] | K does not belong to this config
 infer: VAL --model C K --out out.json --cfg-options test_dataloader.dataset.clas_ses=[a] | VectorizedMapDataset has no setting 'clas_ses'; did you mean 'classes'?
 infer: VAL --model C K --out out.json --cfg-options test_dataloader.dataset.classes=[a] | VAL was made with classes
@@ -85,6 +86,19 @@ train: C --work-dir w --cfg-options runner_type=FlexibelRunner | there is no run
 train: C --work-dir w --cfg-options randomness.sede=2 | has no setting 'sede'; did you mean 'seed'?
 train: C --work-dir w --cfg-options train_dataloader.dataset.data_root=nowhere | no annotation file at nowhere
 train: C --work-dir w --cfg-options train_dataloader.dataset.cameras=[A] train_dataloader.num_workers=1 | has no camera 'A'
+train: C --work-dir w --cfg-options optim_wrapper.clip_grad.max_norm=abc | --cfg-options optim_wrapper.clip_grad.max_norm must be a number, got 'abc': it is 35 in
+train: C --work-dir w --cfg-options optim_wrapper.optimizer=AdamW | --cfg-options optim_wrapper.optimizer must be dict(...)
+train: C --work-dir w --cfg-options param_scheduler=[abc] | param_scheduler must be a list of dict(...), got ['abc']
+train: C --work-dir w --cfg-options train_cfg.max_epochs=0 | train_cfg.max_epochs must be an integer >= 1, got 0
+train: C --work-dir w --cfg-options train_cfg.val_interval=0 | train_cfg.val_interval must be an integer >= 1, got 0
+train: C --work-dir w --cfg-options env_cfg.dist_cfg.backend=foo | env_cfg.dist_cfg.backend must be one of
+train: C --work-dir w --cfg-options load_from=5 | load_from must be a path, got 5
+train: C --work-dir w --cfg-options model.map_head.decoder.num_layers=-2 | num_layers must be more than 0, got -2
+train: C --work-dir w --cfg-options model.data_preprocessor.pad_size_divisor=0 | ZeroDivisionError: division by zero, in code that uses --cfg-options model.data_preprocessor.pad_size_divisor=0
+train: C --work-dir w --cfg-options model.map_head.loss_cls.loss_weight=[1] | in code that uses --cfg-options model.map_head.loss_cls.loss_weight=[1]: check this value
+train: C --work-dir w --cfg-options model.map_head.embed_dims=-16 | cannot be made from these settings (model.map_head.embed_dims=-16):
+train: C --work-dir w --cfg-options optim_wrapper.optimizer.betas=0.9 | AdamW cannot be made from these settings (optim_wrapper.optimizer.betas=0.9):
+test: C K --work-dir w --cfg-options test_evaluator.thresholds=[a] | ValueError: could not convert string to float: 'a', in code that uses --cfg-options test_evaluator.thresholds=['a']
 test: nowhere.py K | There is no config file nowhere.py
 test: C nowhere.pth | There is no checkpoint nowhere.pth
 test: C foreign.pth --work-dir w | the checkpoint does not fit the model

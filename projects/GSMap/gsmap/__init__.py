@@ -9,6 +9,7 @@ import sys
 
 from gsmap.mmcv_ext import MmcvExtFinder
 from gsmap.settings_guard import SettingsGuard
+from gsmap.utils.forks import use_one_thread_in_forks
 from gsmap.utils.interrupt import leave_at_once_on_ctrl_c, starts_a_command
 from gsmap.utils.lazy import lazy_names
 from gsmap.utils.moved import MovedModules
@@ -17,6 +18,7 @@ __version__ = "0.1.0"
 
 if starts_a_command():
     leave_at_once_on_ctrl_c()  # the imports that follow take seconds
+use_one_thread_in_forks()
 sys.meta_path.insert(0, SettingsGuard)
 sys.meta_path.append(MmcvExtFinder)  # last: mmcv's own compiled module comes first
 sys.meta_path.append(MovedModules())

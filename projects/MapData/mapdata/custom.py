@@ -29,6 +29,7 @@ from gsmap.utils.shards import WHOLE, Shard
 from mapdata.calibrated import calibrated_records
 from mapdata.folders.rig import RigCamera
 from mapdata.local_map import POLYGON, vertices_of
+from mapdata.paths import path_below
 
 _LOGGER = logging.getLogger(__name__)
 _UNMOUNTED = (
@@ -281,7 +282,8 @@ def _create_camera(camera: Mapping[str, Any], token: str, root: Path) -> CameraR
     values = dict(camera)
     if camera.get("width") is None or camera.get("height") is None:
         where = f"sample {token!r}, camera {camera['name']!r}"
-        values["width"], values["height"] = image_size(root / camera["path"], where)
+        path = path_below(root, name=camera["path"], noun=f"{where}: the path")
+        values["width"], values["height"] = image_size(path, where)
     if np.any(camera.get("distortion", ())):
         values["path"] = _rectify_image(values, root=root)
     return _create_record(CameraRecord, values)
@@ -308,7 +310,8 @@ def _rectify_image(camera: Mapping[str, Any], root: Path) -> str:
     target = root / path
     if not target.is_file():
         where = f"camera {rig_camera.name!r}"
-        image = read_image(str(root / camera["path"]), where, size=rig_camera.size_px)
+        source = path_below(root, name=camera["path"], noun=f"{where}: the path")
+        image = read_image(str(source), where, size=rig_camera.size_px)
         target.parent.mkdir(parents=True, exist_ok=True)
         rig_camera.write_image(target, image)
     return path

@@ -145,6 +145,20 @@ def test_missing_image_names_sample_camera_and_places(tmp_path):
         read_info_file(path)
 
 
+def test_no_path_leads_out_of_the_data_root(tmp_path):
+    (tmp_path / "secret.jpg").write_bytes(b"nothing")
+    root = tmp_path / "root"
+    (root / "samples").mkdir(parents=True)
+    path = make_info(root, cameras=("CAM_FRONT",))
+    content = pickle.loads(path.read_bytes())
+    camera = content["data_list"][0]["images"]["CAM_FRONT"]
+    for name in ("../secret.jpg", "samples/../../secret.jpg", str(tmp_path / "root/../secret.jpg")):
+        camera["img_path"] = name
+        path.write_bytes(pickle.dumps(content))
+        with pytest.raises(FileNotFoundError, match="camera CAM_FRONT: no file"):
+            read_info_file(path)
+
+
 def test_file_that_is_no_image_is_named(tmp_path):
     path = make_info(tmp_path)
     (tmp_path / "CAM_BACK.jpg").write_bytes(b"nothing")

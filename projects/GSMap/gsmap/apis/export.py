@@ -80,6 +80,7 @@ class ExportedDetector(nn.Module):
         self.input_names = ("images", *calibration, *prior_inputs, *stream_inputs)
         self.output_names = ("scores", "labels", "points", *head.reference.outputs[1:])
         self.memory: tuple[str, ...] = ()
+        self._empty_memory: dict[str, Tensor] = {}
 
     def forward(self, images: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Predict the best map elements, including elements outside of the map.
@@ -164,7 +165,8 @@ class ExportedDetector(nn.Module):
     def example_inputs(self, num_cams: int, image_size: tuple[int, int]) -> tuple[Tensor, ...]:
         """Create inputs of the right shapes: black images of cameras at the origin.
 
-        For a model with memory, a frame is computed to find the names and shapes of its memory.
+        For a model with memory, the first call computes a frame to find the names and shapes of the
+        memory.
 
         Args:
             num_cams: Number of cameras.
@@ -194,9 +196,11 @@ class ExportedDetector(nn.Module):
             _, memory = self.step(images, inputs=dict(inputs))
             self.memory = tuple(memory)
             for name, value in memory.items():
-                inputs[f"{MEMORY_PREFIX}{name}"] = torch.zeros_like(value)
-            self.input_names = ("images", *inputs)
-            self.output_names += tuple(f"new_{MEMORY_PREFIX}{name}" for name in memory)
+                self._empty_memory[f"{MEMORY_PREFIX}{name}"] = torch.zeros_like(value)
+            self.input_names += tuple(self._empty_memory)
+            self.output_names += tuple(f"new_{name}" for name in self._empty_memory)
+        for name, value in self._empty_memory.items():
+            inputs[name] = value.clone()
         return images, *inputs.values()
 
 

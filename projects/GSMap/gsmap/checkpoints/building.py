@@ -13,6 +13,7 @@ from mmengine.registry import Registry, build_from_cfg
 
 from gsmap.utils.errors import GsmapError, InputError
 from gsmap.utils.faults import registry_names, suggestion, user_message
+from gsmap.utils.overrides import find_override
 from gsmap.utils.shipped import shipped_path
 
 _BUILDER = build_from_cfg.__code__  # every registry calls it, also registries inside of classes
@@ -32,10 +33,12 @@ class _Part(NamedTuple):
     Attributes:
         registry: Registry that builds the part; None for a part that the runner builds itself.
         kind: Class of the part, or its name.
+        settings: Settings that the part is built from; None for a part of the runner.
     """
 
     registry: Registry | None
     kind: Any
+    settings: Any = None
 
     @property
     def name(self) -> str:
@@ -103,7 +106,7 @@ def building(cfg: Config, kind: type | None = None) -> Iterator[None]:
         parts = _parts_under_construction(error)
         if kind is not None:
             parts.append(_Part(registry=None, kind=kind))
-        fault = None if user_message(error) else _describe_fault(error, parts=parts)
+        fault = None if user_message(error) else _describe_fault(error, parts=parts, cfg=cfg)
         if fault is None:
             raise
         raise InputError(f"{where}{fault}") from error
@@ -129,18 +132,19 @@ def _parts_under_construction(error: BaseException) -> list[_Part]:
             kind = settings.get("type") if isinstance(settings, dict) else None
             if isinstance(kind, str):
                 kind = registry.get(kind)
-            parts.append(_Part(registry=registry, kind=kind))
+            parts.append(_Part(registry=registry, kind=kind, settings=settings))
         elif frame.f_globals.get("__name__") == _RUNNER and name.startswith(("build_", "__init__")):
             parts.append(_Part(registry=None, kind=None))
     return parts
 
 
-def _describe_fault(error: BaseException, parts: list[_Part]) -> str | None:
+def _describe_fault(error: BaseException, parts: list[_Part], cfg: Config) -> str | None:
     """Describe the fault in the settings that caused an error.
 
     Args:
         error: Exception of Python or of a library.
         parts: Parts under construction, the innermost first.
+        cfg: The config.
 
     Returns:
         The description; None if the error is a bug.
@@ -166,12 +170,41 @@ def _describe_fault(error: BaseException, parts: list[_Part]) -> str | None:
         close = suggestion(absent[1], names=registry_names(registry))
         return f"there is no {registry.name} of type {absent[1]!r}{close or '.'}"
     subject = " of ".join(part.name for part in typed_parts) or "the run"
+    place = find_override(error) or _find_place(cfg, parts=parts)
+    settings = f"these settings ({place})" if place else "these settings"
     if type(error) is ValueError:  # raised by the checks of a library's class
-        return f"{subject} cannot be made from these settings: {text}"
+        return f"{subject} cannot be made from {settings}: {text}"
     return (
-        f"{subject} cannot be made from these settings: {type(error).__name__}: {text} "
+        f"{subject} cannot be made from {settings}: {type(error).__name__}: {text} "
         "(GSMAP_TRACEBACK=1 shows where)."
     )
+
+
+def _find_place(cfg: Config, parts: list[_Part]) -> str | None:
+    """Find the dotted name of the innermost part whose settings are in a config."""
+    for part in parts:
+        if isinstance(part.settings, dict):
+            for name, settings in _sections(cfg, prefix=""):
+                if settings == part.settings:
+                    return name
+    return None
+
+
+def _sections(settings: Any, prefix: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the dictionaries with a ``type`` in nested settings, with their dotted names.
+
+    Args:
+        settings: Nested dictionaries and lists.
+        prefix: Dotted name of ``settings``, with a final dot; empty at the top level.
+    """
+    items = enumerate(settings) if isinstance(settings, list | tuple) else settings.items()
+    for key, value in items:
+        if str(key).startswith("_"):  # values that other settings have copies of
+            continue
+        if isinstance(value, dict) and "type" in value:
+            yield f"{prefix}{key}", value
+        if isinstance(value, dict | list | tuple):
+            yield from _sections(value, prefix=f"{prefix}{key}.")
 
 
 def _describe_unknown_setting(

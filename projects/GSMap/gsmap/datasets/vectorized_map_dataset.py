@@ -19,7 +19,9 @@ from gsmap.structures.grid import BEVGrid
 from gsmap.structures.rigid import invert_rigid, rigid
 from gsmap.structures.streams import Frame
 from gsmap.utils.errors import InputError, WorkError
+from gsmap.utils.faults import user_message
 from gsmap.utils.model_facts import MOUNT, RIG
+from gsmap.utils.overrides import describe_override
 from gsmap.utils.split_lists import SPLIT_LIST
 
 _BROKEN_MODES = ("raise", "skip")
@@ -480,6 +482,7 @@ class VectorizedMapDataset(BaseDataset):
         Raises:
             BrokenSampleError: If a file is missing or damaged and ``broken_samples`` is ``raise``.
             RuntimeError: If more than ``max_refetch`` consecutive samples are broken.
+            ValueError: If an override of the command (``--cfg-options``) causes an error.
         """
         try:
             data = self.pipeline(self.get_data_info(idx))
@@ -498,5 +501,10 @@ class VectorizedMapDataset(BaseDataset):
                     f"broken sample skipped ({len(self.broken_tokens)} so far): {error}"
                 )
             return None
+        except Exception as error:
+            description = None if user_message(error) else describe_override(error)
+            if description is None:
+                raise
+            raise InputError(description) from error  # a worker sends only the text
         self._broken_in_a_row = 0
         return data

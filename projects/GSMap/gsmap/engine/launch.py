@@ -28,6 +28,7 @@ from gsmap.engine.targets import check_targets, class_of_type, share_settings
 from gsmap.utils.errors import InputError
 from gsmap.utils.faults import registry_names, suggestion
 from gsmap.utils.files import DAMAGED_ZIP
+from gsmap.utils.overrides import check_kinds
 from gsmap.utils.parallel import LAUNCHER, die_with_parent
 
 # Keys that configs copy into other sections; no code reads them at the top level
@@ -40,6 +41,7 @@ _EXTRA_KEYS = (
 _MAX_WORKERS = 16
 # Endings of the keys whose values must be dictionaries
 _SECTIONS = ("_cfg", "_dataloader", "default_hooks", "model", "optim_wrapper", "randomness")
+_PART_LISTS = ("custom_hooks", "param_scheduler")  # keys whose values are parts or lists of parts
 
 
 @cache
@@ -79,6 +81,7 @@ def read_config(config: str | Path | Config, cfg_options: dict | None = None) ->
     factor = options.pop("image_scale", None)
     for name in options:
         _check_effect(cfg, name=name)
+    check_kinds(cfg.to_dict(), overrides=options, source=cfg.filename or "the config")
     with reading_config(f"--cfg-options of {cfg.filename or 'a config'}"):
         cfg.merge_from_dict(options)
     if factor is not None:
@@ -241,10 +244,13 @@ def check_config(cfg: Config) -> None:
 
     Raises:
         ValueError: If a learning-rate schedule and the training end at different epochs, if the
-            optimizer or runner does not exist, if the pipeline lacks a transform that the head
-            needs, or if a loader does not keep the frame order that a temporal model needs.
+            training has no epoch, if the optimizer, runner or backend does not exist, if the
+            pipeline lacks a transform that the head needs, or if a loader does not keep the frame
+            order that a temporal model needs.
     """
     check_targets(cfg)
+    _check_lengths(cfg)
+    _check_backend(cfg)
     _check_streams(cfg)
     _check_schedule(cfg)
     optimizer = (cfg.get("optim_wrapper") or {}).get("optimizer") or {}
@@ -254,6 +260,33 @@ def check_config(cfg: Config) -> None:
     )
     runner_type = cfg.get("runner_type", "Runner")
     _check_registered(cfg, component="runner", registry=RUNNERS, type_name=runner_type)
+
+
+def _check_lengths(cfg: Config) -> None:
+    """Require a training of at least one epoch or iteration, and validation intervals > 0.
+
+    mmengine trains nothing, without an error, for fewer epochs.
+    """
+    settings = cfg.get("train_cfg") or {}
+    for name in ("max_epochs", "max_iters", "val_begin", "val_interval"):
+        value = settings.get(name)
+        if value is not None and (not isinstance(value, int) or value < 1):
+            raise InputError(
+                f"{cfg.filename}: train_cfg.{name} must be an integer >= 1, got {value!r:.60}."
+            )
+
+
+def _check_backend(cfg: Config) -> None:
+    """Require a backend of torch for the communication between ranks."""
+    backend = cfg.get("env_cfg", {}).get("dist_cfg", {}).get("backend")
+    if backend is None or not torch.distributed.is_available():
+        return
+    known = torch.distributed.Backend.backend_list
+    if backend not in known:
+        raise InputError(
+            f"{cfg.filename}: env_cfg.dist_cfg.backend must be one of {', '.join(known)}, got "
+            f"{backend!r:.60}."
+        )
 
 
 def _check_schedule(cfg: Config) -> None:
@@ -334,11 +367,19 @@ def _find_copies(settings: Any, key: str, value: Any, prefix: str) -> Iterator[s
 
 
 def _check_keys(cfg: Config) -> None:
-    """Refuse unknown top-level keys, and sections that are not dictionaries."""
+    """Refuse unknown top-level keys, and sections that are not dictionaries or lists of them."""
     for key, value in cfg.items():
         is_known = key in _known_keys()
         if is_known and key.endswith(_SECTIONS) and not isinstance(value, dict | None):
             raise InputError(f"{cfg.filename}: {key} must be dict(...), got {value!r:.60}.")
+        if key in _PART_LISTS and not isinstance(value, dict | None):
+            is_list = isinstance(value, list | tuple)
+            if not is_list or not all(isinstance(part, dict) for part in value):
+                raise InputError(
+                    f"{cfg.filename}: {key} must be a list of dict(...), got {value!r:.60}."
+                )
+        if key == "load_from" and not isinstance(value, str | None):
+            raise InputError(f"{cfg.filename}: load_from must be a path, got {value!r:.60}.")
         if is_known or key.startswith("_"):
             continue
         hint = suggestion(key, names=_known_keys())

@@ -155,7 +155,7 @@ def _hashable(values: Any) -> Any:
     """Convert nested sequences of numbers, or an array, to tuples."""
     if hasattr(values, "tolist"):
         values = values.tolist()
-    if isinstance(values, Sequence):
+    if isinstance(values, Sequence) and not isinstance(values, str):
         return tuple(_hashable(value) for value in values)
     return values
 

@@ -23,6 +23,7 @@ from gsmap.utils.faults import user_message
 from gsmap.utils.handover import report_lost_batches
 from gsmap.utils.inputs import declare_files, protect_inputs
 from gsmap.utils.interrupt import INTERRUPTED_TEXT, is_first_rank
+from gsmap.utils.overrides import declare_overrides, describe_override
 from gsmap.utils.parallel import kill_forks_with_parent
 from gsmap.utils.terminal import escape_output
 
@@ -73,6 +74,8 @@ class CommandParser(argparse.ArgumentParser):
                 elif path.is_file():
                     inputs.append(path)
         declare_files(inputs=inputs, outputs=outputs)
+        overrides = getattr(namespace, "cfg_options", None)
+        declare_overrides(overrides if isinstance(overrides, dict) else {})
         return namespace, rest
 
 
@@ -104,7 +107,8 @@ def run_command(command: Callable[[], str | None], clean_up_on_kill: bool = True
 
     The command ends as follows:
 
-    * After an error that a user can cause (`faults.user_message`): ``error: ...`` and exit code 2.
+    * After an error that a user can cause (`faults.user_message`), or that a value of
+      ``--cfg-options`` causes (`overrides.describe_override`): ``error: ...`` and exit code 2.
     * After Ctrl-C: one line and exit code 130.
     * After ``kill``: exit code 143. After the end of its terminal: exit code 129.
     * After any other error: a traceback.
@@ -196,6 +200,7 @@ def _run(command: Callable[[], str | None], clean_up_on_kill: bool) -> None:
         sys.exit(128 + signal.SIGINT)
     finally:
         handler.has_ended = True
+        declare_overrides({})
 
 
 def _install(handler: "_SignalHandler", clean_up_on_kill: bool) -> None:
@@ -219,7 +224,7 @@ def _report(error: BaseException | None) -> bool:
     """Print one line for an error that a user can cause; return whether it is one."""
     if error is None or os.environ.get("GSMAP_TRACEBACK"):
         return False
-    message = user_message(error)
+    message = user_message(error) or describe_override(error)
     if not message:
         return False
     sys.stderr.write(f"error: {' '.join(message.split())}\n")

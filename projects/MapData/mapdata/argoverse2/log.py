@@ -9,13 +9,12 @@ import numpy as np
 from av2.geometry.camera.pinhole_camera import PinholeCamera
 from av2.geometry.geometry import quat_to_mat
 from av2.utils.synchronization_database import SynchronizationDB
-from pyarrow import feather
 
 from gsmap.datasets.errors import explain_errors
 from gsmap.structures.rigid import rigid
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import SUFFIX as PARTIAL_SUFFIX
-from gsmap.utils.inputs import check_input
+from mapdata.arrow_tables import read_table
 
 # Camera order of MapTR and its successors; the camera embeddings of checkpoints depend on it.
 RING_CAMERAS = (
@@ -41,15 +40,10 @@ MAP_CHANGE_LOGS = (
 def _read_feather(path: Path) -> Any:
     """Read a table as a pandas data frame.
 
-    The table is validated, because a damaged one could crash the process later.
-
     Raises:
         ArrowException: If the table is damaged.
     """
-    check_input(path)  # because Arrow does not open files through Python
-    table = feather.read_table(path, memory_map=False)
-    table.validate(full=True)
-    return table.to_pandas()
+    return read_table(path).to_pandas()
 
 
 class Argoverse2Log:

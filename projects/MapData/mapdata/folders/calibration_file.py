@@ -18,6 +18,7 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.files import read_text
 from mapdata.folders.poses import read_poses
 from mapdata.folders.rig import PoseTrack, RigCamera, rotation_of
+from mapdata.paths import path_below
 
 NAMES = ("calibration.yaml", "calibration.yml", "calibration.json")
 _KEYS = {"cameras", "ground_z_m", "poses", "rate_hz", "max_time_difference_ms"}
@@ -195,25 +196,6 @@ def read_named_poses(
         return None
     path = path_below(folder, str(content["poses"]), noun="poses")
     return read_poses(path, time_of=time_of, ground=ground)
-
-
-def path_below(folder: Path, name: str, noun: str) -> Path:
-    """Path that a calibration file names, below its folder.
-
-    Args:
-        folder: Folder of the calibration file.
-        name: Relative path.
-        noun: Key of the path, for error messages.
-
-    Returns:
-        The path.
-
-    Raises:
-        ValueError: If the path leads out of the folder.
-    """
-    if Path(name).is_absolute() or ".." in Path(name).parts:
-        raise InputError(f"{noun} must lie below the calibration file's folder, got {name!r}")
-    return folder / name
 
 
 def create_camera(

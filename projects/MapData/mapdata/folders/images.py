@@ -21,7 +21,6 @@ from mapdata.folders.calibration_file import (
     check_camera_keys,
     create_camera,
     ground_pose,
-    path_below,
     read_calibration,
     read_named_poses,
 )
@@ -35,6 +34,7 @@ from mapdata.folders.rig import (
     rig_samples,
     set_rectification_targets,
 )
+from mapdata.paths import path_below
 from mapdata.unix_times import span_of
 
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp")

@@ -62,9 +62,11 @@ def _relative(path: str, root: Path) -> str:
     for anchor in ("samples", "sweeps", "train", "val", "test"):
         if anchor in parts:
             last_anchor = len(parts) - 1 - parts[::-1].index(anchor)
-            return Path(*parts[last_anchor:]).as_posix()
-    if not Path(path).is_absolute():
-        return posix_path.as_posix()
+            parts = parts[last_anchor:]
+            break
+    suffix = Path(*parts)
+    if not suffix.is_absolute() and ".." not in parts:
+        return suffix.as_posix()
     raise InputError(f"path {path!r} does not lie under {root}: give the right --data-root.")
 
 

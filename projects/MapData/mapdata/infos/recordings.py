@@ -81,6 +81,8 @@ def _matrix(values: Any, size: int, name: str) -> np.ndarray:
 def find_file(name: str, root: Path) -> Path | None:
     """Find the longest suffix of a path that is a file below a folder.
 
+    Suffixes with ``..`` may lead out of the folder, and are left out.
+
     Args:
         name: Path, possibly absolute and from another computer.
         root: Folder.
@@ -91,7 +93,7 @@ def find_file(name: str, root: Path) -> Path | None:
     parts = [part for part in Path(name.replace("\\", "/")).parts if part != "/"]
     for start in range(len(parts)):
         suffix = Path(*parts[start:])
-        if (root / suffix).is_file():
+        if ".." not in suffix.parts and (root / suffix).is_file():
             return suffix
     return None
 

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from gsmap.models.base.layers import feed_forward
 from gsmap.models.base.parts import build_part
 from gsmap.structures.gaussians import GaussianSpace
+from gsmap.utils.settings import check_positive
 
 Refine = Callable[[int, Tensor, Tensor], Tensor]  # (layer, point states, reference) -> reference
 
@@ -204,6 +205,7 @@ class MapDecoder(BaseModule):
         **shared: Any,
     ) -> None:
         super().__init__()
+        check_positive(num_layers=num_layers)
         self.num_points = num_points
         self.detach_reference = detach_reference
         defaults = {"type": self.layer_class, "num_points": num_points, **shared}

@@ -10,6 +10,7 @@ from mmengine.model import BaseModule
 from torch import Tensor, nn
 
 from gsmap.models.base.layers import feed_forward, init_matrices, mlp
+from gsmap.utils.settings import check_positive
 
 
 class ClassLines(NamedTuple):
@@ -127,6 +128,7 @@ class PointLineDecoder(BaseModule):
     ) -> None:
         super().__init__()
         self.line_masks = line_masks
+        check_positive(num_layers=num_layers)
         self.num_heads = num_heads
         self.queries: list[tuple[int, int]] = []
         self.points_per_class: list[int] = []

@@ -23,6 +23,7 @@ from gsmap.models.vectormapnet.canvas import Canvas
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import constant
 from gsmap.utils.errors import InputError
+from gsmap.utils.settings import check_positive
 
 _CORNERS = 2
 
@@ -167,6 +168,7 @@ class KeyPointHead(DetectionHead):
         layer_settings: PARTS = {"num_heads": 8, "ffn_dims": 512, "dropout": 0.1, "num_layers": 6}
         layer_settings |= decoder or {}
         num_layers = layer_settings.pop("num_layers")
+        check_positive(num_layers=num_layers)
         self.context = BEVEmbedding(in_channels, embed_dims)
         self.elements = nn.Embedding(num_queries, 2 * embed_dims)
         self.corners = nn.Embedding(_CORNERS, 2 * embed_dims)

@@ -13,6 +13,7 @@ from gsmap.models.vectormapnet.detector import BEVEmbedding
 from gsmap.models.vectormapnet.layers import Cache, GatedLayer, append_cache, keep_most_likely
 from gsmap.structures.tensors import constant
 from gsmap.utils.errors import InputError
+from gsmap.utils.settings import check_positive
 
 _CONDITION = 5  # tokens before the points: the class, and x0, y0, x1, y1 of the box
 _FORBIDDEN = -1e9  # logit of a token that must not be sampled
@@ -95,6 +96,7 @@ class PolylineGenerator(BaseModule):
         self.metres_from_norm: Callable[[Tensor], Tensor] = canvas.metres_from_norm
         if shrunk_results:
             self.metres_from_norm = canvas.grid.metres_from_norm
+        check_positive(num_layers=num_layers)
         self.context = BEVEmbedding(in_channels, embed_dims)
         self.label = nn.Embedding(num_classes, embed_dims)
         self.vertex = nn.Embedding(canvas.num_tokens, embed_dims)

@@ -1,0 +1,1 @@
+"""Logs of the library py123d, which converts several data sets to one format."""

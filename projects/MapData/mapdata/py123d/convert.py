@@ -1,0 +1,265 @@
+"""Conversion of logs of py123d to an annotation file (pinhole cameras, frame ``ego``)."""
+
+import argparse
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.annotations.record import CLASSES, RANGES
+from gsmap.structures.rigid import invert_rigid
+from gsmap.utils.errors import InputError, WorkError
+from gsmap.utils.files import file_name
+from gsmap.utils.progress import Progress
+from mapdata.argoverse2.samples import thin_out
+from mapdata.command_line import FileOptions, add_range_options, options_from, parse_rate
+from mapdata.custom import from_records
+from mapdata.py123d.log import REMEDY, SYNC, Log
+from mapdata.py123d.map import Map
+from mapdata.summary import ConversionSummary
+
+_GROUND_TOLERANCE_M = 0.05
+
+
+@dataclass(frozen=True)
+class Py123dOptions(FileOptions):
+    """Options of a conversion of logs of py123d (``tools/create_data.py py123d``).
+
+    Args:
+        split: Folder of the logs below ``root/logs``, such as ``nuscenes_val``.
+        data_root: Folder that the paths of images in logs are relative to, and into which images in
+            logs are written; None for ``root``.
+        rate_hz: Samples per second; None keeps all frames.
+        logs: Names, or first characters of names, of the logs to convert; empty converts all.
+        ground_z_m: Height of the road in the frame of the rear axle, in metres; None takes the
+            bottom of the vehicle's box.
+        x_range: Smallest and largest x (forward) of the ground truth, in metres.
+        y_range: Smallest and largest y (left) of the ground truth, in metres.
+    """
+
+    _: KW_ONLY
+    split: str
+    data_root: Path | None = None
+    rate_hz: float | None = 2.0
+    logs: Sequence[str] = ()
+    ground_z_m: float | None = None
+    x_range: tuple[float, float] = RANGES["ego"][0]
+    y_range: tuple[float, float] = RANGES["ego"][1]
+
+
+def convert_py123d(options: Py123dOptions) -> ConversionSummary:
+    """Convert logs of py123d to one annotation file.
+
+    The file appears only once it is complete. A log that cannot be read is left out, and the
+    summary names the reason.
+
+    Args:
+        options: Options of the conversion.
+
+    Returns:
+        Counts of the samples and map elements in the file, and of the problems.
+
+    Raises:
+        FileNotFoundError: If there is no such split or log.
+        RuntimeError: If no sample is left. Nothing is written then.
+        ValueError: If logs differ in the height of the road, or an image is damaged.
+    """
+    summary = ConversionSummary(options.classes)
+    logs = []
+    for folder in _find_logs(options):
+        try:
+            log = Log(folder)
+            log.ground_z_m  # noqa: B018 - reads the poses' table
+            logs.append(log)
+        except (FileNotFoundError, ValueError) as error:
+            summary.add_problem(f"log left out: {error}", folder.name)
+    if not logs:
+        raise WorkError(f"no log is left of {options.split}:\n{summary.text()}")
+    data_root = options.data_root or options.root
+    target = options.path_of("py123d", options.split)
+    meta = options.meta(
+        dataset=file_name(f"py123d_{logs[0].metadata.get('dataset')}"),
+        frame="ego",
+        split=options.split,
+        ground_z_m=_ground_z_m(logs, options.ground_z_m),
+        options={"rate_hz": options.rate_hz},
+    )
+    with Progress(logs, desc=f"py123d {options.split}", unit="logs") as progress:
+        records = _all_records(progress, options, summary=summary)
+        first = next(records, None)
+        if first is None:
+            raise WorkError(f"no sample is left of {options.split}:\n{summary.text()}")
+        from_records(target, _chained(first, records), meta, data_root, join=True)
+    for sample in AnnotationFile(target):
+        summary.add_sample(options.split, sample)
+    summary.notes.append(f"written to {target}")
+    return summary
+
+
+def _chained(first: dict[str, Any], records: Iterator[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    """Yield the first record and the remaining ones."""
+    yield first
+    yield from records
+
+
+def _find_logs(options: Py123dOptions) -> list[Path]:
+    """Find the folders of the logs of a split.
+
+    Raises:
+        FileNotFoundError: If there is none.
+    """
+    parent = options.root / "logs" / options.split
+    folders = []
+    for path in sorted(parent.glob(f"*/{SYNC}")):
+        if not options.logs or path.parent.name.startswith(tuple(options.logs)):
+            folders.append(path.parent)
+    if not folders:
+        splits = sorted({path.parts[-3] for path in options.root.glob(f"logs/*/*/{SYNC}")})
+        known = f"; there are {', '.join(splits)}" if splits else ""
+        raise FileNotFoundError(f"no log of py123d as asked for in {parent}{known}.")
+    return folders
+
+
+def _ground_z_m(logs: Sequence[Log], given_m: float | None) -> float:
+    """Height of the road in the frame of the rear axle, which all logs must share.
+
+    Raises:
+        ValueError: If logs differ.
+    """
+    if given_m is not None:
+        return given_m
+    first = logs[0]
+    for log in logs[1:]:
+        if abs(log.ground_z_m - first.ground_z_m) > _GROUND_TOLERANCE_M:
+            raise InputError(
+                f"the road lies {first.ground_z_m:.2f} m above the axle in {first.name} and "
+                f"{log.ground_z_m:.2f} m in {log.name}: convert the vehicles apart (--logs), or "
+                "give --ground-z."
+            )
+    return first.ground_z_m
+
+
+def _all_records(
+    logs: Progress, options: Py123dOptions, summary: ConversionSummary
+) -> Iterator[dict[str, Any]]:
+    """Yield the records of all logs; a log that cannot be read is left out."""
+    maps: dict[Path, Map] = {}  # the latest one alone, as logs of one town follow each other
+    for log in logs:
+        try:
+            path = log.map_file(options.root)
+            if path is not None and path not in maps:
+                if not path.is_file():
+                    raise FileNotFoundError(f"no map at {path}: {REMEDY}.")
+                maps = {path: Map(path, options.classes)}
+                if maps[path].left_out:
+                    reason = "map element without a valid geometry left out"
+                    summary.add_problem(reason, path.name, count=maps[path].left_out)
+            for name in log.unused_cameras:
+                summary.add_problem("camera left out: it is no pinhole camera", name)
+            records = _records(log, maps.get(path) if path else None, options, summary=summary)
+            yield from records
+        except (FileNotFoundError, ValueError) as error:
+            summary.add_problem(f"log left out: {error}", log.name)
+
+
+def _records(
+    log: Log, log_map: Map | None, options: Py123dOptions, summary: ConversionSummary
+) -> Iterator[dict[str, Any]]:
+    """Yield the records of a log; frames that cannot be used are counted and left out."""
+    frames = {}
+    for time_ns, rows in log.frames():
+        if not rows:
+            raise InputError("it has no pinhole camera")
+        known_rows = {name: row for name, row in rows.items() if row is not None}
+        missing = sorted(rows.keys() - known_rows)
+        if missing:
+            reason = f"frame left out: no image of {missing[0]}"
+            summary.add_problem(reason, f"{log.name}_{time_ns // 1000}")
+        else:
+            frames[time_ns] = known_rows
+    limits = np.abs([options.x_range, options.y_range])
+    radius_m = float(np.hypot(*limits.max(axis=1)))
+    root = options.data_root or options.root
+    for time_ns in thin_out(np.array(sorted(frames), np.int64), options.rate_hz).tolist():
+        token = f"{log.name}_{time_ns // 1000}"
+        global_from_imu = log.track.at(time_ns)
+        if global_from_imu is None:
+            summary.add_problem("frame left out: no pose near its time", token)
+            continue
+        pose = global_from_imu @ log.imu_from_axle
+        try:
+            cameras = _cameras(log, rows=frames[time_ns], global_from_axle=pose, root=root)
+        except ValueError as error:
+            summary.add_problem(f"frame left out: {error}", token)
+            continue
+        record = {
+            "token": token,
+            "scene": log.name,
+            "map_name": log.location,
+            "timestamp_ns": time_ns,
+            "global_from_frame": pose,
+            "cameras": cameras,
+        }
+        if log_map is not None:
+            record["global_instances"] = log_map.around(pose[:2, 3], radius_m=radius_m)
+        yield record
+
+
+def _cameras(
+    log: Log, rows: Mapping[str, int], global_from_axle: np.ndarray, root: Path
+) -> list[dict[str, Any]]:
+    """List the cameras of a frame, as `from_records` takes them.
+
+    The transforms to the cameras include the motion of the vehicle between the two times.
+
+    Args:
+        log: The log.
+        rows: Row of the image by camera.
+        global_from_axle: Pose of the frame ``ego`` at the time of the frame. (4, 4)
+        root: Data root of the images.
+
+    Raises:
+        ValueError: If an image, a pose or a calibration cannot be used.
+    """
+    cameras = []
+    for camera in log.cameras:
+        row = rows[camera.name]
+        global_from_camera = camera.global_from_camera(row, track=log.track)
+        record = camera.calibration
+        record["path"] = camera.image_path(row, root=root, scene=log.name)
+        record["cam_from_frame"] = invert_rigid(global_from_camera) @ global_from_axle
+        cameras.append(record)
+    return cameras
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``tools/create_data.py py123d`` to a parser."""
+    add = parser.add_argument
+    add("--root", type=Path, required=True, help="folder of py123d with logs and maps")
+    add("--split", required=True, help="folder below logs, such as nuscenes_val")
+    add("--data-root", type=Path, help="folder of the images that logs name (default: --root)")
+    add("--logs", nargs="+", default=(), metavar="LOG", help="only these (first characters)")
+    add(
+        "--rate", type=parse_rate, default=2.0, dest="rate_hz", metavar="RATE",
+        help="samples per second, such as 2hz, or all (default: 2hz)",
+    )  # fmt: skip
+    add(
+        "--ground-z", type=float, dest="ground_z_m", metavar="M",
+        help="height of the road above the rear axle (default: bottom of the vehicle's box)",
+    )  # fmt: skip
+    add("--centerline", action="store_true", help="add the class centerline")
+    add("--out-dir", type=Path, help="folder of the annotation file (default: the data root)")
+    add("--tag", default="", help="suffix of its name, such as _extended")
+    add_range_options(parser, RANGES["ego"])
+
+
+def run(arguments: argparse.Namespace) -> str:
+    """Convert with the options of a command line and return the summary as text."""
+    classes: tuple[str, ...] = CLASSES
+    if arguments.centerline:
+        classes = (*CLASSES, "centerline")
+    options = options_from(Py123dOptions, arguments, classes=classes)
+    return convert_py123d(options).text()

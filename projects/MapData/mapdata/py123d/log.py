@@ -1,0 +1,248 @@
+"""Logs of py123d: times, poses of the vehicle, and cameras."""
+
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from gsmap.datasets.errors import explain_errors
+from gsmap.datasets.image_files import decode_image
+from gsmap.structures.rigid import invert_rigid, rigid
+from gsmap.utils.errors import InputError
+from gsmap.utils.files import file_name, write_bytes
+from mapdata.arrow_tables import read_table
+from mapdata.folders.rig import PoseTrack, rotation_of
+from mapdata.paths import path_below
+from mapdata.py123d.packed import metadata_of
+
+SYNC = "sync.arrow"
+_EGO = "ego_state_se3"
+REMEDY = "convert the log again with py123d"
+_CAMERA_PREFIX = "camera."
+_PNG_START = b"\x89PNG"
+
+
+def pose_of(values: Any) -> np.ndarray:
+    """Transform of a pose of py123d: x, y, z in metres and the quaternion w, x, y, z. (4, 4)
+
+    Raises:
+        ValueError: If there are not 7 numbers, one is not finite, or the quaternion has another
+            length than 1.
+    """
+    numbers = np.array(values, dtype=np.float64)
+    if numbers.shape != (7,) or not np.isfinite(numbers).all():
+        raise InputError(f"a pose must be 7 finite numbers, got {values!r:.80}")
+    return rigid(rotation_of(numbers[3:]), translation=numbers[:3])
+
+
+class Camera:
+    """Images of a camera of a log.
+
+    Args:
+        path: Table of the camera in the folder of the log.
+
+    Attributes:
+        key: Name of the columns of the camera.
+        name: Name of the camera.
+        image_rows: Number of images.
+
+    Raises:
+        ValueError: If the table is damaged, or its images are in a film.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.key = path.stem
+        self.name = self.key.removeprefix(_CAMERA_PREFIX)
+        with explain_errors(path, REMEDY):
+            columns = map(self._column, ("timestamp_us", "data", "camera_to_global_se3"))
+            self._table = read_table(path, columns=list(columns), memory_map=True)
+            self.metadata = metadata_of(self._table)
+            self.image_rows = self._table.num_rows
+            if pa.types.is_integer(self._table.schema.field(self._column("data")).type):
+                raise InputError("its images are in a film; py123d must store them as JPEG or PNG")
+
+    def _column(self, name: str) -> str:
+        return f"{self.key}.{name}"
+
+    def _value(self, name: str, row: int) -> Any:
+        return self._table[self._column(name)][row].as_py()
+
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether this is a pinhole camera, possibly with distortion."""
+        has_intrinsics = self.metadata.get("intrinsics") is not None
+        return self.metadata.get("camera_model") == "pinhole" and has_intrinsics
+
+    def time_us(self, row: int) -> int:
+        """Time of an image in microseconds."""
+        return int(self._value("timestamp_us", row))
+
+    def global_from_camera(self, row: int, track: PoseTrack) -> np.ndarray:
+        """Pose of the camera at the time of an image. (4, 4)
+
+        Args:
+            row: Row of the image.
+            track: Poses of the IMU, from which the pose follows if the table has none.
+
+        Raises:
+            ValueError: If there is no pose.
+        """
+        values = self._value("camera_to_global_se3", row)
+        if values is not None:
+            return pose_of(values)
+        global_from_imu = track.at(1000 * self.time_us(row))
+        if global_from_imu is None:
+            raise InputError(f"camera {self.name!r} has no pose near {self.time_us(row)} us")
+        return global_from_imu @ pose_of(self.metadata["camera_to_imu_se3"])
+
+    def image_path(self, row: int, root: Path, scene: str) -> str:
+        """Path of an image below the data root; an image in the table is written there.
+
+        Args:
+            row: Row of the image.
+            root: Data root.
+            scene: Name of the log.
+
+        Raises:
+            ValueError: If the table has no image, or something else, in this row.
+        """
+        data = self._value("data", row)
+        where = f"camera {self.name!r}"
+        if isinstance(data, str):
+            path_below(root, name=data, noun=f"{where}: the path")
+            return data
+        if not isinstance(data, bytes):
+            raise InputError(f"{where} has no image in row {row}")
+        size = (int(self.metadata["width"]), int(self.metadata["height"]))
+        decode_image(data, path=f"row {row}", where=where, size=size)
+        suffix = "png" if data.startswith(_PNG_START) else "jpg"
+        folder = f"images/{file_name(scene)}/{file_name(self.name)}"
+        path = f"{folder}/{self.time_us(row)}.{suffix}"
+        target = root / path
+        target.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(target, data)
+        return path
+
+    @property
+    def calibration(self) -> dict[str, Any]:
+        """Name, size, intrinsics and distortion of the camera, as `from_records` takes them.
+
+        Raises:
+            ValueError: If a value is missing.
+        """
+        fx, fy, cx, cy, skew = self.metadata["intrinsics"]
+        distortion = self.metadata.get("distortion")
+        if distortion is None or self.metadata.get("is_undistorted"):
+            distortion = []
+        return {
+            "name": self.name,
+            "width": self.metadata["width"],
+            "height": self.metadata["height"],
+            "intrinsics": [[fx, skew, cx], [0, fy, cy], [0, 0, 1]],
+            "distortion": list(distortion),  # k1, k2, p1, p2, k3, as in OpenCV
+        }
+
+
+class Log:
+    """Log of py123d. Tables are read on first use.
+
+    Args:
+        folder: Folder of the log, with ``sync.arrow`` and a table for each sensor.
+
+    Attributes:
+        name: Name of the folder, which is the scene of the samples.
+
+    Raises:
+        FileNotFoundError: If a table is missing.
+        ValueError: If a table is damaged.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.name = folder.name
+        self._sync = self._read(SYNC)
+        self.metadata = metadata_of(self._sync)
+
+    def _read(self, name: str, columns: list[str] | None = None) -> pa.Table:
+        path = self.folder / name
+        if not path.is_file():
+            raise FileNotFoundError(f"no table at {path}: {REMEDY}.")
+        with explain_errors(path, REMEDY):
+            return read_table(path, columns=columns)
+
+    @property
+    def location(self) -> str:
+        """Name of the town or map; empty if unknown."""
+        return str(self.metadata.get("location") or "")
+
+    def map_file(self, root: Path) -> Path | None:
+        """Path of the map; None if the log has none.
+
+        Args:
+            root: Folder of py123d's data, with ``logs`` and ``maps``.
+        """
+        metadata = self.metadata.get("map_metadata")
+        if not isinstance(metadata, dict):
+            return None
+        if metadata.get("map_is_per_log"):
+            return self.folder / "map.arrow"
+        dataset = str(metadata["dataset"])
+        file = f"{dataset}/{dataset}_{metadata['location']}.arrow"
+        return path_below(root / "maps", name=file, noun="the map's file")
+
+    @cached_property
+    def _ego(self) -> pa.Table:
+        return self._read(f"{_EGO}.arrow", columns=[f"{_EGO}.timestamp_us", f"{_EGO}.imu_se3"])
+
+    @cached_property
+    def track(self) -> PoseTrack:
+        """Poses of the IMU in the global frame, by time in nanoseconds."""
+        with explain_errors(self.folder / f"{_EGO}.arrow", REMEDY):
+            times_ns = [1000 * time for time in self._ego[f"{_EGO}.timestamp_us"].to_pylist()]
+            poses = map(pose_of, self._ego[f"{_EGO}.imu_se3"].to_pylist())
+            return PoseTrack(times_ns, poses)
+
+    @cached_property
+    def imu_from_axle(self) -> np.ndarray:
+        """Pose of the rear axle (x ahead, y left, z up), the frame ``ego``, in the IMU. (4, 4)"""
+        with explain_errors(self.folder / f"{_EGO}.arrow", REMEDY):
+            return pose_of(metadata_of(self._ego)["rear_axle_to_imu_se3"])
+
+    @cached_property
+    def ground_z_m(self) -> float:
+        """Height of the road in the frame ``ego`` in metres: the bottom of the vehicle's box."""
+        with explain_errors(self.folder / f"{_EGO}.arrow", REMEDY):
+            metadata = metadata_of(self._ego)
+            imu_from_center = pose_of(metadata["center_to_imu_se3"])
+            axle_from_center = invert_rigid(self.imu_from_axle) @ imu_from_center
+            return float(axle_from_center[2, 3]) - float(metadata["height"]) / 2
+
+    @cached_property
+    def cameras(self) -> list[Camera]:
+        """Pinhole cameras, by name."""
+        return [camera for camera in self._all_cameras if camera.is_pinhole]
+
+    @cached_property
+    def _all_cameras(self) -> list[Camera]:
+        return [Camera(path) for path in sorted(self.folder.glob(f"{_CAMERA_PREFIX}*.arrow"))]
+
+    @property
+    def unused_cameras(self) -> list[str]:
+        """Names of the cameras that are no pinhole cameras."""
+        return [camera.name for camera in self._all_cameras if not camera.is_pinhole]
+
+    def frames(self) -> Iterator[tuple[int, dict[str, int | None]]]:
+        """Yield the time in nanoseconds, and the row of each camera's table, of each frame."""
+        with explain_errors(self.folder / SYNC, REMEDY):
+            times = self._sync["sync.timestamp_us"].to_pylist()
+            rows = {}
+            for camera in self.cameras:
+                rows[camera.name] = self._sync[camera.key].to_pylist()
+        for number, time in enumerate(times):
+            row_of_camera = {}
+            for name, column in rows.items():
+                row_of_camera[name] = column[number]
+            yield 1000 * int(time), row_of_camera
