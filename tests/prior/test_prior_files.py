@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from gsmap.prior import HitMissCounts, KeepMaximum, LastSeen, MapPrior, PriorSettings
-from gsmap.prior.file_format import _FOOTER, _INDEX, _MAGIC, _START
+from gsmap.prior.file_format import _FOOTER, _INDEX, _START, RASTER_MAGIC
 from gsmap.structures.grid import BEVGrid
 
 SETTINGS = PriorSettings(("divider", "boundary"), "town")
@@ -180,7 +180,7 @@ def test_a_prior_of_other_settings_is_refused(other, name, tmp_path):
 def file_of(header, tiles=(), index=None, version=1):
     """File of a header, tiles (bytes) and an index."""
     text = header if isinstance(header, bytes) else json.dumps(header).encode()
-    start = _START.pack(_MAGIC, version, len(text)) + text
+    start = _START.pack(RASTER_MAGIC, version, len(text)) + text
     rows, body = [], b""
     for number, tile in enumerate(tiles):
         rows.append((number, 0, len(start) + len(body), len(tile), zlib.crc32(tile)))
@@ -188,7 +188,7 @@ def file_of(header, tiles=(), index=None, version=1):
     rows = rows if index is None else index
     packed = np.array(rows, _INDEX).tobytes()
     offset = len(start) + len(body)
-    footer = _FOOTER.pack(offset, len(rows), zlib.crc32(packed), zlib.crc32(text), _MAGIC)
+    footer = _FOOTER.pack(offset, len(rows), zlib.crc32(packed), zlib.crc32(text), RASTER_MAGIC)
     return start + body + packed + footer
 
 

@@ -1,10 +1,12 @@
-"""Map priors: rasters of the map at places that a vehicle has passed before."""
+"""Map priors: rasters or Gaussians of the map at places that a vehicle has passed before."""
 
 from gsmap.utils.lazy import lazy_names
 
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
+        "GaussianPrior": "gaussian_prior",
+        "GaussianRule": "gaussian_rule",
         "HitMissCounts": "rules",
         "KeepMaximum": "rules",
         "LastSeen": "rules",

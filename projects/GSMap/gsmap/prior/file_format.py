@@ -1,4 +1,4 @@
-"""File of a map prior: a header, compressed tiles and an index.
+"""File of a map prior or a Gaussian prior: a header, compressed tiles and an index.
 
 The file begins with the magic number, the version and the length of the header, all little-endian.
 The header is JSON in UTF-8. Compressed tiles (zlib) follow, then the index with the place, offset,
@@ -9,14 +9,15 @@ import json
 import mmap
 import struct
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
-from gsmap.prior.rules import WriteRule, rule_from_settings, rule_settings
+from gsmap.prior.gaussian_rule import GAUSSIAN_RULES
+from gsmap.prior.rules import RULES, rule_from_settings, rule_settings
 from gsmap.prior.settings import PriorSettings
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import fetch_advice
@@ -28,7 +29,10 @@ TilePlace = tuple[int, int, int]
 """Offset and length of a compressed tile in bytes, and its checksum."""
 FARTHEST_TILE = 2**30
 """Largest column or row of a tile."""
-_MAGIC = b"\x89GSPRIOR"
+RASTER_MAGIC = b"\x89GSPRIOR"
+"""First bytes of a file of `MapPrior`."""
+GAUSSIAN_MAGIC = b"\x89GSGAUSS"
+"""First bytes of a file of `GaussianPrior`."""
 _START = struct.Struct("<8sII")  # magic, version, length of the header
 _FOOTER = struct.Struct("<QIII8s")  # offset, number and checksum of the index, of the header, magic
 _INDEX = np.dtype(
@@ -40,8 +44,9 @@ _LONGEST_HEADER = 1 << 16
 def write_tiles(
     file: IO[bytes],
     settings: PriorSettings,
-    rule: WriteRule,
+    rule: Any,
     tiles: Iterable[tuple[TileKey, bytes]],
+    magic: bytes = RASTER_MAGIC,
 ) -> None:
     """Write the content of a file.
 
@@ -50,9 +55,12 @@ def write_tiles(
         settings: Classes, place and cells.
         rule: Rule of the stored states.
         tiles: Place and compressed states of each tile.
+        magic: First bytes of the kind of file.
     """
-    header = json.dumps(asdict(settings) | {"rule": rule_settings(rule)}).encode()
-    file.write(_START.pack(_MAGIC, VERSION, len(header)))
+    rules: Mapping[str, type] = RULES if magic == RASTER_MAGIC else GAUSSIAN_RULES
+    entry = rule_settings(rule, rules)
+    header = json.dumps(asdict(settings) | {"rule": entry}).encode()
+    file.write(_START.pack(magic, VERSION, len(header)))
     file.write(header)
     offset = _START.size + len(header)
     rows = []
@@ -62,17 +70,18 @@ def write_tiles(
         offset += len(content)
     index = np.array(rows, dtype=_INDEX).tobytes()
     file.write(index)
-    file.write(_FOOTER.pack(offset, len(rows), zlib.crc32(index), zlib.crc32(header), _MAGIC))
+    file.write(_FOOTER.pack(offset, len(rows), zlib.crc32(index), zlib.crc32(header), magic))
 
 
 def read_header(
-    content: mmap.mmap | bytes, path: Path
-) -> tuple[PriorSettings, WriteRule, dict[TileKey, TilePlace]]:
+    content: mmap.mmap | bytes, path: Path, magic: bytes = RASTER_MAGIC
+) -> tuple[PriorSettings, Any, dict[TileKey, TilePlace]]:
     """Read and check everything but the tiles of an untrusted file.
 
     Args:
         content: Content of the file.
         path: Name of the file, for messages.
+        magic: First bytes of the kind of file.
 
     Returns:
         Settings, rule and the place of each tile in the file.
@@ -82,9 +91,11 @@ def read_header(
     """
     size = len(content)
     start = bytes(content[: max(_START.size, 200)])
-    if not start.startswith(_MAGIC):
-        advice = fetch_advice(start, otherwise="give a file that MapPrior.save has written")
-        raise InputError(f"{path} is no map prior: {advice}.")
+    if not start.startswith(magic):
+        kind = "map prior" if magic == RASTER_MAGIC else "Gaussian prior"
+        writer = "MapPrior" if magic == RASTER_MAGIC else "GaussianPrior"
+        advice = fetch_advice(start, otherwise=f"give a file that {writer}.save has written")
+        raise InputError(f"{path} is no {kind}: {advice}.")
     if size < _START.size + _FOOTER.size:
         raise _cut(path)
     _, version, length = _START.unpack_from(start)
@@ -93,9 +104,10 @@ def read_header(
             f"{path} has version {version} of map priors, and version {VERSION} is read: build "
             "the prior with this version of the program."
         )
-    offset, count, index_crc, header_crc, magic = _FOOTER.unpack_from(content, size - _FOOTER.size)
+    footer = _FOOTER.unpack_from(content, size - _FOOTER.size)
+    offset, count, index_crc, header_crc, last_bytes = footer
     index_size = count * _INDEX.itemsize
-    if magic != _MAGIC or offset + index_size + _FOOTER.size != size:
+    if last_bytes != magic or offset + index_size + _FOOTER.size != size:
         raise _cut(path)
     header_end = _START.size + length
     if length > _LONGEST_HEADER or header_end > offset:
@@ -104,7 +116,8 @@ def read_header(
     index = bytes(content[offset : offset + index_size])
     if zlib.crc32(header) != header_crc or zlib.crc32(index) != index_crc:
         raise InputError(f"{path} is damaged: a checksum is wrong; copy or build it again.")
-    settings, rule = _parse_header(header, path=path)
+    rules: Mapping[str, type] = RULES if magic == RASTER_MAGIC else GAUSSIAN_RULES
+    settings, rule = _parse_header(header, path=path, rules=rules)
     places = _parse_index(index, path=path, start=header_end, end=offset)
     return settings, rule, places
 
@@ -113,7 +126,9 @@ def _cut(path: Path) -> InputError:
     return InputError(f"{path} is cut off: its end is missing; copy or build it again.")
 
 
-def _parse_header(header: bytes, path: Path) -> tuple[PriorSettings, WriteRule]:
+def _parse_header(
+    header: bytes, path: Path, rules: Mapping[str, type]
+) -> tuple[PriorSettings, Any]:
     """Check the settings of a header."""
     fields = ["cell_m", "classes", "place", "rule", "tile_m"]
     try:
@@ -122,7 +137,7 @@ def _parse_header(header: bytes, path: Path) -> tuple[PriorSettings, WriteRule]:
             raise InputError(f"the header must have the fields {fields}.")
         if not isinstance(values["classes"], list):
             raise InputError("classes must be a list.")
-        rule = rule_from_settings(values.pop("rule"))
+        rule = rule_from_settings(values.pop("rule"), rules)
         return PriorSettings(**values), rule
     except (ValueError, TypeError, RecursionError) as error:  # TypeError: names that are lists
         text = str(error).rstrip(".")

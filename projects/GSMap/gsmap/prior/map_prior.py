@@ -6,7 +6,7 @@ import threading
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
 import torch
@@ -14,21 +14,18 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsmap.prior.file_format import FARTHEST_TILE, read_header, write_tiles
+from gsmap.prior.inputs import Pose, Raster, planar_pose, reserve_file, to_numpy
 from gsmap.prior.rules import HitMissCounts, States, WriteRule
 from gsmap.prior.settings import PriorSettings
 from gsmap.prior.tiles import TileStore
 from gsmap.prior.vectors import covered_cells
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
-from gsmap.structures.rigid import is_rigid
 from gsmap.utils.errors import InputError
-from gsmap.utils.files import atomic_write, lock_file
+from gsmap.utils.files import atomic_write
 
-Pose = Tensor | NDArray[np.floating[Any]]
-Raster = Tensor | NDArray[Any]
 MEMORY_BYTES = 100 << 20
 """Default of the largest size of the tiles in memory."""
-_FARTHEST_M = 1e7  # largest coordinate of a pose, in metres
 _MOST_CELLS = 1 << 24  # in the rectangle around the view of a frame
 
 
@@ -89,7 +86,7 @@ class MapPrior:
             RuntimeError: If the file is reserved by another process, or another prior of this one.
         """
         path = Path(path)
-        owner = _reserve(path) if update else None
+        owner = reserve_file(path) if update else None
         try:
             mapped = _map_file(path)
             try:
@@ -121,7 +118,7 @@ class MapPrior:
         path = Path(path)
         with self._lock:
             owns_file = self._owned_path == path.resolve()
-            owner = None if owns_file else _reserve(path)
+            owner = None if owns_file else reserve_file(path)
             try:
                 with atomic_write(path, mode="wb") as file:
                     write_tiles(
@@ -192,7 +189,7 @@ class MapPrior:
         states = flat_canvas[..., window.cells]  # (S, C, H * W)
         values = self.rule.read(states).reshape(-1, grid.height, grid.width)
         device = pose.device if isinstance(pose, Tensor) else torch.device("cpu")
-        return torch.from_numpy(values).to(device)
+        return torch.fromto_numpy(values).to(device)
 
     def write(
         self, pose: Pose, grid: BEVGrid, values: Raster, visible: Raster | None = None
@@ -214,13 +211,13 @@ class MapPrior:
                 transform or too far from the origin, or the grid is too large.
         """
         size = (grid.height, grid.width)
-        prediction = _numpy(values).astype(np.float32, copy=False)
+        prediction = to_numpy(values).astype(np.float32, copy=False)
         expected = (len(self.settings.classes), *size)
         if prediction.shape != expected:
             raise InputError(f"values must have shape {expected}, got {prediction.shape}.")
         if not (prediction.min() >= 0 and prediction.max() <= 1):  # False for NaN
             raise InputError("values must be in [0, 1].")
-        in_view = np.ones(size, dtype=np.bool_) if visible is None else _numpy(visible)
+        in_view = np.ones(size, dtype=np.bool_) if visible is None else to_numpy(visible)
         if in_view.shape != size or in_view.dtype != np.bool_:
             raise InputError(
                 f"visible must be bool of shape {size}, got {in_view.dtype} of shape "
@@ -268,19 +265,9 @@ class MapPrior:
 
     def _window(self, pose: Pose, grid: BEVGrid) -> "_Window":
         """Place the cells of a frame in the rectangle around them, in cells of the prior."""
-        transform = _numpy(pose).astype(np.float64, copy=False)
-        if transform.shape != (4, 4) or not is_rigid(transform):
-            raise InputError("pose must be a rigid transform of shape (4, 4).")
-        if np.abs(transform[:2, 3]).max() > _FARTHEST_M:
-            raise InputError(
-                f"pose is {np.abs(transform[:2, 3]).max():.3g} m from the origin; at most "
-                f"{_FARTHEST_M:g} m are possible."
-            )
-        axis = transform[:2, 0]
-        length = float(np.hypot(axis[0], axis[1]))
-        if length < 1e-6:
-            raise InputError("pose has no yaw: its x axis is vertical.")
-        cos, sin = axis / length
+        frame = planar_pose(pose)
+        cos = frame.cos
+        sin = frame.sin
         dx, dy = grid.pixel_size_m
         x = grid.x_range[0] + dx * (np.arange(grid.width) + 0.5)  # (W,)
         y = grid.y_range[0] + dy * (np.arange(grid.height) + 0.5)  # (H,)
@@ -290,8 +277,8 @@ class MapPrior:
             raise InputError(
                 f"the grid reaches {corner_m:g} m, too far for cells of {self.settings.cell_m:g} m."
             )
-        global_x = (cos * x + transform[0, 3]) - sin * y[:, None]  # (H, W)
-        global_y = (sin * x + transform[1, 3]) + cos * y[:, None]
+        global_x = (cos * x + frame.x_m) - sin * y[:, None]  # (H, W)
+        global_y = (sin * x + frame.y_m) + cos * y[:, None]
         columns = np.floor(global_x / self.settings.cell_m).astype(np.int64)
         rows = np.floor(global_y / self.settings.cell_m).astype(np.int64)
         first_column = int(columns.min())
@@ -412,9 +399,9 @@ def _largest_per_cell(
     is_touched[cells] = True
     touched = np.flatnonzero(is_touched)
     largest = torch.zeros(len(values), size)
-    index = torch.from_numpy(cells)
+    index = torch.fromto_numpy(cells)
     for channel, channel_values in zip(largest, values, strict=True):
-        channel.scatter_reduce_(0, index, torch.from_numpy(channel_values), reduce="amax")
+        channel.scatter_reduce_(0, index, torch.fromto_numpy(channel_values), reduce="amax")
     return touched, largest.numpy()[:, touched]
 
 
@@ -422,23 +409,6 @@ def _flatten_cells(canvas: States) -> States:
     """View of a canvas with its rows and columns in one axis. (S, C, h, w) -> (S, C, h * w)"""
     num_states, num_classes, height, width = canvas.shape
     return canvas.reshape(num_states, num_classes, height * width)
-
-
-def _numpy(values: Raster) -> NDArray[Any]:
-    """Convert a tensor on any device, or an array, to an array."""
-    if isinstance(values, Tensor):
-        detached = values.detach()
-        if detached.dtype == torch.bfloat16:
-            detached = detached.float()
-        return detached.cpu().numpy()
-    return np.asarray(values)
-
-
-def _reserve(path: Path) -> IO[str]:
-    """Reserve a file for a writer, by a lock file beside it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    lock_path = path.with_name(f".{path.name}.lock")
-    return lock_file(lock_path, subject=path, advice="wait for its end, or write another file")
 
 
 def _map_file(path: Path) -> mmap.mmap:

@@ -1,5 +1,6 @@
 """Rules that update the cells of a map prior with the prediction of a frame."""
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 
@@ -160,27 +161,28 @@ RULES: dict[str, type[WriteRule]] = {
 """Rules by their names in files."""
 
 
-def rule_settings(rule: WriteRule) -> dict[str, Any]:
+def rule_settings(rule: Any, rules: Mapping[str, type] = RULES) -> dict[str, Any]:
     """Convert a rule to the settings that `rule_from_settings` reads."""
-    names = {kind: name for name, kind in RULES.items()}
-    fields: dict[str, Any] = asdict(rule)  # type: ignore[call-overload]
+    names = {kind: name for name, kind in rules.items()}
+    fields: dict[str, Any] = asdict(rule)
     return {"name": names[type(rule)]} | fields
 
 
-def rule_from_settings(settings: Any) -> WriteRule:
+def rule_from_settings(settings: Any, rules: Mapping[str, type] = RULES) -> Any:
     """Create a rule from untrusted settings.
 
     Args:
         settings: Name of the rule as ``name``, and its numbers.
+        rules: Classes of rules by their names; their fields are numbers.
 
     Raises:
         ValueError: If the rule is unknown or its settings are invalid.
     """
-    if not isinstance(settings, dict) or settings.get("name") not in list(RULES):
-        raise InputError(f"the rule must have a name of {sorted(RULES)}.")
-    kind = RULES[settings["name"]]
+    if not isinstance(settings, dict) or settings.get("name") not in list(rules):
+        raise InputError(f"the rule must have a name of {sorted(rules)}.")
+    kind = rules[settings["name"]]
     numbers = {name: value for name, value in settings.items() if name != "name"}
-    expected = set(rule_settings(kind())) - {"name"}
+    expected = set(rule_settings(kind(), rules)) - {"name"}
     if set(numbers) != expected:
         raise InputError(f"the rule {settings['name']} must have the settings {sorted(expected)}.")
     for name, number in numbers.items():

@@ -1,0 +1,433 @@
+"""Gaussian prior: the lines of earlier drives as Gaussians in the global frame, in tiles."""
+
+import threading
+import zlib
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gsmap.ops.gaussian_raster import render_gaussians
+from gsmap.prior.file_format import (
+    GAUSSIAN_MAGIC,
+    TileKey,
+    read_header,
+    unpack_tile,
+    write_tiles,
+)
+from gsmap.prior.gaussian_rule import GaussianRule
+from gsmap.prior.gaussian_updates import (
+    Measurements,
+    covered,
+    fuse_across,
+    measure,
+    sample_lines,
+)
+from gsmap.prior.inputs import PlanarPose, Pose, Raster, planar_pose, reserve_file, to_numpy
+from gsmap.prior.settings import PriorSettings
+from gsmap.structures.elements import FloatArray, MapElements
+from gsmap.structures.grid import BEVGrid
+from gsmap.utils.errors import InputError
+from gsmap.utils.files import atomic_write
+
+Stored = NDArray[np.void]
+"""Gaussians of a tile; positions are relative to its corner."""
+_STORED = np.dtype(
+    [
+        ("label", "<u2"),
+        ("position", "<f4", (2,)),
+        ("angle", "<f4"),
+        ("variance", "<f4"),
+        ("hits", "<f4"),
+        ("misses", "<f4"),
+    ]
+)
+_MOST_PER_TILE = 100_000
+_COUNT_BYTES = 4  # before the Gaussians of a tile in a file
+_FORGOTTEN_VALUE = 0.1  # Gaussians below it are removed
+_FORGOTTEN_VIEWS = 3.0  # if their counts are at least this
+_LARGEST_VARIANCE = 1e4  # of a Gaussian in a file, in square metres
+_FAR_M = 1e6  # position of padding, which no raster reaches
+
+
+class GaussianMasks(NamedTuple):
+    """Prior in the cells of a frame.
+
+    Attributes:
+        mean: Lines at their mean positions, with the width of a line, in [0, 1]. (C, H, W)
+        spread: Lines widened by the standard deviations of their positions, in [0, 1]. (C, H, W)
+    """
+
+    mean: Tensor
+    spread: Tensor
+
+
+class GaussianPrior:
+    """Gaussians along the lines of earlier drives, each with a class, counts and a covariance.
+
+    A Gaussian stands for a piece of a line. Its centre and its variance across the line are updated
+    by every frame that has it in view: a Kalman filter in information form. Its standard deviation
+    along the line is half of the distance of Gaussians. It also counts hits and misses, as
+    `HitMissCounts` does. Areas are kept by their outlines. All methods may be called from several
+    threads. All Gaussians are in memory.
+
+    Args:
+        settings: Classes, place and tiles; the size of cells is not used.
+        rule: Settings of the Gaussians; ``GaussianRule()`` by default.
+    """
+
+    def __init__(self, settings: PriorSettings, rule: GaussianRule | None = None) -> None:
+        self.settings = settings
+        self.rule = GaussianRule() if rule is None else rule
+        self._tiles: dict[TileKey, Stored] = {}
+        self._lock = threading.RLock()
+
+    @classmethod
+    def load(cls, path: str | Path, settings: PriorSettings | None = None) -> "GaussianPrior":
+        """Read a file that `save` has written.
+
+        Args:
+            path: File of the prior. It may be untrusted.
+            settings: Classes, place and tiles that the file must have; None to accept any.
+
+        Raises:
+            ValueError: If the file is no valid Gaussian prior, or has other settings.
+        """
+        path = Path(path)
+        content = path.read_bytes()
+        if not content:
+            raise InputError(f"{path} is empty: copy or build it again.")
+        found, rule, places = read_header(content, path, magic=GAUSSIAN_MAGIC)
+        if settings is not None:
+            settings.require_equal(found, str(path))
+        prior = cls(found, rule)
+        for key, (offset, length, crc) in places.items():
+            packed = content[offset : offset + length]
+            stored = _unpack(packed, crc=crc, path=path)
+            _check_stored(stored, settings=found, path=path)
+            prior._tiles[key] = stored
+        return prior
+
+    def save(self, path: str | Path) -> None:
+        """Write the prior to a file, which replaces ``path`` when it is complete.
+
+        Args:
+            path: File to create or replace.
+
+        Raises:
+            RuntimeError: If the file is reserved by another process.
+        """
+        path = Path(path)
+        with self._lock:
+            owner = reserve_file(path)
+            try:
+                packed = [(key, _pack(self._tiles[key])) for key in sorted(self._tiles)]
+                with atomic_write(path, mode="wb") as file:
+                    write_tiles(
+                        file, self.settings, rule=self.rule, tiles=packed, magic=GAUSSIAN_MAGIC
+                    )
+            finally:
+                owner.close()
+
+    @property
+    def num_gaussians(self) -> int:
+        """Number of all Gaussians."""
+        with self._lock:
+            return sum(len(stored) for stored in self._tiles.values())
+
+    def gaussians(self, label: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the Gaussians of a class.
+
+        Args:
+            label: Index of the class.
+
+        Returns:
+            Centres in metres in the global frame (N, 2), covariances in square metres (N, 2, 2),
+            and values in [0, 1] (N,).
+        """
+        with self._lock:
+            active = _Active.gather(self._tiles, sorted(self._tiles), self.settings.tile_m)
+        active = active.select(active.labels == label)
+        cos = np.cos(active.angles)
+        sin = np.sin(active.angles)
+        axes = np.stack([np.stack([cos, -sin], axis=-1), np.stack([sin, cos], axis=-1)], axis=-2)
+        along = np.full(len(cos), (self.rule.spacing_m / 2) ** 2)
+        variances = np.stack([along, active.variances], axis=-1)
+        covariances = (axes * variances[:, None, :]) @ axes.transpose(0, 2, 1)
+        return active.means, covariances, active.values(self.rule)
+
+    def write(
+        self, pose: Pose, grid: BEVGrid, elements: MapElements, visible: Raster | None = None
+    ) -> None:
+        """Update the prior with the prediction of a frame.
+
+        A Gaussian is measured by the nearest line of its class that crosses its normal within
+        1.5 m. Gaussians in view without such a line count a miss. Points of lines without a
+        Gaussian of their class, within 1.5 m across and three quarters of the spacing along the
+        line, become Gaussians.
+
+        Args:
+            pose: Transform from the frame to the global frame, in metres. Far from the origin it
+                must be float64. (4, 4)
+            grid: Extent of the frame, which is in view.
+            elements: Prediction in metres in the frame, with labels of the classes of the prior.
+            visible: Whether a cell of ``grid`` is in view and not occluded, bool; None if all are.
+                (H, W)
+
+        Raises:
+            ValueError: If a label or a shape is wrong, or ``pose`` is no rigid transform or too far
+                from the origin.
+        """
+        num_classes = len(self.settings.classes)
+        labels = elements.labels
+        if len(labels) and not 0 <= labels.min() <= labels.max() < num_classes:
+            raise InputError(f"labels of elements must be in [0, {num_classes}).")
+        in_view = None
+        if visible is not None:
+            in_view = to_numpy(visible)
+            if in_view.shape != (grid.height, grid.width) or in_view.dtype != np.bool_:
+                raise InputError(f"visible must be bool of shape {(grid.height, grid.width)}.")
+        frame = planar_pose(pose)
+        with self._lock:
+            keys = self._keys_in_view(frame, grid)
+            active = _Active.gather(self._tiles, keys, self.settings.tile_m)
+            is_in_view = active.are_in_view(frame, grid, in_view=in_view)
+            parts = []
+            for label in range(num_classes):
+                is_of_class = active.labels == label
+                of_class = active.select(is_of_class)
+                lines = sample_lines(elements, label, frame, rule=self.rule)
+                found = measure(of_class.means, of_class.angles, lines)
+                of_class.update(found, is_in_view[is_of_class], self.rule)
+                kept = of_class.select(~of_class.are_forgotten(self.rule))
+                is_new = ~covered(kept.means, kept.angles, lines, spacing_m=self.rule.spacing_m)
+                parts.append(kept)
+                parts.append(
+                    _Active(
+                        labels=np.full(int(is_new.sum()), label),
+                        means=lines.points[is_new],
+                        angles=lines.angles[is_new],
+                        variances=np.maximum(lines.variances[is_new], self.rule.least_sigma_m**2),
+                        hits=lines.scores[is_new],
+                        misses=1.0 - lines.scores[is_new],
+                    )
+                )
+            for key in keys:
+                self._tiles.pop(key, None)
+            _Active.join(parts).scatter(self._tiles, self.settings.tile_m)
+
+    def read(self, pose: Pose, grid: BEVGrid) -> GaussianMasks:
+        """Draw the prior in the cells of a frame (GSMap Eq. 6).
+
+        Args:
+            pose: Transform from the frame of ``grid`` to the global frame, in metres. Far from the
+                origin it must be float64. (4, 4)
+            grid: Extent and cells of the frame, H rows and W columns.
+
+        Returns:
+            Masks of means and of spreads, float32 on the device of ``pose``.
+
+        Raises:
+            ValueError: If ``pose`` is no rigid transform or too far from the origin.
+        """
+        frame = planar_pose(pose)
+        with self._lock:
+            keys = self._keys_in_view(frame, grid)
+            active = _Active.gather(self._tiles, keys, self.settings.tile_m)
+        active = active.select(active.values(self.rule) >= self.rule.least_value)
+        num_classes = len(self.settings.classes)
+        counts = np.bincount(active.labels, minlength=num_classes)
+        shape = (num_classes, max(1, int(counts.max(initial=0))))
+        means = np.full((*shape, 2), _FAR_M)
+        scales = np.ones((2, *shape, 2))  # of both masks
+        rotations = np.zeros(shape)
+        local = frame.to_frame(active.means)
+        turns = active.angles - np.arctan2(frame.sin, frame.cos)
+        width = self.rule.line_sigma_m
+        for label in range(num_classes):
+            chosen = active.labels == label
+            part = (label, slice(counts[label]))
+            means[part] = local[chosen]
+            rotations[part] = turns[chosen]
+            scales[:, label, : counts[label], 0] = self.rule.spacing_m / 2
+            scales[0, label, : counts[label], 1] = width
+            scales[1, label, : counts[label], 1] = np.sqrt(width**2 + active.variances[chosen])
+        device = pose.device if isinstance(pose, Tensor) else torch.device("cpu")
+        masks = render_gaussians(
+            torch.from_numpy(np.stack([means, means])).float().to(device),
+            torch.from_numpy(scales).float().to(device),
+            rotations=torch.from_numpy(np.stack([rotations, rotations])).float().to(device),
+            grid=grid,
+        )
+        return GaussianMasks(masks[0], spread=masks[1])
+
+    def _keys_in_view(self, frame: PlanarPose, grid: BEVGrid) -> list[TileKey]:
+        """Places of the tiles around the view of a frame, with a margin for lines that cross it."""
+        x0, x1 = grid.x_range
+        y0, y1 = grid.y_range
+        corners = frame.to_global(np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]))
+        margin_m = 5 * self.rule.spacing_m
+        low = np.floor((corners.min(axis=0) - margin_m) / self.settings.tile_m).astype(int)
+        high = np.floor((corners.max(axis=0) + margin_m) / self.settings.tile_m).astype(int)
+        keys = []
+        for column in range(low[0], high[0] + 1):
+            for row in range(low[1], high[1] + 1):
+                if (column, row) in self._tiles:
+                    keys.append((column, row))
+        return keys
+
+
+class _Active:
+    """Gaussians of some tiles in the global frame, in float64.
+
+    Args:
+        labels: Indices of the classes. (N,)
+        means: Centres in metres. (N, 2)
+        angles: Directions of the lines in radians. (N,)
+        variances: Variances across the lines in square metres. (N,)
+        hits: Counts of hits. (N,)
+        misses: Counts of misses. (N,)
+    """
+
+    def __init__(
+        self,
+        labels: NDArray[np.int64],
+        means: FloatArray,
+        angles: FloatArray,
+        variances: FloatArray,
+        hits: FloatArray,
+        misses: FloatArray,
+    ) -> None:
+        self.labels = labels
+        self.means = means
+        self.angles = angles
+        self.variances = variances
+        self.hits = hits
+        self.misses = misses
+
+    @classmethod
+    def gather(cls, tiles: dict[TileKey, Stored], keys: list[TileKey], tile_m: float) -> "_Active":
+        """Convert the Gaussians of tiles."""
+        stored = np.concatenate([np.zeros(0, _STORED), *(tiles[key] for key in keys)])
+        counts = [len(tiles[key]) for key in keys]
+        corners = tile_m * np.array(keys, dtype=np.float64).reshape(-1, 2)
+        return cls(
+            labels=stored["label"].astype(np.int64),
+            means=stored["position"].astype(np.float64) + np.repeat(corners, counts, axis=0),
+            angles=stored["angle"].astype(np.float64),
+            variances=stored["variance"].astype(np.float64),
+            hits=stored["hits"].astype(np.float64),
+            misses=stored["misses"].astype(np.float64),
+        )
+
+    @classmethod
+    def join(cls, parts: list["_Active"]) -> "_Active":
+        """Concatenate Gaussians."""
+        columns = {}
+        for name in ("labels", "means", "angles", "variances", "hits", "misses"):
+            columns[name] = np.concatenate([getattr(part, name) for part in parts])
+        return cls(**columns)
+
+    def select(self, index: NDArray[np.bool_]) -> "_Active":
+        """Select Gaussians by a mask. (N,)"""
+        return _Active(
+            labels=self.labels[index],
+            means=self.means[index],
+            angles=self.angles[index],
+            variances=self.variances[index],
+            hits=self.hits[index],
+            misses=self.misses[index],
+        )
+
+    def values(self, rule: GaussianRule) -> FloatArray:
+        """Values in [0, 1]: hits / (hits + misses + prior_count). (N,)"""
+        values: FloatArray = self.hits / (self.hits + self.misses + rule.prior_count)
+        return values
+
+    def are_forgotten(self, rule: GaussianRule) -> NDArray[np.bool_]:
+        """Whether a Gaussian has been missed so often that it is removed. (N,)"""
+        is_weak = self.values(rule) < _FORGOTTEN_VALUE
+        return is_weak & (self.hits + self.misses >= _FORGOTTEN_VIEWS)
+
+    def are_in_view(
+        self, frame: PlanarPose, grid: BEVGrid, in_view: NDArray[np.bool_] | None
+    ) -> NDArray[np.bool_]:
+        """Whether a Gaussian lies in a visible cell of a frame. (N,)"""
+        cells = np.floor(grid.px_from_metres(frame.to_frame(self.means))).astype(np.int64)
+        columns, rows = cells.T
+        is_inside = (columns >= 0) & (columns < grid.width) & (rows >= 0) & (rows < grid.height)
+        if in_view is not None:
+            inside = np.flatnonzero(is_inside)
+            is_inside[inside] = in_view[rows[inside], columns[inside]]
+        return is_inside
+
+    def update(
+        self, found: Measurements, is_in_view: NDArray[np.bool_], rule: GaussianRule
+    ) -> None:
+        """Update Gaussians by their measurements, and count hits and misses.
+
+        Args:
+            found: Measurements. N
+            is_in_view: Whether a Gaussian is in view. (N,)
+            rule: Settings.
+        """
+        seen = is_in_view | found.is_found
+        variances, gains = fuse_across(
+            self.variances, found, rule.decay, least_variance=rule.least_sigma_m**2
+        )
+        normals = np.stack([-np.sin(self.angles), np.cos(self.angles)], axis=1)
+        self.means = self.means + (gains * found.distances)[:, None] * normals
+        self.angles = self.angles + gains * found.turns
+        self.variances = variances
+        decay = np.where(seen, rule.decay, 1.0)
+        self.hits = decay * self.hits + found.scores
+        self.misses = decay * self.misses + np.where(seen, 1.0 - found.scores, 0.0)
+
+    def scatter(self, tiles: dict[TileKey, Stored], tile_m: float) -> None:
+        """Distribute the Gaussians to tiles, to whose content they are added."""
+        places = np.floor(self.means / tile_m).astype(np.int64)
+        keys, rows = np.unique(places, axis=0, return_inverse=True)
+        stored = np.zeros(len(self.labels), _STORED)
+        stored["label"] = self.labels
+        stored["position"] = self.means - tile_m * places
+        stored["angle"] = np.arctan2(np.sin(self.angles), np.cos(self.angles))
+        stored["variance"] = self.variances
+        stored["hits"] = self.hits
+        stored["misses"] = self.misses
+        for number, (column, row) in enumerate(keys.tolist()):
+            added = stored[rows.ravel() == number]
+            present = tiles.get((column, row), np.zeros(0, _STORED))
+            tiles[column, row] = np.concatenate([present, added])
+
+
+def _pack(stored: Stored) -> bytes:
+    """Compress the Gaussians of a tile."""
+    count = len(stored).to_bytes(_COUNT_BYTES, "little")
+    return count + zlib.compress(stored.tobytes(), level=1)
+
+
+def _unpack(content: bytes, crc: int, path: Path) -> Stored:
+    """Decompress the Gaussians of a tile, in bounded memory."""
+    count = int.from_bytes(content[:_COUNT_BYTES], "little")
+    if zlib.crc32(content) != crc or len(content) < _COUNT_BYTES or count > _MOST_PER_TILE:
+        raise InputError(f"{path} is damaged: a tile cannot be read; copy or build it again.")
+    packed = content[_COUNT_BYTES:]
+    num_bytes = count * _STORED.itemsize
+    states = unpack_tile(packed, crc=zlib.crc32(packed), num_bytes=num_bytes, path=path)
+    return np.frombuffer(states, dtype=_STORED)
+
+
+def _check_stored(stored: Stored, settings: PriorSettings, path: Path) -> None:
+    """Check the values of untrusted Gaussians."""
+    position = stored["position"]
+    variance = stored["variance"]
+    is_valid = (stored["label"] < len(settings.classes)) & np.isfinite(stored["angle"])
+    is_valid &= ((position >= 0) & (position <= settings.tile_m)).all(axis=1)
+    is_valid &= (variance > 0) & (variance <= _LARGEST_VARIANCE)
+    for name in ("hits", "misses"):
+        is_valid &= (stored[name] >= 0) & np.isfinite(stored[name])
+    if not is_valid.all():
+        raise InputError(f"{path} is damaged: a Gaussian is out of range; build it again.")

@@ -1,0 +1,54 @@
+"""Settings of a Gaussian prior."""
+
+from dataclasses import dataclass
+
+from gsmap.utils.errors import InputError
+
+
+@dataclass(frozen=True)
+class GaussianRule:
+    """Settings of the Gaussians of a prior and of their update.
+
+    Args:
+        spacing_m: Distance of new Gaussians along a line, in [0.2, 5] metres. The standard
+            deviation of a Gaussian along its line is half of it.
+        sigma_m: Standard deviation across its line of a prediction without Gaussians, in [0.01, 5]
+            metres.
+        least_sigma_m: Smallest standard deviation of a Gaussian across its line, in [0.001, 1]
+            metres, which covers the errors that all frames share.
+        line_sigma_m: Standard deviation of a drawn line across its direction, in [0.05, 2] metres.
+        decay: Factor of older counts and of older information at each view, in [0.5, 1].
+        prior_count: Pseudo-count of misses, in [0.01, 100].
+        least_value: Smallest value of a drawn Gaussian, in [0, 1]; the value is hits / (hits +
+            misses + ``prior_count``).
+
+    Raises:
+        ValueError: If a setting is out of range.
+    """
+
+    spacing_m: float = 1.0
+    sigma_m: float = 0.2
+    least_sigma_m: float = 0.05
+    line_sigma_m: float = 0.2
+    decay: float = 0.95
+    prior_count: float = 0.25
+    least_value: float = 0.4
+
+    def __post_init__(self) -> None:
+        ranges = {
+            "spacing_m": (0.2, 5.0),
+            "sigma_m": (0.01, 5.0),
+            "least_sigma_m": (0.001, 1.0),
+            "line_sigma_m": (0.05, 2.0),
+            "decay": (0.5, 1.0),
+            "prior_count": (0.01, 100.0),
+            "least_value": (0.0, 1.0),
+        }
+        for name, (low, high) in ranges.items():
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise InputError(f"{name} must be in [{low:g}, {high:g}], got {value}.")
+
+
+GAUSSIAN_RULES: dict[str, type] = {"gaussians": GaussianRule}
+"""Settings of Gaussian priors by their name in files."""

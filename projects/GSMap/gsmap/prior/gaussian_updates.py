@@ -1,0 +1,252 @@
+"""Measurements of stored Gaussians by the lines of a frame, and their Kalman update."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gsmap.prior.gaussian_rule import GaussianRule
+from gsmap.prior.inputs import PlanarPose
+from gsmap.structures.elements import FloatArray, IntArray, MapElements
+from gsmap.structures.gaussians import Gaussians, extents_along_line
+from gsmap.structures.polylines import arc_lengths
+
+REACH_M = 1.5
+"""Largest distance in metres of a line from a Gaussian that it measures, as in ``build_map``."""
+_LEAST_COSINE = np.cos(np.radians(30.0))  # between a Gaussian and a line that measures it
+_SIGMA_PER_M = 0.02  # standard deviation per metre of distance from the vehicle
+_COVERED = 0.75  # of the spacing: distance along a line within which no Gaussian is added
+_ROUNDING_M = 1e-3  # covers the rounding of stored positions at the ends of a line
+_CHUNK = 4_000_000  # pairs of a Gaussian and a segment at a time
+
+
+@dataclass(frozen=True, eq=False)
+class LineSamples:
+    """Points along the lines of one class of a frame, in the global frame.
+
+    Args:
+        points: Points in metres; point i and point i + 1 are the ends of a segment unless i is the
+            last point of a line. (M, 2)
+        variances: Variance of each point across its line, in square metres. (M,)
+        scores: Score of the line of each point, in [0, 1]. (M,)
+        starts: Indices of the first ends of the segments. (S,)
+        angles: Direction of the line at each point in radians, anticlockwise from +x. (M,)
+    """
+
+    points: FloatArray
+    variances: FloatArray
+    scores: FloatArray
+    starts: IntArray
+    angles: FloatArray
+
+
+class Measurements(NamedTuple):
+    """Distances of Gaussians from the nearest line of a frame, one for each Gaussian.
+
+    Attributes:
+        is_found: Whether a line crosses the normal of the Gaussian within reach. (N,)
+        distances: Distance to it along the normal in metres, positive on the left. (N,)
+        variances: Variance of the distance in square metres. (N,)
+        turns: Angle from the Gaussian to the line, in radians within 30 degrees. (N,)
+        scores: Score of the line, in [0, 1]; 0 without a line. (N,)
+    """
+
+    is_found: NDArray[np.bool_]
+    distances: FloatArray
+    variances: FloatArray
+    turns: FloatArray
+    scores: FloatArray
+
+
+def sample_lines(
+    elements: MapElements, label: int, pose: PlanarPose, rule: GaussianRule
+) -> LineSamples:
+    """Sample the lines of one class at equal steps.
+
+    The variance of a vertex across its line is the variance of its Gaussian, or of the rule, plus
+    (0.02 d)^2 at the distance d from the vehicle.
+
+    Args:
+        elements: Predictions in metres in the frame of ``pose``.
+        label: Index of the class.
+        pose: Position and yaw of the frame.
+        rule: Distance of the points, and variance of predictions without Gaussians.
+    """
+    chosen = elements.select(elements.labels == label).with_coordinates(2)
+    points = [np.zeros((0, 2))]
+    variances = [np.zeros(0)]
+    scores = [np.zeros(0)]
+    angles = [np.zeros(0)]
+    starts = [np.zeros(0, np.int64)]
+    num_points = 0
+    vertex_variances = _vertex_variances(chosen, rule)
+    for index, (line, _, score) in enumerate(chosen.rows):
+        along = arc_lengths(line) if len(line) > 1 else np.zeros(1)
+        if along[-1] <= 0.0:
+            continue
+        count = max(2, int(np.ceil(along[-1] / rule.spacing_m)) + 1)
+        positions = np.linspace(0.0, along[-1], count)
+        local_x = np.interp(positions, along, line[:, 0])
+        local_y = np.interp(positions, along, line[:, 1])
+        local = np.stack([local_x, local_y], axis=1)
+        part = slice(chosen.offsets[index], chosen.offsets[index + 1])
+        far = (_SIGMA_PER_M * np.linalg.norm(local, axis=1)) ** 2
+        in_global = pose.to_global(local)
+        steps = np.gradient(in_global, axis=0)
+        points.append(in_global)
+        variances.append(np.interp(positions, along, vertex_variances[part]) + far)
+        scores.append(np.full(count, score))
+        angles.append(np.arctan2(steps[:, 1], steps[:, 0]))
+        starts.append(num_points + np.arange(count - 1))
+        num_points += count
+    return LineSamples(
+        points=np.concatenate(points),
+        variances=np.concatenate(variances),
+        scores=np.concatenate(scores),
+        starts=np.concatenate(starts),
+        angles=np.concatenate(angles),
+    )
+
+
+def _vertex_variances(elements: MapElements, rule: GaussianRule) -> FloatArray:
+    """Variance of each vertex across its line, in square metres. (M,)"""
+    variances = np.full(len(elements.points), rule.sigma_m**2)
+    if elements.scales is None or elements.rotations is None:
+        return variances
+    for start, end in zip(elements.offsets[:-1], elements.offsets[1:], strict=True):
+        if end - start > 1:
+            gaussians = Gaussians(
+                torch.from_numpy(elements.points[start:end]),
+                scales=torch.from_numpy(elements.scales[start:end]),
+                rotations=torch.from_numpy(elements.rotations[start:end]),
+            )
+            variances[start:end] = extents_along_line(gaussians)[:, 1].numpy() ** 2
+    return variances
+
+
+def measure(means: FloatArray, angles: FloatArray, lines: LineSamples) -> Measurements:
+    """Measure Gaussians by the nearest line that crosses their normals.
+
+    A line counts if it crosses the normal within 1.5 m at an angle of at most 30 degrees from the
+    direction of the Gaussian.
+
+    Args:
+        means: Centres of the Gaussians in metres. (N, 2)
+        angles: Directions of their lines in radians. (N,)
+        lines: Lines of the frame.
+    """
+    count = len(means)
+    found = Measurements(
+        is_found=np.zeros(count, dtype=np.bool_),
+        distances=np.zeros(count),
+        variances=np.ones(count),
+        turns=np.zeros(count),
+        scores=np.zeros(count),
+    )
+    num_segments = len(lines.starts)
+    if not num_segments:
+        return found
+    size = max(1, _CHUNK // num_segments)
+    for first in range(0, count, size):
+        part = slice(first, first + size)
+        _measure_part(means[part], angles[part], lines=lines, found=found, first=first)
+    return found
+
+
+def _measure_part(
+    means: FloatArray, angles: FloatArray, lines: LineSamples, found: Measurements, first: int
+) -> None:
+    """Measure some Gaussians, and write the result from the index ``first`` on."""
+    start_points = lines.points[lines.starts]
+    end_points = lines.points[lines.starts + 1]
+    cos = np.cos(angles)[:, None]
+    sin = np.sin(angles)[:, None]
+    x = means[:, :1]
+    y = means[:, 1:]
+    # Coordinates along and across each Gaussian. (N, S)
+    start_along = cos * (start_points[:, 0] - x) + sin * (start_points[:, 1] - y)
+    end_along = cos * (end_points[:, 0] - x) + sin * (end_points[:, 1] - y)
+    start_across = cos * (start_points[:, 1] - y) - sin * (start_points[:, 0] - x)
+    end_across = cos * (end_points[:, 1] - y) - sin * (end_points[:, 0] - x)
+    extent = end_along - start_along
+    fraction = -start_along / np.where(extent == 0, np.inf, extent)
+    distance = start_across + fraction * (end_across - start_across)
+    length = np.linalg.norm(end_points - start_points, axis=1)
+    crosses = (np.minimum(start_along, end_along) <= _ROUNDING_M) & (
+        np.maximum(start_along, end_along) >= -_ROUNDING_M
+    )
+    is_match = crosses & (np.abs(distance) <= REACH_M)
+    is_match &= np.abs(extent) >= _LEAST_COSINE * length
+    is_match &= length > 0
+    best = np.where(is_match, np.abs(distance), np.inf).argmin(axis=1)
+    rows = np.flatnonzero(is_match[np.arange(len(means)), best])
+    best = best[rows]
+    index = first + rows
+    share = fraction[rows, best]
+    starts = lines.starts[best]
+    rise = end_across[rows, best] - start_across[rows, best]
+    found.is_found[index] = True
+    found.distances[index] = distance[rows, best]
+    found.turns[index] = np.arctan(rise / extent[rows, best])
+    found.scores[index] = lines.scores[starts]
+    start_variances = lines.variances[starts]
+    end_variances = lines.variances[starts + 1]
+    found.variances[index] = start_variances + share * (end_variances - start_variances)
+
+
+def covered(
+    means: FloatArray, angles: FloatArray, lines: LineSamples, spacing_m: float
+) -> NDArray[np.bool_]:
+    """Find the points of lines that a Gaussian already describes.
+
+    Args:
+        means: Centres of the Gaussians in metres. (N, 2)
+        angles: Directions of their lines in radians. (N,)
+        lines: Lines of the frame. M points
+        spacing_m: Distance of Gaussians along a line in metres.
+
+    Returns:
+        Whether a Gaussian of about the direction of the line is within reach. (M,)
+    """
+    is_covered = np.zeros(len(lines.points), dtype=np.bool_)
+    if not len(means):
+        return is_covered
+    size = max(1, _CHUNK // len(means))
+    for first in range(0, len(lines.points), size):
+        part = slice(first, first + size)
+        offsets = lines.points[part, None] - means  # (M, N, 2)
+        along = np.abs(np.cos(angles) * offsets[..., 0] + np.sin(angles) * offsets[..., 1])
+        across = np.abs(np.cos(angles) * offsets[..., 1] - np.sin(angles) * offsets[..., 0])
+        cosine = np.abs(np.cos(lines.angles[part, None] - angles))
+        is_near = (along <= _COVERED * spacing_m) & (across <= REACH_M)
+        is_covered[part] = (is_near & (cosine >= _LEAST_COSINE)).any(axis=1)
+    return is_covered
+
+
+def fuse_across(
+    variances: FloatArray, found: Measurements, decay: float, least_variance: float
+) -> tuple[FloatArray, FloatArray]:
+    r"""Multiply Gaussians with their measurements, in information form.
+
+    A line measures the position across it alone: its information is :math:`n n^T / \sigma_m^2` with
+    the normal n. The variance across becomes :math:`1 / (\lambda / \sigma^2 + 1 / \sigma_m^2)` with
+    the decay :math:`\lambda`, and the centre moves by the gain
+    :math:`\sigma_{new}^2 / \sigma_m^2` times the distance.
+
+    Args:
+        variances: Variances across the lines, in square metres. (N,)
+        found: Measurements.
+        decay: Factor of the older information.
+        least_variance: Smallest variance in square metres.
+
+    Returns:
+        New variances in square metres (N,), and gains in [0, 1], 0 without a measurement (N,).
+    """
+    information = decay / variances
+    measured = found.is_found / found.variances
+    fused = 1.0 / (information + measured)
+    gains = fused * measured
+    new_variances = np.where(found.is_found, np.maximum(fused, least_variance), variances)
+    return new_variances, gains
