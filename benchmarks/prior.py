@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks.measure import MIB, Cost, in_own_process, markdown_table, measure, publish
+from benchmarks.prior_kinds import compare
 from gsmap.prior import HitMissCounts, KeepMaximum, LastSeen, MapPrior, PriorSettings
 from gsmap.prior.rules import WriteRule
 from gsmap.structures.grid import BEVGrid
@@ -28,6 +29,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``benchmarks prior`` to a parser."""
     parser.add_argument("--km", type=float, default=20.0, help="length of the driven road")
     parser.add_argument("--repeats", type=int, default=30, help="timed frames")
+    parser.add_argument(
+        "--compared-km", type=float, default=0.5, help="road of the comparison with Gaussians"
+    )
     parser.add_argument("--out", type=Path, help="write the table to this file, too")
 
 
@@ -55,7 +59,8 @@ def run(args: argparse.Namespace) -> None:
         f"{args.km:g} km with a frame every {STEP_M:g} m are written, saved, opened and read; "
         "processor time and peak memory of all that.\n"
     )
-    publish(f"{text}\n{markdown_table(header, rows)}", args.out)
+    table = markdown_table(header, rows)
+    publish(f"{text}\n{table}\n\n{compare(args.compared_km)}", args.out)
 
 
 def prediction(index: int) -> NDArray[np.float32]:

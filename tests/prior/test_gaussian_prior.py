@@ -46,18 +46,19 @@ def across_variance(distance_m, sigma_m):
 
 
 def test_two_lines_make_their_weighted_mean_by_hand():
-    """Lines at x = 0 and 0.3 m, whose variances are 0.04 and 0.01 near the vehicle: 0.24 m."""
+    """Lines at x = 0 and 0.3 m, with variances 0.04 and 0.01 + (0.02 * 0.3)^2 = 0.010036.
+
+    The mean is 0.3 * 0.04 / 0.050036, the variance 0.04 * 0.010036 / 0.050036.
+    """
     prior = GaussianPrior(SETTINGS, PLAIN)
     prior.write(pose_at(), GRID, line_at(0.0, sigma_m=0.2))
     prior.write(pose_at(), GRID, line_at(0.3, sigma_m=0.1))
     means, found, values = prior.gaussians(0)
     assert len(means) == 11  # one a metre
     middle = np.abs(means[:, 1]).argmin()
-    # the second line is 0.3 m from the vehicle, which adds 0.006^2 to its variance
-    assert means[middle] == pytest.approx([0.24, 0.0], abs=5e-4)
-    # 1 / (1 / 0.04 + 1 / 0.01) across, half of the spacing along
-    expected = np.diag([0.008, 0.25])
-    np.testing.assert_allclose(found[middle], expected, atol=1e-5)
+    assert means[middle] == pytest.approx([0.2398273, 0.0], abs=1e-5)  # float32 within a tile
+    expected = np.diag([0.00802302, 0.25])  # along the line: half of the spacing
+    np.testing.assert_allclose(found[middle], expected, atol=1e-6)
     np.testing.assert_allclose(values, 2 / 2.25, rtol=1e-6)  # two hits and the pseudo-count
     assert prior.gaussians(1)[0].shape == (0, 2)
 

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from gsmap.prior.gaussian_rule import GaussianRule
 from gsmap.prior.inputs import PlanarPose
@@ -19,7 +20,6 @@ _LEAST_COSINE = np.cos(np.radians(30.0))  # between a Gaussian and a line that m
 _SIGMA_PER_M = 0.02  # standard deviation per metre of distance from the vehicle
 _COVERED = 0.75  # of the spacing: distance along a line within which no Gaussian is added
 _ROUNDING_M = 1e-3  # covers the rounding of stored positions at the ends of a line
-_CHUNK = 4_000_000  # pairs of a Gaussian and a segment at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,55 +145,55 @@ def measure(means: FloatArray, angles: FloatArray, lines: LineSamples) -> Measur
         turns=np.zeros(count),
         scores=np.zeros(count),
     )
-    num_segments = len(lines.starts)
-    if not num_segments:
+    if not count or not len(lines.starts):
         return found
-    size = max(1, _CHUNK // num_segments)
-    for first in range(0, count, size):
-        part = slice(first, first + size)
-        _measure_part(means[part], angles[part], lines=lines, found=found, first=first)
+    start_points = lines.points[lines.starts]
+    end_points = lines.points[lines.starts + 1]
+    lengths = np.linalg.norm(end_points - start_points, axis=1)
+    # A segment that crosses a normal within reach has its middle within this radius.
+    radius_m = REACH_M + lengths.max() / 2 + _ROUNDING_M
+    rows, segments = _near_pairs(means, (start_points + end_points) / 2, radius_m=radius_m)
+    starts = _offsets(start_points[segments], means[rows], angles=angles[rows])
+    ends = _offsets(end_points[segments], means[rows], angles=angles[rows])
+    extent, rise = (ends - starts).T
+    start_along, start_across = starts.T
+    fraction = -start_along / np.where(extent == 0, np.inf, extent)
+    distances = start_across + fraction * rise
+    crosses = (np.minimum(start_along, ends[:, 0]) <= _ROUNDING_M) & (
+        np.maximum(start_along, ends[:, 0]) >= -_ROUNDING_M
+    )
+    is_match = crosses & (np.abs(distances) <= REACH_M) & (lengths[segments] > 0)
+    is_match &= np.abs(extent) >= _LEAST_COSINE * lengths[segments]
+    matches = np.flatnonzero(is_match)
+    order = np.lexsort((segments[matches], np.abs(distances[matches]), rows[matches]))
+    matches = matches[order]
+    index, first = np.unique(rows[matches], return_index=True)
+    best = matches[first]
+    points = lines.starts[segments[best]]
+    start_variances = lines.variances[points]
+    end_variances = lines.variances[points + 1]
+    found.is_found[index] = True
+    found.distances[index] = distances[best]
+    found.turns[index] = np.arctan(rise[best] / extent[best])
+    found.scores[index] = lines.scores[points]
+    found.variances[index] = start_variances + fraction[best] * (end_variances - start_variances)
     return found
 
 
-def _measure_part(
-    means: FloatArray, angles: FloatArray, lines: LineSamples, found: Measurements, first: int
-) -> None:
-    """Measure some Gaussians, and write the result from the index ``first`` on."""
-    start_points = lines.points[lines.starts]
-    end_points = lines.points[lines.starts + 1]
-    cos = np.cos(angles)[:, None]
-    sin = np.sin(angles)[:, None]
-    x = means[:, :1]
-    y = means[:, 1:]
-    # Coordinates along and across each Gaussian. (N, S)
-    start_along = cos * (start_points[:, 0] - x) + sin * (start_points[:, 1] - y)
-    end_along = cos * (end_points[:, 0] - x) + sin * (end_points[:, 1] - y)
-    start_across = cos * (start_points[:, 1] - y) - sin * (start_points[:, 0] - x)
-    end_across = cos * (end_points[:, 1] - y) - sin * (end_points[:, 0] - x)
-    extent = end_along - start_along
-    fraction = -start_along / np.where(extent == 0, np.inf, extent)
-    distance = start_across + fraction * (end_across - start_across)
-    length = np.linalg.norm(end_points - start_points, axis=1)
-    crosses = (np.minimum(start_along, end_along) <= _ROUNDING_M) & (
-        np.maximum(start_along, end_along) >= -_ROUNDING_M
-    )
-    is_match = crosses & (np.abs(distance) <= REACH_M)
-    is_match &= np.abs(extent) >= _LEAST_COSINE * length
-    is_match &= length > 0
-    best = np.where(is_match, np.abs(distance), np.inf).argmin(axis=1)
-    rows = np.flatnonzero(is_match[np.arange(len(means)), best])
-    best = best[rows]
-    index = first + rows
-    share = fraction[rows, best]
-    starts = lines.starts[best]
-    rise = end_across[rows, best] - start_across[rows, best]
-    found.is_found[index] = True
-    found.distances[index] = distance[rows, best]
-    found.turns[index] = np.arctan(rise / extent[rows, best])
-    found.scores[index] = lines.scores[starts]
-    start_variances = lines.variances[starts]
-    end_variances = lines.variances[starts + 1]
-    found.variances[index] = start_variances + share * (end_variances - start_variances)
+def _near_pairs(
+    first: FloatArray, second: FloatArray, radius_m: float
+) -> tuple[IntArray, IntArray]:
+    """Find the pairs of points within a radius; return the indices of both. (N, 2), (M, 2)"""
+    pairs = cKDTree(first).sparse_distance_matrix(cKDTree(second), radius_m, output_type="ndarray")
+    return pairs["i"], pairs["j"]
+
+
+def _offsets(points: FloatArray, means: FloatArray, angles: FloatArray) -> FloatArray:
+    """Coordinates of points (n, 2) along and across Gaussians, in metres. -> (n, 2)"""
+    x, y = (points - means).T
+    cos = np.cos(angles)
+    sin = np.sin(angles)
+    return np.stack([cos * x + sin * y, cos * y - sin * x], axis=1)
 
 
 def covered(
@@ -211,17 +211,15 @@ def covered(
         Whether a Gaussian of about the direction of the line is within reach. (M,)
     """
     is_covered = np.zeros(len(lines.points), dtype=np.bool_)
-    if not len(means):
+    if not len(means) or not len(lines.points):
         return is_covered
-    size = max(1, _CHUNK // len(means))
-    for first in range(0, len(lines.points), size):
-        part = slice(first, first + size)
-        offsets = lines.points[part, None] - means  # (M, N, 2)
-        along = np.abs(np.cos(angles) * offsets[..., 0] + np.sin(angles) * offsets[..., 1])
-        across = np.abs(np.cos(angles) * offsets[..., 1] - np.sin(angles) * offsets[..., 0])
-        cosine = np.abs(np.cos(lines.angles[part, None] - angles))
-        is_near = (along <= _COVERED * spacing_m) & (across <= REACH_M)
-        is_covered[part] = (is_near & (cosine >= _LEAST_COSINE)).any(axis=1)
+    most_along_m = _COVERED * spacing_m
+    radius_m = float(np.hypot(most_along_m, REACH_M))
+    points, rows = _near_pairs(lines.points, means, radius_m=radius_m)
+    offsets = np.abs(_offsets(lines.points[points], means[rows], angles=angles[rows]))
+    cosine = np.abs(np.cos(lines.angles[points] - angles[rows]))
+    is_near = (offsets[:, 0] <= most_along_m) & (offsets[:, 1] <= REACH_M)
+    is_covered[points[is_near & (cosine >= _LEAST_COSINE)]] = True
     return is_covered
 
 

@@ -189,7 +189,7 @@ class MapPrior:
         states = flat_canvas[..., window.cells]  # (S, C, H * W)
         values = self.rule.read(states).reshape(-1, grid.height, grid.width)
         device = pose.device if isinstance(pose, Tensor) else torch.device("cpu")
-        return torch.fromto_numpy(values).to(device)
+        return torch.from_numpy(values).to(device)
 
     def write(
         self, pose: Pose, grid: BEVGrid, values: Raster, visible: Raster | None = None
@@ -399,9 +399,9 @@ def _largest_per_cell(
     is_touched[cells] = True
     touched = np.flatnonzero(is_touched)
     largest = torch.zeros(len(values), size)
-    index = torch.fromto_numpy(cells)
+    index = torch.from_numpy(cells)
     for channel, channel_values in zip(largest, values, strict=True):
-        channel.scatter_reduce_(0, index, torch.fromto_numpy(channel_values), reduce="amax")
+        channel.scatter_reduce_(0, index, torch.from_numpy(channel_values), reduce="amax")
     return touched, largest.numpy()[:, touched]
 
 
