@@ -21,7 +21,7 @@ from gsmap.prior.file_format import (
 from gsmap.prior.gaussian_rule import GaussianRule
 from gsmap.prior.gaussian_updates import (
     Measurements,
-    covered,
+    find_covered_points,
     fuse_across,
     measure,
     sample_lines,
@@ -203,7 +203,9 @@ class GaussianPrior:
                 found = measure(of_class.means, of_class.angles, lines)
                 of_class.update(found, is_in_view[is_of_class], self.rule)
                 kept = of_class.select(~of_class.are_forgotten(self.rule))
-                is_new = ~covered(kept.means, kept.angles, lines, spacing_m=self.rule.spacing_m)
+                is_new = ~find_covered_points(
+                    kept.means, kept.angles, lines, spacing_m=self.rule.spacing_m
+                )
                 parts.append(kept)
                 parts.append(
                     _Active(

@@ -196,7 +196,7 @@ def _offsets(points: FloatArray, means: FloatArray, angles: FloatArray) -> Float
     return np.stack([cos * x + sin * y, cos * y - sin * x], axis=1)
 
 
-def covered(
+def find_covered_points(
     means: FloatArray, angles: FloatArray, lines: LineSamples, spacing_m: float
 ) -> NDArray[np.bool_]:
     """Find the points of lines that a Gaussian already describes.
