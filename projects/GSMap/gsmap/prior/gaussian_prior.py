@@ -20,6 +20,7 @@ from gsmap.prior.file_format import (
 )
 from gsmap.prior.gaussian_rule import GaussianRule
 from gsmap.prior.gaussian_updates import (
+    LineSamples,
     Measurements,
     find_covered_points,
     fuse_across,
@@ -203,20 +204,8 @@ class GaussianPrior:
                 found = measure(of_class.means, of_class.angles, lines)
                 of_class.update(found, is_in_view[is_of_class], self.rule)
                 kept = of_class.select(~of_class.are_forgotten(self.rule))
-                is_new = ~find_covered_points(
-                    kept.means, kept.angles, lines, spacing_m=self.rule.spacing_m
-                )
                 parts.append(kept)
-                parts.append(
-                    _Active(
-                        labels=np.full(int(is_new.sum()), label),
-                        means=lines.points[is_new],
-                        angles=lines.angles[is_new],
-                        variances=np.maximum(lines.variances[is_new], self.rule.least_sigma_m**2),
-                        hits=lines.scores[is_new],
-                        misses=1.0 - lines.scores[is_new],
-                    )
-                )
+                parts.append(_new_gaussians(kept, lines, label=label, rule=self.rule))
             for key in keys:
                 self._tiles.pop(key, None)
             _Active.join(parts).scatter(self._tiles, self.settings.tile_m)
@@ -403,6 +392,28 @@ class _Active:
             added = stored[rows.ravel() == number]
             present = tiles.get((column, row), np.zeros(0, _STORED))
             tiles[column, row] = np.concatenate([present, added])
+
+
+def _new_gaussians(kept: _Active, lines: LineSamples, label: int, rule: GaussianRule) -> _Active:
+    """Create Gaussians at the points of lines that no Gaussian describes.
+
+    Args:
+        kept: Gaussians of the class.
+        lines: Points along the lines of the frame.
+        label: Index of the class.
+        rule: Settings.
+    """
+    is_covered = find_covered_points(kept.means, kept.angles, lines=lines, spacing_m=rule.spacing_m)
+    is_new = ~is_covered
+    scores = lines.scores[is_new]
+    return _Active(
+        labels=np.full(len(scores), label),
+        means=lines.points[is_new],
+        angles=lines.angles[is_new],
+        variances=np.maximum(lines.variances[is_new], rule.least_sigma_m**2),
+        hits=scores,
+        misses=1.0 - scores,
+    )
 
 
 def _pack(stored: Stored) -> bytes:
