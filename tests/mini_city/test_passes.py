@@ -12,7 +12,7 @@ from nuscenes.nuscenes import NuScenes
 from gsmap.datasets.annotations.file import AnnotationFile
 from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
 from minicity.config import MiniCityConfig
-from minicity.generate import generate
+from minicity.generate import _splits, generate, plan_scenes
 from minicity.map_expansion import town_to_map
 from minicity.repaint import Change, list_changes, repaint_town
 from minicity.roads import CrossSection, Road, RoadStyle
@@ -260,11 +260,28 @@ def test_a_removed_crossing_in_the_middle_joins_the_dividers() -> None:
         ({"passes": 2, "repainted": float("nan")}, "share in 0..1, got nan"),
         ({"repainted": 0.5}, "passes >= 2"),
         ({"scenes": 400, "passes": 4}, "got 1280 and 320"),
+        ({"passes": 3, "new_passes": 3}, "new_passes must be in 1..2, one less than the passes"),
+        ({"passes": 3, "new_passes": 0}, "new_passes must be in 1..2"),
+        ({"new_passes": 2}, "new_passes must be in 1..1"),
     ],
 )
 def test_values_out_of_range_are_refused(values: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         MiniCityConfig(**{"scenes": 4, **values})
+
+
+def test_new_passes_have_the_new_paint_and_are_for_validation() -> None:
+    config = MiniCityConfig(scenes=2, passes=5, new_passes=2, repainted=0.1)
+    tasks = plan_scenes(config)
+    val = [task for task in tasks if task.location == VAL_TOWN]
+    new = [task.expansion == VAL_TOWN for task in val]
+    assert new == [False, False, False, True, True]
+    splits = _splits(config, tasks)
+    assert splits["val"] == [task.name for task in val[3:]]
+    assert splits["val_earlier"] == [task.name for task in val[:3]]
+    assert len(splits["train"]) == 5
+    assert config.as_dict()["new_passes"] == 2
+    assert "new_passes" not in MiniCityConfig(scenes=2, passes=5).as_dict()
 
 
 def test_another_number_of_passes_is_another_data_set(root: Path) -> None:

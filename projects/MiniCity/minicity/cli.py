@@ -49,7 +49,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--repainted",
         type=float,
         metavar="SHARE",
-        help="share of the streets that are repainted before the last pass (default: 0)",
+        help="share of the streets that are repainted before the new passes (default: 0)",
+    )
+    parser.add_argument(
+        "--new-passes",
+        type=int,
+        metavar="M",
+        help="how many of the passes are new: after the repainting, for validation (default: 1)",
     )
     parser.add_argument("--workers", type=int, help="processes (default: one per core)")
 
@@ -63,6 +69,7 @@ SIZE_OPTIONS = (
     "val_scenes",
     "passes",
     "repainted",
+    "new_passes",
 )
 
 
@@ -115,6 +122,7 @@ def run(arguments: argparse.Namespace) -> str:
         val_scenes=config.val_scenes,
         passes=config.passes,
         repainted=config.repainted,
+        new_passes=config.new_passes,
         workers=arguments.workers,
     )
     if not is_new:

@@ -29,7 +29,8 @@ class MiniCityConfig:
         sweeps_per_sample: LiDAR sweeps between two key frames, in [0, 9].
         val_scenes: Validation scenes among ``scenes``; None takes a fifth, at least one.
         passes: Number of times that every scene is driven, in [1, 20].
-        repainted: Share of the streets that are repainted before the last pass, in [0, 1].
+        repainted: Share of the streets that are repainted between two passes, in [0, 1].
+        new_passes: Number of passes after the repainting, in [1, passes - 1] if there is one.
 
     Raises:
         ValueError: If a value is out of range.
@@ -44,6 +45,7 @@ class MiniCityConfig:
     val_scenes: int | None = None
     passes: int = 1
     repainted: float = 0.0
+    new_passes: int = 1
 
     def __post_init__(self) -> None:
         """Check the range of every value."""
@@ -74,6 +76,12 @@ class MiniCityConfig:
             raise InputError(f"repainted must be a share in 0..1, got {self.repainted}.")
         if self.repainted > 0 and self.passes == 1:
             raise InputError("repainted streets need a pass before and one after: passes >= 2.")
+        most_new = max(1, self.passes - 1)
+        if not 1 <= self.new_passes <= most_new:
+            raise InputError(
+                f"new_passes must be in 1..{most_new}, one less than the passes, got "
+                f"{self.new_passes}."
+            )
         train_names = self.num_train * self.passes
         val_names = self.num_val * self.passes
         if val_names > MAX_VAL_SCENES or train_names > MAX_TRAIN_SCENES:
@@ -96,12 +104,12 @@ class MiniCityConfig:
     def as_dict(self) -> dict:
         """All values as JSON-ready fields, with the format version of the generator.
 
-        Without further passes, there are no fields of passes.
+        Fields of passes that have their default are left out.
         """
         values = {"format": FORMAT, **asdict(self), "val_scenes": self.num_val}
-        if self.passes == 1:
-            del values["passes"]
-            del values["repainted"]
+        for name in ("passes", "repainted", "new_passes"):
+            if values[name] == getattr(MiniCityConfig, name):
+                del values[name]
         return values
 
 

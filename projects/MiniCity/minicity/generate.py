@@ -63,8 +63,8 @@ def plan_scenes(config: MiniCityConfig) -> list[SceneTask]:
         for i, name in enumerate(names[: count * config.passes]):
             pass_index, route = divmod(i, count)
             location = locations[route % len(locations)]
-            is_last_pass = pass_index == config.passes - 1
-            has_old_paint = config.repainted > 0 and not is_last_pass
+            is_new = pass_index >= config.passes - config.new_passes
+            has_old_paint = config.repainted > 0 and not is_new
             task = SceneTask(
                 name=name,
                 index=len(tasks),
@@ -88,6 +88,7 @@ def generate(
     val_scenes: int | None = None,
     passes: int = 1,
     repainted: float = 0.0,
+    new_passes: int = 1,
     workers: int | None = None,
     progress: bool = True,
 ) -> bool:
@@ -106,7 +107,8 @@ def generate(
         val_scenes: Validation scenes among ``scenes``; None takes a fifth.
         passes: Number of times that every scene is driven, at other hours and in other weather and
             traffic; the data set has ``scenes * passes`` scenes.
-        repainted: Share of the streets that are repainted before the last pass, in [0, 1].
+        repainted: Share of the streets that are repainted before the new passes, in [0, 1].
+        new_passes: Number of the last passes that are new.
         workers: Number of processes; None takes one per core, 0 or 1 works in this process.
         progress: Whether to show a progress bar.
 
@@ -128,6 +130,7 @@ def generate(
         val_scenes=val_scenes,
         passes=passes,
         repainted=repainted,
+        new_passes=new_passes,
     )
     if workers is not None and workers < 0:
         raise InputError(f"workers must be >= 0, got {workers}.")
@@ -303,8 +306,8 @@ def _splits(config: MiniCityConfig, tasks: list[SceneTask]) -> dict[str, list[st
     for task in tasks:
         split = "train"
         if task.location in VAL_LOCATIONS:
-            is_last_pass = task.pass_index == config.passes - 1
-            split = "val" if is_last_pass else "val_earlier"
+            is_new = task.pass_index >= config.passes - config.new_passes
+            split = "val" if is_new else "val_earlier"
         splits[split].append(task.name)
     return splits
 
