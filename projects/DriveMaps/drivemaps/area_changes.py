@@ -23,10 +23,10 @@ from drivemaps.truth import polygons_of
 from gsmap.structures.elements import BoolArray, FloatArray, MapElements
 
 _MIN_OVERLAP = 0.3  # smallest shared part, of the smaller area, of two areas of one object
-_MIN_SHARE = 0.8  # of the outline of an area that is in view
-_MIN_MOVE_M = 0.75
-_MIN_FRAMES = 3  # with a detection of an area that has moved
-_STEP_M = 1.0  # largest distance of points of an outline
+_MIN_SHARE = 0.8  # smallest part in view of the outline of an area that is in view
+_MIN_MOVE_M = 0.75  # smallest shift of the centre of an area that has moved
+_MIN_FRAMES = 3  # smallest number of frames with a detection of an area that has moved
+_STEP_M = 1.0  # largest distance between successive points of an outline
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,8 +18,8 @@ MIN_VIEWS = 5
 """Smallest number of frames of a pass that have a point in range, for the point to be in view."""
 _NEW_GROUND_M = 30.0  # distance from all elements of the old map
 _PRIOR_VIEWS = 2.0  # pseudo-count of frames against a change
-_MAP_SIGMA_M = 0.2  # error of a map that all frames share
-_MOST_SIGMAS = 3.0  # smallest shift in standard errors
+_MAP_SIGMA_M = 0.2  # standard deviation of the error of a map, which all frames share
+_MIN_SIGMAS = 3.0  # smallest shift of a change, in standard errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +110,7 @@ class Shift:
 
     def exceeds(self, smallest_m: float) -> bool:
         """Whether the shift is larger than a distance and than three standard errors."""
-        return abs(self.mean_m) >= max(smallest_m, _MOST_SIGMAS * self.std_m)
+        return abs(self.mean_m) >= max(smallest_m, _MIN_SIGMAS * self.std_m)
 
     def probability(self, smallest_m: float) -> float:
         """Probability that the shift exceeds a distance, with an error that all frames share."""

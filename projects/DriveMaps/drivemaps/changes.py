@@ -126,12 +126,12 @@ def summarize_changes(found: Changes) -> str:
     """
     counts = Counter(change.kind for change in found.changes)
     text = ", ".join(f"{counts[kind]} {kind}" for kind in KINDS)
-    apart = []
-    for names, reason in (
+    not_compared = []
+    for count_by_class, reason in (
         (found.num_on_new_ground, "on new ground"),
         (found.num_not_in_view, "of the old map not in view"),
     ):
-        if names:
-            numbers = ", ".join(f"{count} {name}" for name, count in sorted(names.items()))
-            apart.append(f"{numbers} {reason}")
-    return f"{text} (not compared: {'; '.join(apart)})" if apart else text
+        if count_by_class:
+            numbers = ", ".join(f"{count} {name}" for name, count in sorted(count_by_class.items()))
+            not_compared.append(f"{numbers} {reason}")
+    return f"{text} (not compared: {'; '.join(not_compared)})" if not_compared else text

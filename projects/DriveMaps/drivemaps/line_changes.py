@@ -32,10 +32,10 @@ from drivemaps.line_matching import (
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 from gsmap.structures.polylines import arc_lengths
 
-_MIN_LENGTH_M = 5.0  # of a changed part of a line that is not the whole line
-_MIN_MOVE_M = 0.5
-_MIN_FRAMES = 3  # with a match of a vertex that has moved
-_WINDOW = 5  # vertices of the median along a line
+_MIN_LENGTH_M = 5.0  # smallest length of a changed part of a line that is not the whole line
+_MIN_MOVE_M = 0.5  # smallest shift of a vertex that has moved
+_MIN_FRAMES = 3  # smallest number of frames with a match of a vertex that has moved
+_WINDOW = 5  # number of vertices of the running median along a line
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,8 +258,10 @@ def _parts(lines: DenseLines, flags: BoolArray) -> list[slice]:
     parts = []
     for start, end in zip(lines.offsets[:-1].tolist(), lines.offsets[1:].tolist(), strict=True):
         smooth = median_filter(flags[start:end], _WINDOW, mode="nearest")
-        edges = np.flatnonzero(np.diff(np.r_[False, smooth, False])).reshape(-1, 2)
-        for first, last in (start + edges).tolist():
+        # Each run of true flags begins and ends with a change of the padded flags.
+        changes = np.flatnonzero(np.diff(np.r_[False, smooth, False]))
+        runs = start + changes.reshape(-1, 2)
+        for first, last in runs.tolist():
             part = slice(first, last)
             is_whole = (first, last) == (start, end)
             if last - first < 2:

@@ -19,8 +19,8 @@ STEP_M = 1.0
 """Largest distance in metres between the vertices of densely sampled lines."""
 _MAX_TURN_DEG = 30.0  # largest angle between two lines that are matched
 _CHUNK_SIZE = 2000  # vertices that are matched at once; memory grows with it
-# Pairs of a vertex and a segment near it: the larger one of a constant and a number per vertex and
-# frame.
+# Limit of the pairs of a vertex and a segment near it: the larger one of a constant and a number
+# per vertex and frame.
 _MOST_PAIRS = 2 * 10**7
 _MOST_PAIRS_PER_FRAME = 16
 
@@ -242,7 +242,7 @@ def _match_pairs(
     # Positions along the line of the vertex; the segment crosses the normal at position 0.
     start_along = start[:, 1] * normal[:, 0] - start[:, 0] * normal[:, 1]
     end_along = end[:, 1] * normal[:, 0] - end[:, 0] * normal[:, 1]
-    extent = end_along - start_along  # of the segment along the line of the vertex, in metres
+    extent = end_along - start_along  # signed length of the segment along this line, in metres
     fraction = -start_along / np.where(extent == 0.0, np.inf, extent)
     distances = (normal * (start + fraction[:, None] * (end - start))).sum(axis=1)
     lengths = np.linalg.norm(end - start, axis=1)
