@@ -9,7 +9,7 @@ from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
 from gsmap.models.base.pairs import BuiltHead, MatchedPairs
-from gsmap.models.base.parts import PARTS, check_classes
+from gsmap.models.base.parts import PartConfig, check_classes
 from gsmap.structures.tensors import constant
 
 
@@ -83,8 +83,8 @@ class QualityClassLoss(ClassLoss):
 
     def __init__(
         self,
-        quality: PARTS,
-        first_layer: PARTS,
+        quality: PartConfig,
+        first_layer: PartConfig,
         beta: float = 2.0,
         loss_weight: float = 2.0,
         classes: Sequence[int] | None = None,

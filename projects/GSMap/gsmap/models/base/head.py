@@ -24,8 +24,8 @@ from gsmap.models.base.masks import ElementMasks
 from gsmap.models.base.matching import MapAssigner, MapCost
 from gsmap.models.base.pairs import Predictions
 from gsmap.models.base.parts import (
-    PARTS,
     AuxHead,
+    PartConfig,
     build_part,
     check_classes,
     check_unique_names,
@@ -83,19 +83,19 @@ class MapHead(LossHead):
         self,
         grid: BEVGrid,
         classes: Sequence[str],
-        decoder: PARTS,
-        losses: Sequence[PARTS],
-        match_costs: Sequence[PARTS],
-        loss_cls: PARTS,
-        query_groups: Sequence[PARTS] = ({"num": 50},),
-        reference: PARTS | None = None,
-        masks: ElementMasks | PARTS | None = None,
-        aux_heads: Sequence[PARTS] = (),
-        flow_parts: Sequence[PARTS] = (),
-        coder: PARTS | None = None,
+        decoder: PartConfig,
+        losses: Sequence[PartConfig],
+        match_costs: Sequence[PartConfig],
+        loss_cls: PartConfig,
+        query_groups: Sequence[PartConfig] = ({"num": 50},),
+        reference: PartConfig | None = None,
+        masks: ElementMasks | PartConfig | None = None,
+        aux_heads: Sequence[PartConfig] = (),
+        flow_parts: Sequence[PartConfig] = (),
+        coder: PartConfig | None = None,
         num_points: int = 20,
         embed_dims: int = 256,
-        point_queries: PARTS | None = None,
+        point_queries: PartConfig | None = None,
         init_cfg: dict | None = None,
         **settings: Any,
     ) -> None:
@@ -163,7 +163,7 @@ class MapHead(LossHead):
         """
         return {"num_points": settings["num_points"]}
 
-    def build_coder(self, settings: PARTS) -> MapCoder:
+    def build_coder(self, settings: PartConfig) -> MapCoder:
         """Build the coder that belongs to the reference.
 
         Args:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from gsmap.models.base.pairs import BuiltHead, MatchedPairs
-from gsmap.models.base.parts import WEIGHT, class_weights
+from gsmap.models.base.parts import WeightConfig, class_weights
 from gsmap.utils.errors import InputTypeError
 from gsmap.utils.targets import NeedsTargets
 
@@ -37,7 +37,7 @@ class MapLoss(nn.Module, NeedsTargets):
 
     def __init__(
         self,
-        loss_weight: WEIGHT = 1.0,
+        loss_weight: WeightConfig = 1.0,
         last_layer_only: bool = False,
         first_group_only: bool = False,
     ) -> None:

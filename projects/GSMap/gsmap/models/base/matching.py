@@ -12,7 +12,7 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from gsmap.models.base.pairs import BuiltHead, GroundTruth, MapMatches, Predictions, SampleView
-from gsmap.models.base.parts import WEIGHT
+from gsmap.models.base.parts import WeightConfig
 from gsmap.structures.tensors import upload
 from gsmap.utils.errors import InputError, NotFiniteError
 
@@ -278,7 +278,7 @@ class MapCost:
             class.
     """
 
-    def __init__(self, weight: WEIGHT = 1.0) -> None:
+    def __init__(self, weight: WeightConfig = 1.0) -> None:
         self.weight = weight
 
     def check(self, head: BuiltHead) -> None:

@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from gsmap.structures.tensors import constant
 from gsmap.utils.errors import InputError
 
-PARTS = dict[str, Any]  # type of the config of one part
-WEIGHT = float | Sequence[float]  # type of a weight: one number, or one for each class
+PartConfig = dict[str, Any]  # type of the config of a part: its settings by name
+WeightConfig = float | Sequence[float]  # type of a weight: one number, or one for each class
 DEFAULTS: Mapping[str, Any] = MappingProxyType({})  # no settings: the part's class has defaults
 
 
@@ -38,7 +38,7 @@ class AuxHead(Protocol):
         """
 
 
-def with_defaults(settings: Mapping[str, Any] | None, **defaults: Any) -> PARTS:
+def with_defaults(settings: Mapping[str, Any] | None, **defaults: Any) -> PartConfig:
     """Config of a part: the given settings, and defaults for those that are not given.
 
     Args:
@@ -70,7 +70,9 @@ def class_of(part: Mapping[str, Any], registry: Registry = MODELS) -> type | Non
     return registry.get(kind) if isinstance(kind, str) else kind
 
 
-def optional_part(kind: type, settings: Mapping[str, Any] | None, **defaults: Any) -> list[PARTS]:
+def optional_part(
+    kind: type, settings: Mapping[str, Any] | None, **defaults: Any
+) -> list[PartConfig]:
     """List of one config, or the empty list if the part is switched off.
 
     Args:
@@ -84,8 +86,12 @@ def optional_part(kind: type, settings: Mapping[str, Any] | None, **defaults: An
 
 
 def set_points_weight(
-    parts: Sequence[PARTS], kind: type, weight: WEIGHT | None, key: str, registry: Registry = MODELS
-) -> list[PARTS]:
+    parts: Sequence[PartConfig],
+    kind: type,
+    weight: WeightConfig | None,
+    key: str,
+    registry: Registry = MODELS,
+) -> list[PartConfig]:
     """Copy configs of losses or costs, and replace the weight of the points loss or cost.
 
     Args:
@@ -138,7 +144,7 @@ def check_unique_names(names: Sequence[str], kind: str) -> None:
             raise InputError(f"two {kind} have one name, {name!r}; there are {list(names)}.")
 
 
-def class_weights(weight: WEIGHT, labels: Tensor) -> Tensor:
+def class_weights(weight: WeightConfig, labels: Tensor) -> Tensor:
     """Weight of each element, by its class.
 
     Args:
@@ -152,7 +158,7 @@ def class_weights(weight: WEIGHT, labels: Tensor) -> Tensor:
     return weights[labels] if weights.ndim else weights
 
 
-def check_weight(part: Any, weight: WEIGHT, classes: Sequence[str]) -> None:
+def check_weight(part: Any, weight: WeightConfig, classes: Sequence[str]) -> None:
     """Raise ValueError if the number of weights is not the number of classes.
 
     Args:

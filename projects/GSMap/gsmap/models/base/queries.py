@@ -5,9 +5,9 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from gsmap.models.base.parts import PARTS
+from gsmap.models.base.parts import PartConfig
 
-HeadSetting = Callable[[Any], PARTS]  # from a value to settings of `MapHead`
+HeadSetting = Callable[[Any], PartConfig]  # from a value to settings of `MapHead`
 
 _ADDED_SETTINGS: dict[str, HeadSetting] = {}
 
@@ -44,7 +44,7 @@ def head_setting(name: str) -> Callable[[HeadSetting], HeadSetting]:
     return add
 
 
-def resolve_added_settings(values: PARTS) -> PARTS:
+def resolve_added_settings(values: PartConfig) -> PartConfig:
     """Settings of `MapHead` that stand for added settings.
 
     Args:
@@ -53,7 +53,7 @@ def resolve_added_settings(values: PARTS) -> PARTS:
     Raises:
         TypeError: If a setting does not exist.
     """
-    head_settings: PARTS = {}
+    head_settings: PartConfig = {}
     for name, value in values.items():
         if name not in _ADDED_SETTINGS:
             raise TypeError(f"MapHead.__init__() got an unexpected keyword argument '{name}'")

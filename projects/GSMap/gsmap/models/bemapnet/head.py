@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from gsmap.models.base.coder import Tensors
 from gsmap.models.base.layers import mlp, resize_map
-from gsmap.models.base.parts import PARTS
+from gsmap.models.base.parts import PartConfig
 from gsmap.models.base.references import Reference
 from gsmap.models.bemapnet.curves import Curve, control_points
 from gsmap.models.bemapnet.losses import BezierLines, BezierLosses, TrueCurves
@@ -76,10 +76,10 @@ class BezierHead(LineHead):
         queries: Sequence[int] = (20, 25, 15),
         degrees: Sequence[int] = (2, 1, 3),
         pieces: Sequence[int] = (3, 1, 7),
-        decoder: PARTS | None = None,
+        decoder: PartConfig | None = None,
         bev_pixel_m: float = 0.3,
         to_end: bool = False,
-        losses: PARTS | None = None,
+        losses: PartConfig | None = None,
         embed_dims: int = 512,
         hidden_dims: int = 256,
         **kwargs: Any,

@@ -87,10 +87,18 @@ def convolve_folded(
     identity: Tensor | None = None,
     relu: bool = True,
 ) -> Tensor:
-    """Convolution on a GPU whose weights include the batch norm (`Convolve`)."""
+    """Convolution on a GPU whose weights include the batch norm (`Convolve`).
+
+    Args:
+        conv: The convolution, with the batch norm folded into its weights.
+        norm: Not used.
+        x: Input. (n, C, h, w)
+        identity: Residual in the shape of the output, or None.
+        relu: Whether the ReLU is applied.
+    """
     if not relu:
         return conv(x)
-    return _convolve_relu(x, conv.weight, conv.bias, identity, _geometry(conv))
+    return _convolve_relu(x, conv.weight, conv.bias, identity=identity, geometry=_geometry(conv))
 
 
 class FrozenNorms:
@@ -148,7 +156,8 @@ class FrozenNorms:
         if constants is None or constants[0] != versions:
             constants = (versions, *_scale_and_shift(norm))
             self._constants[norm] = constants
-        return constants[1:]
+        _, scale, shift = constants
+        return scale, shift
 
 
 def has_frozen_norms(backbone: nn.Module | None) -> bool:
@@ -181,7 +190,20 @@ class _ConvolveReLU(torch.autograd.Function):
         identity: Tensor | None,
         geometry: Geometry,
     ) -> Tensor:
-        output = _convolve_relu(x, weight, bias, identity, geometry)
+        """Compute the output.
+
+        Args:
+            ctx: Context that keeps tensors for the gradient.
+            x: Input. (n, C, h, w)
+            weight: Weights of the convolution. (D, C, kh, kw)
+            bias: Bias of the convolution. (D,)
+            identity: Residual in the shape of the output, or None.
+            geometry: Stride, padding, dilation and groups of the convolution.
+
+        Returns:
+            Output after the ReLU. (n, D, h', w')
+        """
+        output = _convolve_relu(x, weight, bias, identity=identity, geometry=geometry)
         ctx.save_for_backward(x, weight, output)
         ctx.geometry = geometry
         return output

@@ -6,7 +6,7 @@ from typing import Any
 from mmdet3d.registry import MODELS
 
 from gsmap.models.base.head import MapHead
-from gsmap.models.base.parts import DEFAULTS, PARTS, class_of, optional_part
+from gsmap.models.base.parts import DEFAULTS, PartConfig, class_of, optional_part
 from gsmap.models.gemap.attention import GeometryDecoupledAttention
 from gsmap.models.gemap.losses import EuclideanLoss
 
@@ -31,9 +31,9 @@ class GeMapHead(MapHead):
 
     def __init__(
         self,
-        decoder: PARTS,
-        losses: Sequence[PARTS],
-        query_groups: Sequence[PARTS] = ({"num": 50},),
+        decoder: PartConfig,
+        losses: Sequence[PartConfig],
+        query_groups: Sequence[PartConfig] = ({"num": 50},),
         loss_euclidean: Mapping[str, Any] | None = DEFAULTS,
         decoupled: bool = True,
         one_to_many: bool = False,

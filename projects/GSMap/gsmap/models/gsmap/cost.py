@@ -7,7 +7,7 @@ from torch import Tensor
 
 from gsmap.models.base.matching import MapCost
 from gsmap.models.base.pairs import BuiltHead, SampleView
-from gsmap.models.base.parts import WEIGHT, class_weights
+from gsmap.models.base.parts import WeightConfig, class_weights
 from gsmap.models.gsmap.reference import require_gaussians
 from gsmap.ops.soft_iou import pairwise_dice_loss, pairwise_soft_iou
 from gsmap.utils.errors import InputError
@@ -25,7 +25,7 @@ class IoUCost(MapCost):
         ValueError: If ``kind`` is unknown.
     """
 
-    def __init__(self, weight: WEIGHT = 1.0, kind: str = "iou") -> None:
+    def __init__(self, weight: WeightConfig = 1.0, kind: str = "iou") -> None:
         super().__init__(weight)
         if kind not in ("iou", "dice"):
             raise InputError(f"kind must be 'iou' or 'dice', got {kind!r}.")

@@ -11,8 +11,8 @@ from gsmap.models.base.head import MapHead
 from gsmap.models.base.pairs import MatchedPairs
 from gsmap.models.base.parts import (
     DEFAULTS,
-    PARTS,
-    WEIGHT,
+    PartConfig,
+    WeightConfig,
     optional_part,
     set_points_weight,
     with_defaults,
@@ -65,14 +65,14 @@ class GSMapHead(MapHead):
     def __init__(
         self,
         grid: BEVGrid,
-        decoder: PARTS,
-        losses: Sequence[PARTS],
-        match_costs: Sequence[PARTS],
+        decoder: PartConfig,
+        losses: Sequence[PartConfig],
+        match_costs: Sequence[PartConfig],
         loss_raster: Mapping[str, Any] | None = DEFAULTS,
         iou_cost: Mapping[str, Any] | None = DEFAULTS,
-        points_weight: WEIGHT | None = None,
-        masks: PARTS | None = None,
-        reference: PARTS | None = None,
+        points_weight: WeightConfig | None = None,
+        masks: PartConfig | None = None,
+        reference: PartConfig | None = None,
         temperatures: Sequence[Sequence[float]] | None = None,
         **kwargs: Any,
     ) -> None:

@@ -5,7 +5,7 @@ from typing import Any
 from mmdet3d.registry import MODELS
 
 from gsmap.models.base.decoder import MapDecoder, MapDecoderLayer
-from gsmap.models.base.parts import PARTS, class_of, with_defaults
+from gsmap.models.base.parts import PartConfig, class_of, with_defaults
 from gsmap.models.gsmap.guidance import GaussianGuidance
 
 
@@ -39,7 +39,7 @@ class GaussianDecoderLayer(MapDecoderLayer):
         super().__init__(guidance=guidance, **kwargs)
 
 
-def add_guidance(decoder: PARTS) -> PARTS:
+def add_guidance(decoder: PartConfig) -> PartConfig:
     """Copy the config of a decoder, and condition its layers on Gaussians by default.
 
     Args:

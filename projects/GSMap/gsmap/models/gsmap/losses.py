@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gsmap.models.base.losses import MapLoss
 from gsmap.models.base.pairs import BuiltHead, MatchedPairs
-from gsmap.models.base.parts import WEIGHT, check_weight, class_weights
+from gsmap.models.base.parts import WeightConfig, check_weight, class_weights
 from gsmap.models.gsmap.reference import require_gaussians
 from gsmap.ops.raster_loss import NORMALIZATIONS, raster_loss
 from gsmap.ops.soft_iou import dice_loss, soft_iou
@@ -30,7 +30,9 @@ class MaskLoss(MapLoss):
 
     name = "raster"
 
-    def __init__(self, loss_weight: WEIGHT = 10.0, full_iou: WEIGHT = 0.0, **flags: bool) -> None:
+    def __init__(
+        self, loss_weight: WeightConfig = 10.0, full_iou: WeightConfig = 0.0, **flags: bool
+    ) -> None:
         super().__init__(loss_weight=loss_weight, **flags)
         self.full_iou = full_iou
 
@@ -78,13 +80,13 @@ class RasterLoss(MaskLoss):
 
     def __init__(
         self,
-        loss_weight: WEIGHT = 10.0,
+        loss_weight: WeightConfig = 10.0,
         alpha: float = 0.8,
         foreground_weight: float = 1.0,
         normalize: str = "both",
         window_size: int = 11,
         window_sigma: float = 1.5,
-        full_iou: WEIGHT = 0.0,
+        full_iou: WeightConfig = 0.0,
         **flags: bool,
     ) -> None:
         super().__init__(loss_weight=loss_weight, full_iou=full_iou, **flags)
@@ -128,9 +130,9 @@ class MaskOverlapLoss(MaskLoss):
 
     def __init__(
         self,
-        loss_weight: WEIGHT = 10.0,
+        loss_weight: WeightConfig = 10.0,
         kind: str = "dice",
-        full_iou: WEIGHT = 0.0,
+        full_iou: WeightConfig = 0.0,
         **flags: bool,
     ) -> None:
         super().__init__(loss_weight=loss_weight, full_iou=full_iou, **flags)

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from gsmap.models.base.class_losses import Quality
 from gsmap.models.base.pairs import BuiltHead, MatchedPairs
-from gsmap.models.base.parts import PARTS
+from gsmap.models.base.parts import PartConfig
 from gsmap.models.gsmap.reference import GaussianReference, require_gaussians
 from gsmap.ops.soft_iou import soft_iou
 from gsmap.structures.gaussians import extents_along_line, line_errors
@@ -66,7 +66,7 @@ class ProductQuality(Quality):
         qualities: Configs of the factors.
     """
 
-    def __init__(self, qualities: Sequence[PARTS]) -> None:
+    def __init__(self, qualities: Sequence[PartConfig]) -> None:
         super().__init__()
         self.qualities = nn.ModuleList(MODELS.build(quality) for quality in qualities)
 

@@ -11,7 +11,7 @@ from torch.distributions import Laplace, Normal
 from gsmap.models.base import layers
 from gsmap.models.base.losses import MapLoss
 from gsmap.models.base.pairs import BuiltHead, MatchedPairs
-from gsmap.models.base.parts import WEIGHT
+from gsmap.models.base.parts import WeightConfig
 from gsmap.models.gsmap.reference import GaussianReference, require_gaussians
 from gsmap.structures.gaussians import (
     Gaussians,
@@ -129,7 +129,7 @@ class GaussianNLLLoss(MapLoss):
 
     def __init__(
         self,
-        loss_weight: WEIGHT = 1.0,
+        loss_weight: WeightConfig = 1.0,
         laplace: bool = False,
         detach_points: bool = True,
         match_m: float = 1.5,

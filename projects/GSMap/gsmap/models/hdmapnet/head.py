@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsmap.models.base.coder import DetectionHead, Samples, Tensors
 from gsmap.models.base.layers import resize_map
-from gsmap.models.base.parts import PARTS
+from gsmap.models.base.parts import PartConfig
 from gsmap.models.hdmapnet.decoder import LineMapDecoder, LineMaps
 from gsmap.models.hdmapnet.layout import forward_size, metres_from_pixels, orient_forward
 from gsmap.models.hdmapnet.losses import LineMapLosses
@@ -59,9 +59,9 @@ class HDMapNetHead(DetectionHead):
         pixel_m: float = 0.15,
         embedding_dims: int = 16,
         num_directions: int = 36,
-        decoder: PARTS | None = None,
-        losses: PARTS | None = None,
-        vectorizing: PARTS | None = None,
+        decoder: PartConfig | None = None,
+        losses: PartConfig | None = None,
+        vectorizing: PartConfig | None = None,
         random_start: bool = False,
         init_cfg: dict | None = None,
     ) -> None:

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from gsmap.models.base.decoder import Decoded, MapDecoder
 from gsmap.models.base.head import MapHead
 from gsmap.models.base.layers import init_matrices, mlp
-from gsmap.models.base.parts import PARTS
+from gsmap.models.base.parts import PartConfig
 from gsmap.models.base.queries import PointTable
 
 
@@ -49,7 +49,7 @@ class HRMapNetHead(MapHead):
     """
 
     def __init__(
-        self, decoder: PARTS, num_points: int = 20, embed_dims: int = 256, **kwargs: Any
+        self, decoder: PartConfig, num_points: int = 20, embed_dims: int = 256, **kwargs: Any
     ) -> None:
         super().__init__(
             decoder={"type": "ContentDecoder", **decoder},

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from gsmap.models.base.coder import DetectionHead, MapCoder, Samples, Tensors
 from gsmap.models.base.layers import resize_map
-from gsmap.models.base.parts import PARTS, build_part
+from gsmap.models.base.parts import PartConfig, build_part
 from gsmap.models.lines.front import front_size, turn_raster
 from gsmap.models.lines.losses import LINE, Case, LineLosses
 from gsmap.structures.grid import BEVGrid
@@ -87,7 +87,7 @@ class LineHead(DetectionHead):
         grid: BEVGrid,
         classes: Sequence[str],
         numbers: Sequence[int],
-        decoder: PARTS,
+        decoder: PartConfig,
         losses: LineLosses,
         mask_pixel_m: float = 0.15,
         score_threshold: float = 0.5,

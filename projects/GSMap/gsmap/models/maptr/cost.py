@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gsmap.models.base.matching import PointsCost
 from gsmap.models.base.pairs import SampleView
-from gsmap.models.base.parts import WEIGHT, class_weights
+from gsmap.models.base.parts import WeightConfig, class_weights
 from gsmap.utils.errors import InputError
 
 
@@ -45,7 +45,7 @@ class OrderedPointsCost(PointsCost):
         weight: Weight of the cost, or a weight for each class.
     """
 
-    def __init__(self, weight: WEIGHT = 5.0) -> None:
+    def __init__(self, weight: WeightConfig = 5.0) -> None:
         super().__init__(weight=weight)
 
     def __call__(

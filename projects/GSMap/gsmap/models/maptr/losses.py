@@ -5,7 +5,7 @@ from torch import Tensor
 
 from gsmap.models.base.losses import MapLoss
 from gsmap.models.base.pairs import MatchedPairs
-from gsmap.models.base.parts import WEIGHT
+from gsmap.models.base.parts import WeightConfig
 from gsmap.structures.tensors import check_same_shape
 
 _EPS = 1e-12
@@ -22,7 +22,7 @@ class PointsLoss(MapLoss):
 
     name = "pts"
 
-    def __init__(self, loss_weight: WEIGHT = 5.0, **flags: bool) -> None:
+    def __init__(self, loss_weight: WeightConfig = 5.0, **flags: bool) -> None:
         super().__init__(loss_weight=loss_weight, **flags)
 
     def values(self, pairs: MatchedPairs) -> Tensor:
@@ -45,7 +45,7 @@ class DirectionLoss(MapLoss):
 
     name = "dir"
 
-    def __init__(self, loss_weight: WEIGHT = 0.005, **flags: bool) -> None:
+    def __init__(self, loss_weight: WeightConfig = 0.005, **flags: bool) -> None:
         super().__init__(loss_weight=loss_weight, **flags)
 
     def values(self, pairs: MatchedPairs) -> Tensor:

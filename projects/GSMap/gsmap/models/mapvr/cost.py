@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gsmap.models.base.matching import MapCost
 from gsmap.models.base.pairs import BuiltHead, SampleView
-from gsmap.models.base.parts import WEIGHT, class_weights
+from gsmap.models.base.parts import WeightConfig, class_weights
 from gsmap.models.mapvr.losses import ElementRenderer
 from gsmap.ops.soft_iou import pairwise_dice_loss
 
@@ -26,7 +26,7 @@ class RenderedDiceCost(MapCost):
     """
 
     def __init__(
-        self, weight: WEIGHT = 10.0, size: tuple[int, int] = (128, 64), **rendering: Any
+        self, weight: WeightConfig = 10.0, size: tuple[int, int] = (128, 64), **rendering: Any
     ) -> None:
         super().__init__(weight)
         self.renderer = ElementRenderer(size, **rendering)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from gsmap.models.base.losses import MapLoss
 from gsmap.models.base.pairs import BuiltHead, MatchedPairs
-from gsmap.models.base.parts import WEIGHT, check_classes
+from gsmap.models.base.parts import WeightConfig, check_classes
 from gsmap.models.maptr.losses import turns
 from gsmap.ops.polyline_raster import DISTANCES, soft_rasters
 from gsmap.ops.soft_iou import dice_loss
@@ -107,7 +107,7 @@ class RenderedDiceLoss(MapLoss):
 
     def __init__(
         self,
-        loss_weight: WEIGHT = 15.0,
+        loss_weight: WeightConfig = 15.0,
         size: tuple[int, int] = (256, 128),
         last_layer_only: bool = False,
         first_group_only: bool = False,
@@ -146,7 +146,7 @@ class SelfDirectionLoss(MapLoss):
 
     name = "dir"
 
-    def __init__(self, loss_weight: WEIGHT = 0.002, **flags: bool) -> None:
+    def __init__(self, loss_weight: WeightConfig = 0.002, **flags: bool) -> None:
         super().__init__(loss_weight, **flags)
 
     def values(self, pairs: MatchedPairs) -> Tensor:

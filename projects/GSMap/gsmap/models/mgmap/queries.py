@@ -3,7 +3,7 @@
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
-from gsmap.models.base.parts import PARTS
+from gsmap.models.base.parts import PartConfig
 from gsmap.models.base.queries import head_setting
 
 
@@ -27,7 +27,7 @@ class PointsOfInstances(nn.Linear):
 
 
 @head_setting("points_from_instances")
-def points_from_instances(value: bool) -> PARTS:
+def points_from_instances(value: bool) -> PartConfig:
     """Return the settings of a head with `PointsOfInstances`.
 
     Args:

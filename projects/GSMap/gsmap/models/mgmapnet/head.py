@@ -10,14 +10,17 @@ from mmengine.logging import print_log
 from gsmap.models.base.attention import BEVDeformableAttention
 from gsmap.models.base.head import MapHead
 from gsmap.models.base.masks import ElementMasks
-from gsmap.models.base.parts import DEFAULTS, PARTS, class_of, optional_part
+from gsmap.models.base.parts import DEFAULTS, PartConfig, class_of, optional_part
 from gsmap.models.maptrv2.attention import DecoupledSelfAttention
 from gsmap.models.mgmapnet.decoder import MGMapNetDecoder, MGMapNetDecoderLayer
 from gsmap.models.mgmapnet.losses import InstanceMaskLoss, SamplingLocationLoss
 from gsmap.structures.grid import BEVGrid
 
 LINE_WIDTH_PX = 3
-QUERY_GROUPS: tuple[PARTS, ...] = ({"num": 100}, {"name": "one2many", "num": 600, "repeats": 6})
+QUERY_GROUPS: tuple[PartConfig, ...] = (
+    {"num": 100},
+    {"name": "one2many", "num": 600, "repeats": 6},
+)
 
 
 @MODELS.register_module()
@@ -40,12 +43,12 @@ class MGMapHead(MapHead):
     def __init__(
         self,
         grid: BEVGrid,
-        decoder: PARTS,
-        losses: Sequence[PARTS],
-        query_groups: Sequence[PARTS] = QUERY_GROUPS,
+        decoder: PartConfig,
+        losses: Sequence[PartConfig],
+        query_groups: Sequence[PartConfig] = QUERY_GROUPS,
         loss_mean_loc: Mapping[str, Any] | None = DEFAULTS,
         loss_ins_seg: Mapping[str, Any] | None = DEFAULTS,
-        masks: PARTS | None = None,
+        masks: PartConfig | None = None,
         embed_dims: int = 256,
         **kwargs: Any,
     ) -> None:
@@ -67,7 +70,7 @@ class MGMapHead(MapHead):
         )
 
 
-def convert_decoder(decoder: PARTS) -> PARTS:
+def convert_decoder(decoder: PartConfig) -> PartConfig:
     """Convert the settings of a decoder to settings of `MGMapNetDecoder`.
 
     The layers and attentions in the configs of MapTR and MapTRv2 need one query per point. They are

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from gsmap.models.base.coder import Tensors
 from gsmap.models.base.layers import mlp
-from gsmap.models.base.parts import PARTS
+from gsmap.models.base.parts import PartConfig
 from gsmap.models.base.references import Reference
 from gsmap.models.lines.decoder import ClassLines
 from gsmap.models.lines.head import LineHead, LinePredictions, class_scores
@@ -98,8 +98,8 @@ class PivotHead(LineHead):
         grid: BEVGrid,
         classes: Sequence[str],
         queries: Sequence[tuple[int, int]] = ((20, 10), (25, 2), (15, 30)),
-        decoder: PARTS | None = None,
-        losses: PARTS | None = None,
+        decoder: PartConfig | None = None,
+        losses: PartConfig | None = None,
         embed_dims: int = 256,
         **kwargs: Any,
     ) -> None:

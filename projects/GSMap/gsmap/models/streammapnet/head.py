@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from gsmap.models.base.coder import Detections, MapCoder
 from gsmap.models.base.head import MapHead
-from gsmap.models.base.parts import PARTS
+from gsmap.models.base.parts import PartConfig
 from gsmap.models.streammapnet.decoder import StreamMapNetDecoder
 from gsmap.models.streammapnet.reference import LineReference
 
@@ -40,14 +40,14 @@ class StreamMapNetHead(MapHead):
 
     def __init__(
         self,
-        decoder: PARTS,
-        reference: PARTS | None = None,
-        coder: PARTS | None = None,
+        decoder: PartConfig,
+        reference: PartConfig | None = None,
+        coder: PartConfig | None = None,
         num_points: int = 20,
         embed_dims: int = 256,
         **kwargs: Any,
     ) -> None:
-        reference_settings: PARTS = {"type": LineReference, "num_points": num_points}
+        reference_settings: PartConfig = {"type": LineReference, "num_points": num_points}
         reference_settings |= reference or {}
         super().__init__(
             decoder={"type": StreamMapNetDecoder, "bev_dims": embed_dims, **decoder},
@@ -60,7 +60,7 @@ class StreamMapNetHead(MapHead):
         self.instance_embedding = nn.Embedding(num_queries, self.embed_dims)
         branch = nn.Linear(self.embed_dims, len(self.classes))
         self.cls_branches = nn.ModuleList([branch] * len(self.cls_branches))
-        coder_settings: PARTS = {"max_num": self.query_groups[0].num, "margin_m": None}
+        coder_settings: PartConfig = {"max_num": self.query_groups[0].num, "margin_m": None}
         coder_settings |= coder or {}
         self.coder = BestClassCoder(grid=self.grid, **coder_settings)
 

@@ -17,7 +17,7 @@ from gsmap.models.base.attention import BEVDeformableAttention
 from gsmap.models.base.coder import DetectionHead, MapCoder, Samples, Tensors
 from gsmap.models.base.layers import classification_branch, feed_forward, init_matrices
 from gsmap.models.base.matching import solve_assignment
-from gsmap.models.base.parts import PARTS
+from gsmap.models.base.parts import PartConfig
 from gsmap.models.base.references import Reference
 from gsmap.models.vectormapnet.canvas import Canvas
 from gsmap.structures.grid import BEVGrid
@@ -149,23 +149,28 @@ class KeyPointHead(DetectionHead):
         num_queries: int = 120,
         in_channels: int = 128,
         embed_dims: int = 256,
-        decoder: PARTS | None = None,
-        canvas: PARTS | None = None,
+        decoder: PartConfig | None = None,
+        canvas: PartConfig | None = None,
         cls_weight: float = 2.0,
         box_weight: float = 0.1,
         giou_weight: float = 1.0,
-        coder: PARTS | None = None,
+        coder: PartConfig | None = None,
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(init_cfg)
         self.grid = grid
         self.classes = tuple(classes)
         self.reference: KeyPointReference = KeyPointReference(Canvas(grid, **(canvas or {})))
-        coder_settings: PARTS = {"max_num": 35, "margin_m": None, **(coder or {})}
+        coder_settings: PartConfig = {"max_num": 35, "margin_m": None, **(coder or {})}
         self.coder = MapCoder(grid, **coder_settings)
         if self.coder.unfold_classes:
             raise InputError("coder.unfold_classes has no effect on boxes: leave it out.")
-        layer_settings: PARTS = {"num_heads": 8, "ffn_dims": 512, "dropout": 0.1, "num_layers": 6}
+        layer_settings: PartConfig = {
+            "num_heads": 8,
+            "ffn_dims": 512,
+            "dropout": 0.1,
+            "num_layers": 6,
+        }
         layer_settings |= decoder or {}
         num_layers = layer_settings.pop("num_layers")
         check_positive(num_layers=num_layers)

@@ -10,7 +10,7 @@ from mmengine.structures import InstanceData
 from torch import Tensor
 
 from gsmap.models.base.coder import DetectionHead, Samples, Tensors
-from gsmap.models.base.parts import PARTS
+from gsmap.models.base.parts import PartConfig
 from gsmap.models.vectormapnet.canvas import Canvas
 from gsmap.models.vectormapnet.detector import KeyPointHead, get_targets
 from gsmap.models.vectormapnet.generator import Elements, PolylineGenerator
@@ -50,9 +50,9 @@ class VectorMapNetHead(DetectionHead):
         self,
         grid: BEVGrid,
         classes: Sequence[str],
-        detector: PARTS | None = None,
-        generator: PARTS | None = None,
-        canvas: PARTS | None = None,
+        detector: PartConfig | None = None,
+        generator: PartConfig | None = None,
+        canvas: PartConfig | None = None,
         loss_weight: float = 1.0,
         init_cfg: dict | None = None,
     ) -> None:
@@ -61,7 +61,7 @@ class VectorMapNetHead(DetectionHead):
         self.classes = tuple(classes)
         self.loss_weight = loss_weight
         self.canvas = Canvas(grid, **(canvas or {}))
-        detector_settings: PARTS = {"type": "KeyPointHead", "grid": grid, "classes": classes}
+        detector_settings: PartConfig = {"type": "KeyPointHead", "grid": grid, "classes": classes}
         detector_settings |= detector or {}
         if detector_settings["type"] == "KeyPointHead":
             detector_settings = {"canvas": canvas, **detector_settings}
@@ -74,7 +74,7 @@ class VectorMapNetHead(DetectionHead):
                 f"the detector's canvas {detector_canvas.settings} is not the generator's "
                 f"{self.canvas.settings}: give canvas to VectorMapNetHead alone."
             )
-        generator_settings: PARTS = {"canvas": self.canvas, "num_classes": len(classes)}
+        generator_settings: PartConfig = {"canvas": self.canvas, "num_classes": len(classes)}
         generator_settings |= generator or {}
         self.generator = PolylineGenerator(**generator_settings)
 
