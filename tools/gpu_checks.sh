@@ -33,7 +33,8 @@ else
     at=(--device cuda --threads 8)
     models=("$maptr" "$gsmap") fps=("${at[@]}" --repeats 30) step=("${at[@]}" --repeats 8 --batch 4)
     kernels=(--device cuda) graphs=(--cuda-graphs) workers=(--workers 8)
-    tests=(tests/ops/test_triton_kernels.py tests/apis/test_fast_frame.py tests/datasets/transforms/test_image_steps.py -k "gpu or captured")
+    tests=(tests/ops/test_triton_kernels.py tests/apis/test_fast_frame.py tests/datasets/transforms/test_image_steps.py
+        tests/models/test_step_graphs.py tests/models/encoders/test_fused_resnet.py -k "gpu or captured or recorded or accumulated or random")
 fi
 
 failed=()
@@ -57,6 +58,8 @@ part "Frames per second, kernels" 60 "$python" -m benchmarks fps "${models[@]}" 
 part "Frames per second, kernels, half precision" 60 "$python" -m benchmarks fps "${models[@]}" "${fps[@]}" --fp16 ${graphs[0]+"${graphs[@]}"}
 part "A training step, kernels" 60 "$python" -m benchmarks step "${models[@]}" "${step[@]}"
 part "A training step, kernels, bfloat16" 60 "$python" -m benchmarks step "${models[@]}" "${step[@]}" --cfg-options model.autocast=bfloat16
+part "A training step, kernels, bfloat16, replayed" 60 "$python" -m benchmarks step "${models[@]}" "${step[@]}" --cfg-options \
+    model.autocast=bfloat16 model.cuda_graphs=True
 part "Tests" 90 "$python" -m pytest -q -p no:cacheprovider "${tests[@]}"
 [ -n "${REDUCED:-}" ] || part "A training step, kernels, bfloat16, compiled" 150 "$python" -m benchmarks step "${models[@]}" "${step[@]}" --cfg-options \
     model.autocast=bfloat16 model.compiled=reduce-overhead

@@ -172,7 +172,7 @@ class StepGraphs:
                 f"{SWITCH}=True writes the gradients of a step into the memory of the one before: "
                 "set optim_wrapper.accumulative_counts=1, or leave out the switch."
             )
-        key = tuple((tensor.shape, tensor.dtype) for tensor in inputs)
+        key = (len(params), *((tensor.shape, tensor.dtype) for tensor in inputs))
         recording = self._recordings.get(key)
         if recording is None:
             while len(self._recordings) >= _MOST_SIZES:
