@@ -1,6 +1,5 @@
 """Programs that tests run in processes of their own."""
 
-import atexit
 import os
 import runpy
 import socket
@@ -78,7 +77,6 @@ def run_tool(*words: object) -> subprocess.CompletedProcess:
 def _exit_code_of(work: Callable[[], object], argv: list[str]) -> int:
     """Do a forked process's work with streams of its own; return what it exits with."""
     sys.argv = argv
-    atexit._clear()  # of the process of the tests
     sys.stdout, sys.stderr = (TextIOWrapper(FileIO(n, "w", closefd=False)) for n in (1, 2))
     os.chdir(REPO)
     code: Any = 1

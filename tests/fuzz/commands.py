@@ -1,6 +1,5 @@
 """Commands on tiny data, in forks of a process that has imported everything."""
 
-import atexit
 import faulthandler
 import os
 import pty
@@ -44,7 +43,6 @@ def start(work: Work) -> tuple[int, int]:
     if pid:
         return pid, terminal
     code = 1
-    atexit._clear()  # of the process of the tests
     try:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})

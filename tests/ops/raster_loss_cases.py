@@ -24,5 +24,5 @@ MASKS = {
     "faint": (1e-3 * sparse_masks((21, 33), 0.3), 1e-2 * sparse_masks((21, 33), 0.3, seed=1)),
     "empty prediction": (torch.zeros(2, 21, 33), sparse_masks((21, 33), 0.3)),
     "empty target": (sparse_masks((21, 33), 0.3), torch.zeros(2, 21, 33)),
-    "both empty": (torch.zeros(2, 40, 50), torch.zeros(2, 40, 50)),
+    "both empty": (torch.zeros(2, 21, 33), torch.zeros(2, 21, 33)),
 }

@@ -55,7 +55,7 @@ def train(monkeypatch):
 
     def run(*words: object) -> None:
         monkeypatch.setattr(sys, "argv", ["train.py", *map(str, words)])
-        run_command(tools.train.main)
+        run_command(tools.train.main, clean_up_on_kill=False)
 
     return run
 

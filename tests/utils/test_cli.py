@@ -293,7 +293,7 @@ def command():
     {end}
 run_command(command, clean_up_on_kill=False)
 """
-    done = run_python("-c", program)
+    done = run_python("-c", program, env={"RANK": "0"})
     assert done.returncode == code
     assert done.stderr.endswith(said)
     assert bool(done.stderr) == bool(said)

@@ -120,25 +120,29 @@ def run_command(command: Callable[[], str | None], clean_up_on_kill: bool = True
     Args:
         command: Function that returns the text to print, or None.
         clean_up_on_kill: Whether the clean-up runs after ``kill``. The ranks of a training wait for
-            each other and should die at once instead. If False, `end_process` ends the process.
+            each other and should die at once instead. If False, `end_process` ends a rank.
     """
     try:
         _run(command, clean_up_on_kill=clean_up_on_kill)
     except BaseException as error:
-        if clean_up_on_kill:
+        if clean_up_on_kill or not _is_rank():
             raise
         end_process(_exit_code(error))
-    if not clean_up_on_kill:
+    if not clean_up_on_kill and _is_rank():
         end_process(0)
+
+
+def _is_rank() -> bool:
+    """Whether this process is one of several of a training or test."""
+    return "RANK" in os.environ
 
 
 def end_process(code: int) -> NoReturn:
     """End the process after its exit functions, without the end of the interpreter.
 
-    The threads of gloo, and the thread of a data loader that pins memory, take the lock of the
-    interpreter in C++ destructors. At the end of the interpreter, Python stops a thread that waits
-    for this lock. In a destructor this aborts the process, and the main thread may wait forever
-    for such a thread if it deletes a process group.
+    The threads of gloo take the lock of the interpreter in C++ destructors. At the end of the
+    interpreter, Python stops a thread that waits for this lock. In a destructor this aborts the
+    process, and the main thread may wait forever for such a thread if it deletes a process group.
 
     Args:
         code: Exit code.
@@ -194,7 +198,7 @@ def _run(command: Callable[[], str | None], clean_up_on_kill: bool) -> None:
         handler.has_ended = True
         if is_first_rank():
             sys.stderr.write(INTERRUPTED_TEXT)
-        if "RANK" in os.environ and not clean_up_on_kill:
+        if _is_rank() and not clean_up_on_kill:
             sys.stderr.flush()
             os._exit(128 + signal.SIGINT)  # the end of the interpreter would wait for other ranks
         sys.exit(128 + signal.SIGINT)
