@@ -18,6 +18,7 @@ from gsmap.evaluation.core.results_json import SHARD_KIND as RESULTS
 from gsmap.evaluation.core.results_json import vectors_of, write_results
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.shards import Shard
+from minicity.repaint import Change, changes_geojson
 
 
 def info_v2(sample: MapSample) -> dict[str, Any]:
@@ -140,6 +141,20 @@ def own_poses(sample: MapSample) -> bytes:
     stems = sorted({Path(camera.path).stem for camera in sample.cameras})
     rows = [f"{stem},1.0,2.0,0.0,1.0,0.0,0.0,0.0" for stem in stems]
     return "\n".join(["frame,x,y,z,qw,qx,qy,qz", *rows]).encode()
+
+
+def changes(map_name: str) -> bytes:
+    """Return a file of changes with each kind of a change in a town."""
+    line = np.array([[300.0, 300.0], [310.0, 300.0], [320.0, 301.0]])
+    ring = np.array([[300.0, 310.0], [308.0, 310.0], [308.0, 313.0], [300.0, 310.0]])
+    town = [
+        Change(0, "removed", "divider", before=line),
+        Change(1, "added", "ped_crossing", after=ring),
+        Change(2, "moved", "divider", before=line, after=line + 1),
+    ]
+    content = changes_geojson({map_name: town})
+    content["features"][0]["properties"]["confidence"] = 0.5
+    return json.dumps(content).encode()
 
 
 def own_record(sample: MapSample) -> dict[str, Any]:

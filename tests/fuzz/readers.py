@@ -26,6 +26,7 @@ from mmdet3d.registry import DATASETS
 from mmengine.config import Config
 from pyarrow.feather import write_feather
 
+from drivemaps.geojson_reading import read_geojson
 from fuzz import contents, mutations
 from fuzz.attacks import CONFIG
 from fuzz.reading import Pictures, Reader
@@ -34,12 +35,14 @@ from gsmap.checkpoints.reading import adopt_settings, read_weights
 from gsmap.checkpoints.settings import MODEL_SETTINGS, plain
 from gsmap.datasets.annotations.file import SHARD_KIND as ANNOTATIONS
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
-from gsmap.datasets.annotations.record import AnnotationMeta, MapSample
+from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta, MapSample
 from gsmap.datasets.elements import elements_of_instances
 from gsmap.datasets.errors import BrokenSampleError
 from gsmap.datasets.image_files import read_image
 from gsmap.datasets.transforms.points import FEATHER_COLUMNS, read_points
 from gsmap.engine.launch import check_config, read_config
+from gsmap.evaluation.analysis.change_files import read_changes
+from gsmap.evaluation.analysis.changes import change_figures, changed_samples
 from gsmap.evaluation.core.match_files import SHARD_KIND as MATCHES
 from gsmap.evaluation.core.results_json import RESULTS_KEY, read_samples, vectors_of, write_results
 from gsmap.evaluation.core.results_json import SHARD_KIND as RESULTS
@@ -92,6 +95,7 @@ class Files:
                   "log")  # fmt: skip
         town = self.work / f"maps/expansion/{self.sample.map_name}.json"
         plan = self.put("splits.json", b'{"train": ["scene-0001", "b"], "val": ["scene-0003"]}')
+        changes = self.put("changes.geojson", contents.changes(self.sample.map_name))
         byte, camera = mutations.damaged_bytes, mutations.renamed(self.sample.cameras[0].name)
         made = {
             "annotation file, its bytes": lambda: self.annotations(byte, exact=True),
@@ -129,6 +133,8 @@ class Files:
             "image, PNG": lambda: self.image(".png"),
             "nuScenes map expansion": lambda: self.json(town, self.expansion),
             "nuScenes CAN bus": self.can_bus,
+            "changes of a map": self.changes,
+            "map, GeoJSON": lambda: self.json(changes, lambda: read_geojson(changes, CLASSES)),
             "split file": lambda: self.json(plan, lambda: read_split_file(plan)),
             "Argoverse 2 poses": lambda: self.of_log("*.feather", byte),
             "Argoverse 2 calibration": lambda: self.of_log("calibration/intr*", byte),
@@ -348,6 +354,17 @@ class Files:
     def json(self, path: Path, read: Callable[[], Any]) -> Reader:
         damages = (mutations.damaged_bytes, mutations.damaged_json, mutations.damaged_json)
         return Reader(path, read, damages)
+
+    def changes(self) -> Reader:
+        path = self.work / "changes.geojson"
+        annotations = AnnotationFile(self.arrow)
+
+        def read() -> dict[str, float]:
+            found = read_changes(path)
+            changed_samples(found, annotations)
+            return change_figures(found, found, annotations, found_file=path)
+
+        return self.json(path, read)
 
     def expansion(self) -> list[np.ndarray]:
         layers = open_layers(self.work, self.sample.map_name, LIDAR_META.classes)

@@ -95,7 +95,8 @@ def change_report(args: argparse.Namespace) -> MetricReport:
         )
     found = read_changes(args.results)
     truth = read_changes(args.changes)
-    figures = change_figures(found, truth, AnnotationFile(args.ground_truth))
+    annotations = AnnotationFile(args.ground_truth)
+    figures = change_figures(found, truth, annotations, found_file=args.results)
     rows = []
     for name in (*KINDS, "all", "any_kind"):
         row = [name.replace("_", " ")]

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import shapely
@@ -147,7 +148,10 @@ def _all_samples(changes: Sequence[MapChange]) -> FloatArray:
 
 
 def change_figures(
-    found: Sequence[MapChange], truth: Sequence[MapChange], annotations: AnnotationFile
+    found: Sequence[MapChange],
+    truth: Sequence[MapChange],
+    annotations: AnnotationFile,
+    found_file: str | Path = "the file of found changes",
 ) -> dict[str, float]:
     """Compute precision and recall of changes.
 
@@ -160,6 +164,7 @@ def change_figures(
         found: Changes found by a model.
         truth: All true changes.
         annotations: Samples of the drives that found the changes.
+        found_file: File of the found changes, for messages.
 
     Returns:
         Figures by key: for each kind, for ``all`` and for ``any_kind`` (kinds are not compared) the
@@ -171,12 +176,12 @@ def change_figures(
         ValueError: If the map of a found change is unknown.
     """
     views = views_by_map(annotations)
-    found = with_map_names(found, sorted(views), where="the file of found changes")
+    found = with_map_names(found, sorted(views), where=str(found_file))
     truth = with_map_names(truth, sorted(views), where="the file of true changes")
     unknown = sorted({change.map_name for change in found} - views.keys())
     if unknown:
         raise InputError(
-            f"a change is on the map {unknown[0]!r}, and the samples are on "
+            f"{found_file} has a change on the map {unknown[0]!r}, and the samples are on "
             f"{sorted(views)!r:.200}: give the annotation file of its drives."
         )
     targets = _targets(truth, views)
