@@ -29,6 +29,10 @@ COMMANDS = {
     "overlap": ("mapdata.overlap", "list the validation samples that lie near training"),
     "occlusion": ("mapdata.nuscenes.occlusion", "group samples by how much boxes hide of the map"),
     "check": ("mapdata.check", "check annotation files completely"),
+    "fiftyone": (
+        "gsmap.visualization.fiftyone",
+        "write camera images with map elements for FiftyOne",
+    ),
     "export": ("mapdata.vectors_json", "write an annotation file's vectors as JSON"),
 }
 

@@ -1,0 +1,199 @@
+"""Export of camera images with map elements to a JSON file of FiftyOne."""
+
+import argparse
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.annotations.record import CameraRecord, MapSample
+from gsmap.datasets.elements import elements_of_instances
+from gsmap.evaluation.core.results_json import SampleFile
+from gsmap.structures.elements import MapElements
+from gsmap.structures.frames import FrameView, frame_view
+from gsmap.utils.cli import output_file
+from gsmap.utils.errors import InputError
+from gsmap.utils.files import atomic_write
+from gsmap.utils.words import format_count
+from gsmap.visualization.camera_projection import project_segments, subdivide
+
+_STEP_M = 2.0  # largest length of a projected segment
+_DECIMALS = 6  # of positions in an image, as shares of its width and height
+_ID_DIGITS = 24  # hexadecimal digits of an ID of FiftyOne
+_FIELDS = "fiftyone.core.fields."
+_POLYLINES = f"{_FIELDS}EmbeddedDocumentField(fiftyone.core.labels.Polylines)"
+
+
+def write_fiftyone(
+    path: str | Path,
+    annotations: str | Path,
+    results: str | Path | None = None,
+    data_root: str | Path | None = None,
+) -> int:
+    """Write a JSON file that ``fiftyone.Dataset.from_json`` loads as a grouped data set.
+
+    A group is a sample, and its slices are the images of the cameras. Map elements are polylines in
+    the images: ``ground_truth``, and ``predictions`` with their scores.
+
+    Args:
+        path: File to write.
+        annotations: Annotation file.
+        results: Result file; None for ground truth alone.
+        data_root: Folder that image paths are relative to; None for the folder of the annotations.
+
+    Returns:
+        Number of images.
+
+    Raises:
+        ValueError: If a file is malformed, or no sample has a camera.
+    """
+    file = AnnotationFile(annotations)
+    root = Path(data_root or Path(annotations).parent).resolve()
+    predictions = None
+    places = {}
+    if results is not None:
+        predictions = SampleFile(results, key="results", classes=file.meta.classes)
+        places = {token: place for token, _, place in predictions}
+        if not places.keys() & set(file.column("token")):
+            raise InputError(f"{results} has no sample of {annotations}.")
+    view = frame_view(file.meta.frame, file.meta.ground_z_m)
+    samples: list[dict[str, Any]] = []
+    for sample in file:
+        layers = {"ground_truth": elements_of_instances(sample.instances or [])}
+        if predictions is not None and sample.token in places:
+            layers["predictions"] = predictions.load(sample.token, places[sample.token])
+        samples += _images(sample, layers, view=view, classes=file.meta.classes, root=root)
+    if not samples:
+        raise InputError(f"{annotations} has no sample with a camera.")
+    content = {**_schema(file, samples=samples), "samples": samples}
+    with atomic_write(path, "w") as target:
+        json.dump(content, target)
+    return len(samples)
+
+
+def _schema(file: AnnotationFile, samples: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Name, slices and types of the fields of the data set."""
+    slices = {image["group"]["name"]: "image" for image in samples}
+    fields = {
+        "id": f"{_FIELDS}ObjectIdField",
+        "filepath": f"{_FIELDS}StringField",
+        "tags": f"{_FIELDS}ListField({_FIELDS}StringField)",
+        "group": f"{_FIELDS}EmbeddedDocumentField(fiftyone.core.groups.Group)",
+        "token": f"{_FIELDS}StringField",
+        "scene": f"{_FIELDS}StringField",
+        "ground_truth": _POLYLINES,
+        "predictions": _POLYLINES,
+    }
+    return {
+        "name": f"{file.meta.dataset}-{file.meta.split}",
+        "media_type": "group",
+        "group_field": "group",
+        "group_media_types": slices,
+        "default_group_slice": next(iter(slices)),
+        "sample_fields": fields,
+        "info": {},
+    }
+
+
+def _images(
+    sample: MapSample,
+    layers: dict[str, MapElements],
+    view: FrameView,
+    classes: Sequence[str],
+    root: Path,
+) -> Iterator[dict[str, Any]]:
+    """Yield the images of a sample, as FiftyOne stores samples.
+
+    Args:
+        sample: The sample.
+        layers: Map elements by the name of their field.
+        view: Orientation of the annotation frame, and height of the road.
+        classes: Names of the classes.
+        root: Data root of the images.
+    """
+    group = hashlib.sha256(sample.token.encode()).hexdigest()[:_ID_DIGITS]
+    for camera in sample.cameras:
+        image: dict[str, Any] = {
+            "filepath": str(root / camera.path),
+            "tags": [],
+            "group": {"_id": {"$oid": group}, "_cls": "Group", "name": camera.name},
+            "token": sample.token,
+            "scene": sample.scene,
+        }
+        for name, elements in layers.items():
+            polylines = list(_polylines(elements, camera=camera, view=view, classes=classes))
+            image[name] = {"_cls": "Polylines", "polylines": polylines}
+        yield image
+
+
+def _polylines(
+    elements: MapElements, camera: CameraRecord, view: FrameView, classes: Sequence[str]
+) -> Iterator[dict[str, Any]]:
+    """Yield the elements that a camera sees; those of unknown classes are left out."""
+    for number, line in enumerate(elements.polylines):
+        label = int(elements.labels[number])
+        shapes = _visible_parts(view.lift(line), camera)
+        if label < 0 or not shapes:
+            continue
+        polyline = {
+            "_cls": "Polyline",
+            "attributes": {},
+            "tags": [],
+            "label": classes[label],
+            "points": shapes,
+            "closed": False,
+            "filled": False,
+        }
+        if elements.scores is not None:
+            polyline["confidence"] = float(elements.scores[number])
+        yield polyline
+
+
+def _visible_parts(line: np.ndarray, camera: CameraRecord) -> list[list[list[float]]]:
+    """Parts of a line inside the image of a camera, as shares of its width and height.
+
+    Args:
+        line: Vertices in metres. (n, 3)
+        camera: The camera.
+
+    Returns:
+        Vertices of each part, in [0, 1].
+    """
+    dense = subdivide(line, _STEP_M)
+    size_px = (camera.width, camera.height)
+    segments, _, index = project_segments(
+        dense[:-1], dense[1:], img_from_frame=camera.img_from_frame, size_px=size_px
+    )
+    if not len(segments):
+        return []
+    shares = np.clip(segments / size_px, 0.0, 1.0).round(_DECIMALS)  # (m, 2, 2)
+    breaks = [i + 1 for i, (before, after) in enumerate(pairwise(index)) if after != before + 1]
+    parts = []
+    for run in np.split(shares, breaks):
+        vertices = np.concatenate([run[:, 0], run[-1:, 1]])
+        parts.append(vertices.tolist())
+    return parts
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``tools/create_data.py fiftyone``."""
+    parser.add_argument("annotations", type=Path, help="annotation file (.arrow)")
+    parser.add_argument("target", type=output_file, help="JSON file to write")
+    parser.add_argument("--results", type=Path, help="result file, for the field predictions")
+    parser.add_argument("--data-root", type=Path, help="root of the image paths")
+
+
+def run(arguments: argparse.Namespace) -> str:
+    """Run the command ``fiftyone`` and return its report."""
+    count = write_fiftyone(
+        arguments.target,
+        arguments.annotations,
+        results=arguments.results,
+        data_root=arguments.data_root,
+    )
+    return f"{format_count(count, 'image')} written to {arguments.target}"
