@@ -83,3 +83,20 @@ def vector(class_name: str, score: float, points: list[list[float]]) -> dict:
         "gaussian_scales": [[2.0, 0.5]] * len(points),
         "gaussian_rotations": [np.pi / 2] * len(points),
     }
+
+
+def write_changes_case(path: Path) -> Path:
+    """Changes near the vehicle at the origin, and one of another map."""
+    rows: list[tuple[str, str, list, dict]] = [
+        ("divider", "moved", [[1.0, -50], [1, 50]], {"moved_m": 1.02, "moved_std_m": 0.05}),
+        ("ped_crossing", "removed", RING, {"passes_not_seen": 2, "passes_in_view": 3}),
+        ("boundary", "added", [[400.0, 0], [410, 0]], {"confidence": 0.2}),
+        (STRANGE, "added", [[0.0, 0], [9, 0]], {"map": "village"}),
+    ]
+    features = []
+    for name, kind, points, more in rows:
+        geometry = {"type": "LineString", "coordinates": points}
+        properties = {"class": name, "change": kind, "map": "town", **more}
+        features.append({"type": "Feature", "geometry": geometry, "properties": properties})
+    path.write_text(json.dumps({"type": "FeatureCollection", "crs": None, "features": features}))
+    return path

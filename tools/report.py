@@ -72,13 +72,16 @@ def parse_args() -> argparse.Namespace:
         choices=LAWS,
         help="distribution of the errors (default: the one of the model's calibration, or normal)",
     )
+    parser.add_argument(
+        "--changes", type=Path, help="changes of the map (tools/build_map.py --changes), for a page"
+    )
     parser.add_argument("--scene", help="drive of a film; default: the first one of --ann")
     args = parser.parse_args()
     is_film = args.out.suffix.lower() == ".mp4"
     if is_film and (args.by or args.allow_mismatch or args.image_width is not None):
         parser.error("--by, --allow-mismatch and --image-width are of pages: leave them out")
-    if is_film and (args.allow_other_split or args.law):
-        parser.error("--allow-other-split and --law are of pages: leave them out")
+    if is_film and (args.allow_other_split or args.law or args.changes):
+        parser.error("--allow-other-split, --law and --changes are of pages: leave them out")
     if args.scene and not is_film:
         parser.error("--scene is of films: give --out NAME.mp4; a page has a field for the scene")
     return args
@@ -123,6 +126,7 @@ def main() -> str:
         by=args.by,
         allow_other_split=args.allow_other_split,
         law=args.law,
+        changes=args.changes,
     )
     data = page_data(args.ann, results, options)
     return write_page(args.out, data)

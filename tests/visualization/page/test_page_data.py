@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from processes import run_tool
-from report_case import CLASSES, FRAMES, STRANGE, write_case
+from report_case import CLASSES, FRAMES, RING, STRANGE, write_case, write_changes_case
 
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.evaluation.analysis.distances import cut_by_distance, distance_groups
@@ -296,3 +296,43 @@ def test_the_package_carries_the_page():
         path.name for path in (REPO / "projects/GSMap/gsmap/visualization/page").glob(pattern)
     }
     assert {"page.html", "page.css", "page.js"} <= carried
+
+
+def test_changes_are_lines_of_the_frames_and_a_table(case, tmp_path):
+    path = write_changes_case(tmp_path / "changes.geojson")
+    data = page_data(*case, replace(NO_IMAGES, changes=path))
+    for frame in data["frames"]:
+        moved, removed = frame["changes"]
+        assert moved == {
+            "kind": "moved",
+            "text": "divider moved by 1.02 \N{PLUS-MINUS SIGN} 0.05 m",
+            "p": [100, -3000, 100, 3000],  # cut to the range
+        }
+        assert removed["text"] == "ped_crossing removed (2 of 3 drives)"
+        assert removed["p"] == [round(100 * value) for point in RING for value in point]
+    assert "4 changes of the map: 1 removed, 2 added, 1 moved; 2 in these frames." in data["notes"]
+    table = data["tables"][-1]
+    assert table["caption"] == "Changes of the map"
+    rows = {tuple(row[:2]): row for row in table["rows"]}
+    assert rows["divider", "moved"][3] == "1.02 \N{PLUS-MINUS SIGN} 0.05 m"
+    assert rows["ped_crossing", "removed"][4] == "2 of 3"
+    assert table["rows"][-1][0] == "boundary"  # the least sure
+    assert "<img" not in page_html(data)
+
+
+def test_a_page_without_changes_has_none(case):
+    data = page_data(*case, NO_IMAGES)
+    assert all(frame["changes"] == [] for frame in data["frames"])
+    assert all(table["caption"] != "Changes of the map" for table in data["tables"])
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("moved_m", -1.0), ("moved_std_m", "x"), ("passes_in_view", True)]
+)
+def test_wrong_figures_of_changes_are_named(case, tmp_path, name, value):
+    path = write_changes_case(tmp_path / "changes.geojson")
+    content = json.loads(path.read_text())
+    content["features"][1]["properties"][name] = value
+    path.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=rf"feature 1: `{name}` must be a number of at least 0"):
+        page_data(*case, replace(NO_IMAGES, changes=path))

@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from report_case import CLASSES, FRAMES, STRANGE, write_case
+from report_case import CLASSES, FRAMES, STRANGE, write_case, write_changes_case
 
 from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.structures.grid import BEVGrid
@@ -343,4 +343,25 @@ def test_ground_truth_alone_has_no_controls_of_predictions(browser, page):
     open_frame(browser, 0)
     assert [e.text for e in shown(browser, "#maps strong")] == ["Ground truth"]
     assert len(shown(browser, "#maps .truth")) == 3
+    assert browser.get_log("browser") == []
+
+
+def test_changes_are_a_layer_with_words(browser, page, tmp_path):
+    changes = write_changes_case(tmp_path / "changes.geojson")
+    results = {"good": page.with_name("good.json")}
+    options = PageOptions(image_width=0, changes=changes)
+    write_page(tmp_path / "p.html", page_data(page.with_name("case.arrow"), results, options))
+    browser.get((tmp_path / "p.html").as_uri())
+    until_drawn(browser)
+    open_frame(browser, 1)
+    drawn = shown(browser, "#maps .bev .change")
+    assert [line.get_attribute("class") for line in drawn] == ["change moved", "change removed"]
+    title = drawn[0].find_element(By.TAG_NAME, "title").get_attribute("textContent")
+    assert title == "divider moved by 1.02 \N{PLUS-MINUS SIGN} 0.05 m"
+    legend = text(browser, "#legend")
+    assert "removed" in legend
+    assert "added" not in legend  # none in these frames
+    shown(browser, "[data-layer=change]")[0].click()
+    assert not shown(browser, "#maps .bev .change")
+    assert "Changes of the map" in browser.page_source
     assert browser.get_log("browser") == []

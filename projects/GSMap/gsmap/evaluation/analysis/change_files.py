@@ -34,6 +34,9 @@ class MapChange:
             the new one. (n, 2)
         old_points: Old place of a moved element, if it is known. (m, 2)
         confidence: Confidence in [0, 1].
+        moved_m: Distance in metres of a moved element, if it is known.
+        moved_std_m: Standard error of the distance in metres, if it is known.
+        passes: Number of drives that agree, and of those with the place in view, if known.
     """
 
     kind: str
@@ -42,6 +45,9 @@ class MapChange:
     points: FloatArray
     old_points: FloatArray | None
     confidence: float
+    moved_m: float | None = None
+    moved_std_m: float | None = None
+    passes: tuple[int, int] | None = None
 
     def samples(self) -> FloatArray:
         """Points at equal steps along the change. (M, 2)"""
@@ -110,7 +116,29 @@ def _read_feature(feature: Any) -> MapChange:
         points=_read_geometry(feature.get("geometry")),
         old_points=old_points,
         confidence=float(confidence),
+        moved_m=_read_amount(properties, "moved_m"),
+        moved_std_m=_read_amount(properties, "moved_std_m"),
+        passes=_read_passes(properties, "passes_not_seen" if kind == "removed" else "passes_seen"),
     )
+
+
+def _read_amount(properties: Mapping[str, Any], key: str) -> float | None:
+    """Read a number of at least 0; None if there is none."""
+    value = properties.get(key)
+    if value is None:
+        return None
+    if not _is_coordinate(value) or value < 0:
+        raise InputError(f"`{key}` must be a number of at least 0, got {value!r:.60}")
+    return float(value)
+
+
+def _read_passes(properties: Mapping[str, Any], key: str) -> tuple[int, int] | None:
+    """Read a number of drives, and the number of drives in view; None if one is missing."""
+    count = _read_amount(properties, key)
+    in_view = _read_amount(properties, "passes_in_view")
+    if count is None or in_view is None:
+        return None
+    return int(count), int(in_view)
 
 
 def _read_name(properties: Mapping[str, Any], key: str) -> str:

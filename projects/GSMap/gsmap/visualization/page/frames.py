@@ -58,8 +58,8 @@ def choose_frames(
     return sorted(chosen)
 
 
-def _centimetres(points: np.ndarray, view: FrameView) -> list[int]:
-    """Convert points (n, 2) to (right, ahead) in whole centimetres, flattened. -> (2 n,)"""
+def to_centimetres(points: np.ndarray, view: FrameView) -> list[int]:
+    """Convert points of a frame (n, 2) to (right, ahead) in whole centimetres. -> (2 n,)"""
     centimetres = np.rint(100 * view.display_from_frame(points)).astype(int)
     return centimetres.ravel().tolist()
 
@@ -77,7 +77,7 @@ def truth_of(sample: MapSample, view: FrameView) -> list[dict[str, Any]]:
     elements = elements_of_instances(sample.instances or [])
     entries = []
     for line, label, _ in elements.rows:
-        entries.append({"c": label, "p": _centimetres(line, view)})
+        entries.append({"c": label, "p": to_centimetres(line, view)})
     return entries
 
 
@@ -105,7 +105,7 @@ def predictions_of(token: str, result: ScoredResult, view: FrameView) -> list[di
     hits = result.hits(token)[is_shown].tolist()
     entries: list[dict[str, Any]] = []
     for (line, label, score), hit in zip(elements.rows, hits, strict=True):
-        points = _centimetres(line, view)
+        points = to_centimetres(line, view)
         entries.append({"c": label, "s": round(score, 6), "hit": hit, "p": points})
     if elements.scales is not None and elements.rotations is not None:
         degrees = np.degrees(elements.rotations + view.display_turn_rad)

@@ -116,6 +116,14 @@ function shapes(frame, r, parts, path, named = true) {
   return drawn;
 }
 
+function changeShapes(frame, named) {
+  return frame.changes.map((item) => {
+    const node = make("svg:path", { class: `change ${item.kind}`, d: flat(item) });
+    if (named) node.append(make("svg:title", {}, item.text));
+    return node;
+  });
+}
+
 // ---- bird's-eye view: metres, to the right and ahead ----
 
 function flat(item) {
@@ -236,7 +244,7 @@ function birdsEye(frame, r, large) {
       view.append(group);
     }
   }
-  view.append(...lines);
+  view.append(...lines, ...changeShapes(frame, large));
   const taken = [];
   for (const item of large && r !== null ? frame.found[r] : []) {
     const label = scoreLabel(item, taken);
@@ -480,9 +488,12 @@ function drawLegend() {
       .map(([key, text]) => [data.match_colours[key], text, `sign-${key}`])
     : data.classes.filter((_, c) => data.frames.some((frame) => [frame.truth, ...frame.found].some((items) => items.some((item) => item.c === c))))
       .map((of) => [of.colour, of.title, ""]);
+  for (const kind of ["removed", "added", "moved"]) {
+    if (data.frames.some((frame) => frame.changes.some((item) => item.kind === kind))) lines.push([null, kind, `change ${kind}`]);
+  }
   byId("legend").replaceChildren(...lines.map(([colour, text, kind]) => {
     const swatch = make("span", { class: `swatch ${kind}` });
-    swatch.style.setProperty("color", colour);
+    if (colour) swatch.style.setProperty("color", colour);
     return make("li", {}, swatch, text);
   }));
 }
@@ -537,6 +548,7 @@ function start() {
   const scored = data.results.length > 0;
   document.body.classList.toggle("no-results", !scored);
   document.body.classList.toggle("no-pair", !pair);
+  document.body.classList.toggle("no-changes", !data.frames.some((frame) => frame.changes.length));
   document.body.classList.toggle("no-gaussians", !data.frames.some((frame) => frame.found.some((found) => found.some((item) => item.g))));
   for (const [key, colour] of Object.entries(data.match_colours)) document.documentElement.style.setProperty(`--${key}`, colour);
   const [left, right, bottom, top] = data.extent;

@@ -26,6 +26,7 @@ from gsmap.utils.files import write_text
 from gsmap.utils.inputs import has_mark
 from gsmap.utils.words import format_count
 from gsmap.visualization.bev_view import display_extent
+from gsmap.visualization.page.changes import ChangeLayer
 from gsmap.visualization.page.frames import cameras_of, choose_frames, predictions_of, truth_of
 from gsmap.visualization.page.scores import MATCH_M, ScoredResult, score_by_distance, score_result
 from gsmap.visualization.page.tables import (
@@ -60,6 +61,8 @@ class PageOptions:
         allow_other_split: Whether models may be of another split than the annotation file.
         law: Distribution of the errors of vertices, ``normal`` or ``laplace``, for results with
             Gaussians; by default the distribution of their calibration, or else ``normal``.
+        changes: File of changes of the map (``build_map.py --changes``), shown in the frames and
+            in a table.
 
     Raises:
         ValueError: If a value is out of its range.
@@ -73,6 +76,7 @@ class PageOptions:
     by: str | None = None
     allow_other_split: bool = False
     law: str | None = None
+    changes: Path | None = None
 
     def __post_init__(self) -> None:
         if self.max_frames < 1 or self.image_width < 0 or not 0 <= self.score_thr <= 1:
@@ -125,6 +129,7 @@ def page_data(
         tokens, max_frames=options.max_frames, results=scored, score_thr=options.score_thr
     )
     root = Path(annotations).parent if options.data_root is None else options.data_root
+    layer = ChangeLayer(options.changes, file)
     frames = []
     for index in chosen:
         sample = file[index]
@@ -143,6 +148,7 @@ def page_data(
             "truth": truth_of(sample, view),
             "found": predictions,
             "cameras": cameras,
+            "changes": layer.entries(sample, view),
         }
         frames.append(frame)
     notes = []
@@ -160,6 +166,8 @@ def page_data(
     tables: list[Table] = []
     if scored:
         tables = _tables(scored, truth=truth, style=style, file=file, options=options)
+    notes += layer.notes()
+    tables += layer.tables()
     return {
         "title": f"{meta.dataset} {meta.split}: {' and '.join(results) or 'ground truth'}",
         "notes": notes,

@@ -1,0 +1,130 @@
+"""Changes of the map on the report page: lines of each frame, and their table."""
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.annotations.record import MapSample
+from gsmap.evaluation.analysis.change_files import KINDS, MapChange, read_changes
+from gsmap.evaluation.analysis.changes import with_map_names
+from gsmap.structures.elements import MapElements
+from gsmap.structures.frames import FrameView
+from gsmap.structures.polylines import clip_to_box, is_closed
+from gsmap.structures.rigid import invert_rigid
+from gsmap.utils.words import format_count
+from gsmap.visualization.page.frames import to_centimetres
+from gsmap.visualization.page.tables import Table
+
+
+class ChangeLayer:
+    """Changes of the places of an annotation file.
+
+    Args:
+        path: File of ``build_map.py --changes`` or of MiniCity; None for no changes.
+        file: Annotation file.
+
+    Raises:
+        FileNotFoundError: If the file of changes does not exist.
+        ValueError: If it is malformed.
+    """
+
+    def __init__(self, path: Path | None, file: AnnotationFile) -> None:
+        maps = sorted(set(file.column("map_name")))
+        changes = read_changes(path) if path else []
+        self._changes = with_map_names(changes, maps, where=str(path))
+        self._is_shown = path is not None
+        self._meta = file.meta
+        self._shown: set[int] = set()
+
+    def entries(self, sample: MapSample, view: FrameView) -> list[dict[str, Any]]:
+        """Convert the changes in range of a sample to plain values.
+
+        Args:
+            sample: Sample of the annotation file.
+            view: Orientation of the annotation frame.
+
+        Returns:
+            Kind ``kind``, description ``text`` and points ``p`` in centimetres of each piece.
+        """
+        frame_from_global = invert_rigid(sample.global_from_frame)
+        entries = []
+        for index, change in enumerate(self._changes):
+            if change.map_name != sample.map_name:
+                continue
+            line = MapElements.from_polylines([change.points], [0]).to_frame(frame_from_global)
+            pieces = clip_to_box(line.points, self._meta.x_range, self._meta.y_range)
+            if pieces and is_closed(line.points):
+                pieces = [line.points]
+            for piece in pieces:
+                self._shown.add(index)
+                entry = {
+                    "kind": change.kind,
+                    "text": _describe(change),
+                    "p": to_centimetres(piece, view),
+                }
+                entries.append(entry)
+        return entries
+
+    def notes(self) -> list[str]:
+        """Describe the number of changes, and of those in range of the frames so far."""
+        if not self._is_shown:
+            return []
+        counts = Counter(change.kind for change in self._changes)
+        parts = [f"{counts[kind]} {kind}" for kind in KINDS]
+        total = format_count(len(self._changes), noun="change")
+        return [f"{total} of the map: {', '.join(parts)}; {len(self._shown)} in these frames."]
+
+    def tables(self) -> list[Table]:
+        """Table of all changes, the surest first; none without a file."""
+        if not self._is_shown:
+            return []
+        rows = []
+        for change in sorted(self._changes, key=lambda each: -each.confidence):
+            rows.append(_row(change))
+        head = ["class", "change", "map", "by", "drives", "confidence", "near (global frame)"]
+        return [{"caption": "Changes of the map", "head": head, "rows": rows}]
+
+
+def _distance(change: MapChange) -> str:
+    """Distance of a moved element with its standard error; empty for others."""
+    if change.moved_m is None:
+        return ""
+    if change.moved_std_m is None:
+        return f"{change.moved_m:.2f} m"
+    return f"{change.moved_m:.2f} \N{PLUS-MINUS SIGN} {change.moved_std_m:.2f} m"
+
+
+def _drives(change: MapChange) -> str:
+    """Number of drives that agree, of those in view."""
+    if change.passes is None:
+        return ""
+    agreeing, in_view = change.passes
+    return f"{agreeing} of {in_view}"
+
+
+def _describe(change: MapChange) -> str:
+    """Describe a change in a few words."""
+    parts = [f"{change.class_name} {change.kind}"]
+    if change.moved_m is not None:
+        parts.append(f"by {_distance(change)}")
+    if change.passes is not None:
+        parts.append(f"({_drives(change)} drives)")
+    return " ".join(parts)
+
+
+def _row(change: MapChange) -> Sequence[str]:
+    """Row of the table."""
+    x, y = np.mean(change.points, axis=0)
+    return [
+        change.class_name,
+        change.kind,
+        change.map_name,
+        _distance(change),
+        _drives(change),
+        f"{change.confidence:.2f}",
+        f"{x:.0f} m, {y:.0f} m",
+    ]
