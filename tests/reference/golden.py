@@ -3,11 +3,12 @@
 import importlib.util
 import json
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 from unittest.mock import patch
 
 import numpy as np
@@ -22,6 +23,7 @@ from gsmap import registered  # noqa: F401
 from gsmap.checkpoints.key_map import key_maps
 
 NUM_CAMS = 6
+Output = TypeVar("Output")
 
 
 @dataclass(eq=False)
@@ -43,6 +45,7 @@ class Golden:
     recipes: Path | None = None
     _models: dict[str, BaseModel] = field(default_factory=dict, repr=False)
     _states: dict[str, dict[str, Tensor]] = field(default_factory=dict, repr=False)
+    _outputs: dict[str, Any] = field(default_factory=dict, repr=False)
 
     def _file(self, name: str) -> Path:
         """Return the file of a recipe, there or not."""
@@ -142,6 +145,22 @@ class Golden:
             model.load_state_dict(self.upstream_state(state_list))
             self._models[config] = model.eval()
         return self._models[config]
+
+    def once(self, name: str, make: Callable[[], Output]) -> Output:
+        """Return outputs of a model that several files share.
+
+        Args:
+            name: Name of the outputs, unique among all checks.
+            make: Computes the outputs, without a gradient, if they are not there.
+        """
+        if name not in self._outputs:
+            with torch.no_grad():
+                self._outputs[name] = make()
+        return self._outputs[name]
+
+    def forget_outputs(self) -> None:
+        """Delete the outputs of `once`, since a weight of a model has changed."""
+        self._outputs.clear()
 
     def images(self, size: str) -> Tensor:
         """Return the normalised images of a size (``full`` or ``reduced``). (1, V, 3, H, W)"""

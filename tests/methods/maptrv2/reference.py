@@ -53,10 +53,25 @@ def all_queries(head: MapHead) -> Iterator[None]:
 
 
 def encode(golden: Golden, size: str) -> tuple[BaseModel, dict[str, Tensor]]:
-    """Return the model and its BEV encoder's outputs."""
+    """Return the model and its BEV encoder's outputs, which the files of one size share."""
     model = golden.model(CONFIG, STATE)
-    feats = model.extract_img_feats(golden.images(size))
-    return model, model.bev_encoder(feats, [golden.meta(size)])
+
+    def outputs() -> dict[str, Tensor]:
+        feats = model.extract_img_feats(golden.images(size))
+        return model.bev_encoder(feats, [golden.meta(size)])
+
+    return model, golden.once(f"{STATE}: BEV features, {size}", outputs)
+
+
+def training_outputs(golden: Golden, size: str) -> list[Predictions]:
+    """Return the predictions of the training queries, which the files of one size share."""
+    model, bev_outputs = encode(golden, size)
+
+    def outputs() -> list[Predictions]:
+        with all_queries(model.map_head):
+            return model.map_head(bev_outputs)
+
+    return golden.once(f"{STATE}: training queries, {size}", outputs)
 
 
 @check("maptrv2_r50_forward_*_{variant}.npz")
@@ -78,8 +93,7 @@ def check_forward(golden: Golden, name: str) -> Iterator[Row]:
     yield Row(name, "cells with seg off by > 1e-3", seg, FLIPPED)
     pv_seg = masks["pv_seg"](bev_outputs["img_feats"].flatten(0, 1))[None]
     yield Row(name, "pv_seg", largest_difference(pv_seg, data["pv_seg"]), 1e-4)
-    with all_queries(head):
-        groups = [part for _, part in head.split_groups(head(bev_outputs))]
+    groups = [part for _, part in head.split_groups(training_outputs(golden, size))]
     yield from group_rows(name, data, *groups)
 
 
@@ -143,8 +157,7 @@ def check_loss(golden: Golden, name: str) -> Iterator[Row]:
     gt = gt_instances(golden.gt_sets[case])
     sample = auxiliary_targets(golden, size, case)
     yield from target_rows(name, data, gt, sample)
-    with all_queries(head):
-        outputs = head(bev_outputs)
+    outputs = training_outputs(golden, size)
     for group, part in head.split_groups(outputs):
         label = group.name or "one2one"
         yield from match_rows(name, data, label, head, part, gt, meta, group.repeats)
