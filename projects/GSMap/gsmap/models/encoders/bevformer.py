@@ -9,7 +9,7 @@ from torch import Tensor
 
 from gsmap.models.base.attention import SamplingAttention, sample_map
 from gsmap.models.encoders.projection import PillarProjection
-from gsmap.structures.tensors import constant
+from gsmap.structures.tensors import constant, upload
 from gsmap.utils.errors import InputError
 
 
@@ -66,6 +66,7 @@ class SpatialCrossAttention(SamplingAttention):
         weights = self.weights(query).chunk(self.num_parts, 3)
         repeats = self.num_points // (self.num_parts * self.num_heights)
         summed = query.new_zeros(query.shape, dtype=torch.float32)
+        cells = [] if self.fixed_sizes else _visible_cells(projection.visible)
         for feats, offset, weight in zip(levels, offsets, weights, strict=True):
             height, width = feats.shape[-2:]
             offset = offset / constant(query, [width, height])
@@ -82,7 +83,7 @@ class SpatialCrossAttention(SamplingAttention):
                 continue
             batch, num_views = feats.shape[:2]
             for sample, view in product(range(batch), range(num_views)):
-                cell = projection.visible[sample, view].nonzero()[:, 0]  # (T,)
+                cell = cells[sample * num_views + view]  # (T,)
                 centres = projection.uv[sample, view, cell].repeat(1, repeats, 1)  # (T, S, 2)
                 locations = centres[:, None] + offset[sample, cell]  # (T, heads, S, 2)
                 sampled = sample_map(
@@ -94,6 +95,20 @@ class SpatialCrossAttention(SamplingAttention):
                 summed[sample] = summed[sample].index_add(0, cell, sampled[0])
         count = projection.visible.sum(1).clamp(min=1)
         return self.output_proj(summed / count[..., None])
+
+
+def _visible_cells(visible: Tensor) -> list[Tensor]:
+    """Indices of the cells that each camera sees, with a single wait for a GPU.
+
+    Args:
+        visible: Whether a cell is visible in a camera. (B, V, Q)
+
+    Returns:
+        Indices of each camera of each sample. B * V tensors (T,)
+    """
+    pairs = visible.flatten(0, 1).cpu()
+    indices = [pair.nonzero()[:, 0] for pair in pairs.unbind()]
+    return upload(indices, visible.device)
 
 
 def _sample_all_pairs(
