@@ -1,0 +1,148 @@
+"""``infer --prior``, ``test --prior`` and a resumed training, on a tiny MiniCity."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from methods.hrmapnet.prior_cases import CLASSES
+from mmdet3d.registry import MODELS
+from processes import run_tool
+
+from gsmap.engine.launch import read_config
+from gsmap.prior import LastSeen, MapPrior, PriorSettings
+from gsmap.utils.shards import digest
+from tools import infer
+
+PRIOR = """
+_base_ = {base!r}
+model = dict(prior=dict(
+    type='RasterPrior', cell_m=0.6, score_threshold=0.0, bev=dict(layer=None, threshold=0.1),
+    queries=dict(num_heads=4, stride=1, threshold=0.1)))
+"""
+
+
+@pytest.fixture(scope="module")
+def config(tiny_config, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("prior") / "prior.py"
+    path.write_text(PRIOR.format(base=str(tiny_config)))
+    return path
+
+
+@pytest.fixture(scope="module")
+def model(config) -> list[str]:
+    """The words after ``--model``."""
+    torch.manual_seed(0)
+    path = config.with_name("weights.pth")
+    model = MODELS.build(read_config(config).model)
+    model.init_weights()
+    torch.save({"state_dict": model.state_dict()}, path)
+    return [str(config), str(path)]
+
+
+def lines_of(path):
+    return {r["sample_token"]: r["vectors"] for r in json.loads(path.read_text())["results"]}
+
+
+def test_a_prior_is_made_updated_and_only_read(model, minicity_annotations, tmp_path, capsys):
+    path, drive = tmp_path / "town.prior", str(minicity_annotations["val"])
+
+    def run(name, *words):
+        out = tmp_path / f"{name}.json"
+        infer.main([drive, "--model", *model, "--out", str(out), *map(str, words)])
+        return lines_of(out)
+
+    first = run("first", "--prior", path, "--update-prior")
+    assert f"updated: {path}" in capsys.readouterr().out
+    with MapPrior.load(path) as prior:
+        settings = PriorSettings(CLASSES, "boston-seaport", cell_m=0.6)
+        assert prior.settings == settings
+        assert prior.rule == LastSeen()
+        assert prior.num_tiles > 0
+    before = digest(path)
+    second = run("second", "--prior", path)
+    assert digest(path) == before
+    assert second != first  # the map was empty then
+    assert run("kept") == first  # without a prior, a map is kept from empty
+    run("third", "--prior", path, "--update-prior")
+    assert digest(path) != before
+    with pytest.raises(ValueError, match="--shard cuts drives"):
+        run("part", "--prior", path, "--shard", "1/2")
+
+
+def test_priors_that_do_not_fit_are_refused(model, tiny_config, minicity_annotations, tmp_path):
+    drive, out = str(minicity_annotations["val"]), str(tmp_path / "map.json")
+
+    def run(path, *words, of=model):
+        infer.main([drive, "--model", *of, "--out", out, "--prior", str(path), *words])
+
+    def saved(name, classes=CLASSES, place="boston-seaport", cell_m=0.6):
+        path = tmp_path / name
+        MapPrior(PriorSettings(classes, place, cell_m=cell_m), LastSeen()).save(path)
+        return path
+
+    with pytest.raises(ValueError, match="has classes"):
+        run(saved("classes", classes=CLASSES[:2]))
+    with pytest.raises(ValueError, match=r"has cell_m 0\.3"):
+        run(saved("cells", cell_m=0.3))
+    with pytest.raises(ValueError, match=r"is in 'boston-seaport', and the priors are of \['oslo'"):
+        run(saved("place", place="oslo"))
+    with pytest.raises(FileNotFoundError):
+        run(tmp_path / "nowhere")
+    cut = saved("cut")
+    cut.write_bytes(cut.read_bytes()[:-5])
+    with pytest.raises(ValueError, match="cut"):
+        run(cut)
+    whole = saved("whole")
+    with (
+        MapPrior.load(whole, update=True),
+        pytest.raises(RuntimeError, match="whole"),
+    ):
+        run(whole, "--update-prior")
+    weights = tmp_path / "plain.pth"
+    state = MODELS.build(read_config(tiny_config).model).state_dict()
+    torch.save({"state_dict": state}, weights)
+    with pytest.raises(ValueError, match="the model takes no prior"):
+        run(whole, of=[str(tiny_config), str(weights)])
+    with pytest.raises(SystemExit):
+        infer.parse_args([drive, "--model", *model, "--out", out, "--update-prior"])
+
+
+def test_a_test_reads_a_prior(model, minicity_annotations, tmp_path):
+    path = tmp_path / "town.prior"
+    infer.main(
+        [
+            str(minicity_annotations["val"]), "--model", *model, "--out", str(tmp_path / "a.json"),
+            "--prior", str(path), "--update-prior",
+        ]
+    )  # fmt: skip
+    words = ["tools/test.py", *model, "--eval", "--work-dir", tmp_path / "work"]
+    before = digest(path)
+    found = {}
+    for name, options in {"kept": [], "prior": ["--prior", path]}.items():
+        out = tmp_path / f"{name}.json"
+        done = run_tool(*words, "--out", out, *options)
+        assert done.returncode == 0, done.stderr[-2000:]
+        found[name] = lines_of(out)
+    assert digest(path) == before
+    assert found["kept"] == lines_of(tmp_path / "a.json")
+    assert found["prior"] != found["kept"]
+    done = run_tool(*words, "--out", tmp_path / "b.json", "--prior", tmp_path / "nowhere")
+    assert done.returncode == 2
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert "nowhere" in done.stderr
+
+
+def test_a_resumed_training_is_equal_bit_for_bit(config, minicity_annotations, tmp_path):
+    """The map is empty at the start of an epoch, so nothing of it is lost at its end."""
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    for folder, *runs in ((whole, 2), (parts, 1, 2)):
+        for number, epochs in enumerate(runs):
+            done = run_tool(
+                "tools/train.py", config, "--work-dir", folder, *(["--resume"] if number else []),
+                "--cfg-options", f"train_cfg.max_epochs={epochs}",
+            )  # fmt: skip
+            assert done.returncode == 0, done.stderr[-2000:]
+    states = [torch.load(folder / "epoch_2.pth", weights_only=False) for folder in (whole, parts)]
+    for name, value in states[0]["state_dict"].items():
+        assert torch.equal(value, states[1]["state_dict"][name]), name
