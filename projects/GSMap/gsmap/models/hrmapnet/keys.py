@@ -1,0 +1,38 @@
+"""State keys of the HRMapNet release (on MapTRv2) and their names here."""
+
+from gsmap.checkpoints.key_rules import KeyMap, rules_of
+from gsmap.models.maptr.keys import HEAD, TRANSFORMER
+from gsmap.models.maptrv2.keys import LIFTED_MARKER, LIFTED_UNUSED, MAPTRV2
+
+_BEV_LAYER = "prior.bev.layer."
+_MAP_LAYER = TRANSFORMER + "map_encoder.layers.{i}."
+_LABELS = (HEAD + "label_encoder.", "prior.queries.label_encoder.")
+# Of the modules that MapTRv2 does not use, the BEV layer uses these.
+_USED_AGAIN = ("positional_encoding.", "transformer.level_embeds", "transformer.cams_embeds")
+_UNUSED = {
+    key: value
+    for key, value in LIFTED_UNUSED.items()
+    if not key.removeprefix(HEAD).startswith(_USED_AGAIN)
+}
+
+HRMAPNET = KeyMap(
+    "hrmapnet",
+    (
+        *MAPTRV2.rules,
+        _LABELS,
+        *rules_of(HEAD, "prior.queries.", "query_attention.attn.=attention."),
+        *rules_of(TRANSFORMER, "prior.bev.", "map_feats_conv.=conv."),
+        *rules_of(HEAD, _BEV_LAYER, "bev_embedding. positional_encoding."),
+        *rules_of(TRANSFORMER, _BEV_LAYER, "level_embeds cams_embeds"),
+        *rules_of(
+            _MAP_LAYER,
+            _BEV_LAYER + "layers.{i}.",
+            "attentions.0.=self_attn. attentions.1.output_proj.=cross_attn.output_proj. "
+            "attentions.1.deformable_attention.=cross_attn. ffns.0.=ffn. norms.",
+        ),
+    ),
+    _UNUSED,
+    markers=(LIFTED_MARKER, _LABELS),
+)
+
+KEY_MAPS = (HRMAPNET,)
