@@ -71,7 +71,7 @@ class ExportedDetector(nn.Module):
         self.model = model
         stream_inputs = () if model.temporal is None else STREAM_INPUTS
         calibration = [*model.bev_encoder.calibration]
-        prior_inputs = ()
+        prior_inputs: tuple[str, ...] = ()
         if model.prior is not None:
             prior_inputs = (PRIOR_INPUT,)
             for name in model.prior.calibration:

@@ -1,12 +1,13 @@
 """Head of HRMapNet: queries without a positional half."""
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
-from gsmap.models.base.decoder import Decoded, MapDecoder
+from gsmap.models.base.decoder import Decoded, MapDecoder, Queries, Refine
 from gsmap.models.base.head import MapHead
 from gsmap.models.base.layers import init_matrices, mlp
 from gsmap.models.base.parts import PartConfig
@@ -20,18 +21,39 @@ class ContentDecoder(MapDecoder):
     It has the arguments of `MapDecoder`.
     """
 
-    def forward(self, query: Tensor, query_pos: Tensor, **inputs: Any) -> list[Decoded]:
-        """Run all layers.
+    def forward(
+        self,
+        query: Tensor,
+        query_pos: Tensor,
+        reference: Tensor,
+        bev_feats: Tensor,
+        refine: Refine,
+        attn_mask: Tensor | None = None,
+        between: Callable[[int, Queries], Queries] | None = None,
+    ) -> list[Decoded]:
+        """Run all layers as `MapDecoder.forward`, without positional queries.
 
         Args:
             query: Content of the queries. (B, Q, C)
             query_pos: Positional queries; not used. (B, Q, C)
-            inputs: Further arguments of `MapDecoder.forward`.
+            reference: Initial references. (B, N * P, D)
+            bev_feats: BEV features. (B, C, H, W)
+            refine: Refinement of the references after each layer.
+            attn_mask: True where an instance may not attend to another, or None. (N, N)
+            between: Change of the queries between layers, or None.
 
         Returns:
             The output of every layer.
         """
-        return super().forward(query, query_pos=torch.zeros_like(query_pos), **inputs)
+        return super().forward(
+            query,
+            query_pos=torch.zeros_like(query_pos),
+            reference=reference,
+            bev_feats=bev_feats,
+            refine=refine,
+            attn_mask=attn_mask,
+            between=between,
+        )
 
 
 @MODELS.register_module()
@@ -60,13 +82,15 @@ class HRMapNetHead(MapHead):
         num_instances = sum(group.num for group in self.query_groups)
         self.instance_embedding = nn.Embedding(num_instances, embed_dims)
         self.pts_embedding = PointTable(num_points, embed_dims // 2)  # of C channels
-        first: Any = self.reference.initial
-        self.reference.initial = mlp(embed_dims, embed_dims, embed_dims, first.out_features)
+        reference: Any = self.reference
+        out_dims = reference.initial.out_features
+        reference.initial = mlp(embed_dims, embed_dims, embed_dims, out_dims)
 
     def init_weights(self) -> None:
         """Initialise as `MapHead`, and the network of the first references (Xavier)."""
         super().init_weights()
-        init_matrices(self.reference.initial)
+        reference: Any = self.reference
+        init_matrices(reference.initial)
 
     def queries(self) -> tuple[Tensor, Tensor]:
         """Queries as the source of the first references, and as content. (N * P, C) each
@@ -76,5 +100,6 @@ class HRMapNetHead(MapHead):
         embeddings = self.instance_embedding.weight
         if not self.training:
             embeddings = embeddings[: self.query_groups[0].num]
+        assert self.pts_embedding is not None  # set in the constructor
         query = self.pts_embedding(embeddings).flatten(0, 1)
         return query, query

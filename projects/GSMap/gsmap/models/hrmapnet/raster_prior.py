@@ -205,7 +205,7 @@ class RasterPrior(BaseModule):
     def fuse(
         self,
         outputs: Mapping[str, Any],
-        metas: Sequence[Mapping[str, Any]],
+        metas: Sequence[dict[str, Any]],
         img_shape: tuple[int, int],
     ) -> dict[str, Any]:
         """Read the map of a batch, and fuse the outputs of the encoder with it.
