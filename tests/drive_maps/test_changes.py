@@ -143,3 +143,16 @@ def test_the_error_of_a_shift_by_hand():
     assert sure.exceeds(1.0)
     assert not Shift(1.0, 0.4).exceeds(0.5)
     assert Shift(0.5, 0.1).probability(0.5) == pytest.approx(0.5)
+
+
+def test_a_doubtful_element_of_the_old_map_is_a_doubtful_change():
+    """A line that is gone, and one that moved, of which the old map was half sure."""
+    drive = straight_drive([UP], [0], np.arange(0.0, 101.0, 4.0))
+    one_pass = Pass(drive, map_of([(0, UP)]))
+    confidences = []
+    for score in (1.0, 0.5):
+        old = MapElements.from_polylines([beside(0.9), beside(5)], [0, 0], [score, score])
+        found = find_changes(old, [one_pass]).changes
+        assert [change.kind for change in found] == ["removed", "moved"]
+        confidences.append([change.confidence for change in found])
+    np.testing.assert_allclose(confidences[1], np.array(confidences[0]) / 2)

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -43,6 +44,11 @@ def test_maps_of_the_library_are_read_back(tmp_path, suffix, origin, atol):
     found, unused = read_map(path, CLASSES, origin)
     assert_equal(found, expected, atol)
     assert not unused
+    scored = replace(expected, scores=np.linspace(0, 1, len(expected)))
+    write(path, scored, CLASSES, origin)
+    found, _ = read_map(path, CLASSES, origin)
+    kept = scored.scores if suffix == "geojson" else np.ones(len(expected))
+    np.testing.assert_allclose(found.scores, kept, atol=1e-4)
 
 
 @pytest.mark.parametrize("place", [ORIGIN, MapOrigin(40.44, -80.0, utm_zone=17), GRID])
@@ -349,3 +355,12 @@ def test_maps_with_too_many_vertices_are_refused(tmp_path, monkeypatch, suffix):
         path.write_text(geojson([divider([*LINE, *LINE])], crs=None))
     with pytest.raises(ValueError, match=r"has more than \d (vertices|nodes and references)"):
         read_map(Path(path), CLASSES)
+
+
+@pytest.mark.parametrize("score", [math.nan, math.inf, -1, 7, True, "high", None, 10**400])
+def test_other_scores_of_strangers_are_not_used(tmp_path, score):
+    path = tmp_path / "town.geojson"
+    path.write_text(geojson([feature("LineString", LINE, **{"class": "divider", "score": score})]))
+    path.write_text(path.read_text().replace("{", '{"crs": null, ', 1))
+    found, _ = read_map(path, CLASSES)
+    assert found.scores.tolist() == [1.0]

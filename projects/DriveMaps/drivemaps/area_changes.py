@@ -62,11 +62,10 @@ def area_changes(
     Returns:
         Removed, moved and added areas.
     """
-    old_areas = _areas_of(old, label)
     new_areas = [_areas_of(one_pass.elements, label) for one_pass in passes]
     detections = _detections(passes, label=label, config=config)
     changes = []
-    for area in old_areas:
+    for area, known in _scored_areas(old, label):
         outline = _outline(area)
         in_view = _passes_in_view(outline, passes)
         is_seen = np.array([_overlaps(area, areas) for areas in new_areas])
@@ -79,7 +78,7 @@ def area_changes(
                 REMOVED,
                 label,
                 line=shapely.get_coordinates(area.exterior),
-                confidence=smooth_share(num_without, views),
+                confidence=known * smooth_share(num_without, views),
                 passes_in_view=num_in_view,
                 num_passes=num_missing,
             )
@@ -94,7 +93,7 @@ def area_changes(
                 MOVED,
                 label,
                 line=shapely.get_coordinates(new_area.exterior),
-                confidence=share * shift.probability(_MIN_MOVE_M),
+                confidence=known * share * shift.probability(_MIN_MOVE_M),
                 passes_in_view=num_in_view,
                 num_passes=num_in_view - num_missing,
                 moved_m=shift.mean_m,
@@ -152,10 +151,18 @@ def _polygons(rings: list[FloatArray]) -> list[shapely.Polygon]:
     return polygons
 
 
+def _scored_areas(elements: MapElements, label: int) -> list[tuple[shapely.Polygon, float]]:
+    """Areas of one class of a map with their scores."""
+    scored = []
+    for line, _, score in elements.select(elements.labels == label).rows:
+        for area in _polygons([line[:, :2]]):
+            scored.append((area, score))
+    return scored
+
+
 def _areas_of(elements: MapElements, label: int) -> list[shapely.Polygon]:
     """Areas of one class of a map."""
-    lines = elements.select(elements.labels == label).polylines
-    return _polygons([line[:, :2] for line in lines])
+    return [area for area, _ in _scored_areas(elements, label)]
 
 
 def _outline(area: shapely.Polygon) -> FloatArray:

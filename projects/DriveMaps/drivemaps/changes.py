@@ -35,13 +35,16 @@ def find_changes(
 ) -> Changes:
     """Find the elements of a place that were removed, added or moved.
 
-    * Removed: a part of at least 5 m of an old line, or an old area, that most passes in view do
-      not see.
+    * Removed: a part of at least 8 m of an old line, a whole line, or an old area, that most passes
+      in view do not see.
     * Added: such a part of a line, or an area, in the map of a pass, of which the old map has no
       element of the class within 1.5 m, or no area that shares 30 percent. The old map must have an
       element of any class within 30 m.
     * Moved: such a part of an old line whose predictions lie at least 0.5 m beside it on one side,
       or an old area whose centre moved by at least 0.75 m, and by at least three standard errors.
+
+    The confidence of a removed or moved element is that of a removal or a move, times the score of
+    the element in the old map.
 
     Args:
         old: Old map in the global frame.

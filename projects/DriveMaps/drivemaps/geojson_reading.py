@@ -1,7 +1,7 @@
 """Reading of GeoJSON maps, written by `write_geojson` or by other programs."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -111,16 +111,25 @@ def _add_feature(feature: Any, collector: ElementCollector) -> None:
     name = collector.class_of(properties or {})
     if name is None:
         return
+    score = _score_of(properties or {})
     parts = [geometry.get("coordinates")]
     if kind.startswith("Multi"):
         parts = _list_of(parts[0])
     for part in parts:
         if kind.endswith("Polygon"):
             rings = _list_of(part)
-            collector.add(name, _outer_ring(rings))
+            collector.add(name, _outer_ring(rings), score=score)
             collector.unused["holes of polygons"] += len(rings) - 1
         else:
-            collector.add(name, _line_of(part))
+            collector.add(name, _line_of(part), score=score)
+
+
+def _score_of(properties: Mapping[str, Any]) -> float:
+    """Return the confidence that `write_geojson` writes; 1 for other values of ``score``."""
+    score = properties.get("score")
+    if isinstance(score, bool) or not isinstance(score, (int, float)):
+        return 1.0
+    return float(score) if 0 <= score <= 1 else 1.0
 
 
 def _outer_ring(rings: list[Any]) -> FloatArray:

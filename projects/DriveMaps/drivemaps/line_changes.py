@@ -32,7 +32,7 @@ from drivemaps.line_matching import (
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 from gsmap.structures.polylines import arc_lengths
 
-_MIN_LENGTH_M = 5.0  # smallest length of a changed part of a line that is not the whole line
+_MIN_LENGTH_M = 8.0  # smallest length of a changed part of a line that is not the whole line
 _MIN_MOVE_M = 0.5  # smallest shift of a vertex that has moved
 _MIN_FRAMES = 3  # smallest number of frames with a match of a vertex that has moved
 _WINDOW = 5  # number of vertices of the running median along a line
@@ -127,11 +127,12 @@ def line_changes(
         if not num_passes:
             continue
         num_without = float((views - support)[part].mean())
+        known = float(lines.scores[part].mean())
         change = Change(
             REMOVED,
             label,
             line=lines.points[part],
-            confidence=smooth_share(num_without, float(views[part].mean())),
+            confidence=known * smooth_share(num_without, float(views[part].mean())),
             passes_in_view=in_view,
             num_passes=num_passes,
         )
@@ -174,6 +175,7 @@ def _moved(
             if not num_passes or not shift.exceeds(_MIN_MOVE_M):
                 continue
             share = smooth_share(float(support[part].mean()), float(views[part].mean()))
+            share *= float(old_lines.scores[part].mean())
             change = Change(
                 MOVED,
                 label,
@@ -249,7 +251,7 @@ def _added(old: MapElements, passes: list[Pass], label: int) -> list[Change]:
 def _parts(lines: DenseLines, flags: BoolArray) -> list[slice]:
     """Find the parts of lines whose vertices have a flag.
 
-    A part is at least 5 m long, or a whole line. Single vertices with another value are ignored.
+    A part is at least 8 m long, or a whole line. Single vertices with another value are ignored.
 
     Args:
         lines: Lines. M vertices

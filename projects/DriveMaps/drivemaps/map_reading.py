@@ -29,7 +29,8 @@ class MapFile(NamedTuple):
     """Map that was read from a file.
 
     Attributes:
-        elements: Elements in metres in the global frame, with labels of the requested classes.
+        elements: Elements in metres in the global frame, with labels of the requested classes, and
+            scores, which are 1 if the file has none.
         unused: Number of elements of the file that are not used, by the reason.
     """
 
@@ -97,6 +98,7 @@ class ElementCollector:
         self._rule = rule
         self._lines: list[FloatArray] = []
         self._labels: list[int] = []
+        self._scores: list[float] = []
         self._num_vertices = 0
 
     def class_of(self, values: Mapping[str, Any]) -> str | None:
@@ -117,12 +119,13 @@ class ElementCollector:
             return None
         return name
 
-    def add(self, name: str, line: FloatArray) -> None:
+    def add(self, name: str, line: FloatArray, score: float = 1.0) -> None:
         """Add an element, or count it if it has no length, or an area is open or has no area.
 
         Args:
             name: Class of the element.
             line: Finite vertices in degrees or metres; areas are closed. (n, 2)
+            score: Confidence in [0, 1].
 
         Raises:
             ValueError: If the file has too many vertices.
@@ -141,6 +144,7 @@ class ElementCollector:
             return
         self._lines.append(line)
         self._labels.append(self._classes.index(name))
+        self._scores.append(score)
 
     def finish(self, origin: MapOrigin | MapGrid | None) -> MapFile:
         """Convert the lines to the global frame, check them, and create the map.
@@ -159,7 +163,9 @@ class ElementCollector:
             )
         lines = []
         labels = []
-        for line, label in zip(self._lines, self._labels, strict=True):
+        scores = []
+        rows = zip(self._lines, self._labels, self._scores, strict=True)
+        for line, label, score in rows:
             points = line if origin is None else origin.points_of(line, where=str(self._path))
             farthest_m = np.abs(points).max()
             if not farthest_m <= FARTHEST_M:
@@ -173,7 +179,8 @@ class ElementCollector:
                 continue
             lines.append(points)
             labels.append(label)
-        return MapFile(MapElements.from_polylines(lines, labels), unused=self.unused)
+            scores.append(score)
+        return MapFile(MapElements.from_polylines(lines, labels, scores), unused=self.unused)
 
     def describe(self) -> str:
         """Describe the elements that are not used, the most frequent reasons first."""
