@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Convert a config of the original MapTR, MapTRv2, GeMap or MapVR to ours.
+"""Convert a config of the original MapTR, or of a method built on its code, to ours.
 
 The file is read, not run. Settings without a counterpart are printed; those of the model are an
 error unless --allow-changes is given. Example:

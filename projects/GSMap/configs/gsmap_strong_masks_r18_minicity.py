@@ -1,5 +1,5 @@
-# A small GSMap whose masks weigh as much as MapVR's and are twice as wide: higher figures, but lines that fold
-# (results/gaussians.md, "Why MapVR is ahead"). With model.map_head.losses.1.loss_weight=0.05 they fold no more
+# A small GSMap whose masks weigh more and are twice as wide: higher figures, but lines that fold
+# (results/gaussians.md). With model.map_head.losses.1.loss_weight=0.05 they fold no more
 # than by default, and keep the gain in AP_raster.
 _base_ = '../../../configs/maptr/maptr_r18_minicity.py'
 

@@ -1,4 +1,4 @@
-"""Conversion of the original configs of MapTR, MapTRv2, GeMap and MapVR to GSMap configs."""
+"""Conversion of configs of the original MapTR, and of methods built on its code, to our configs."""
 
 import math
 import re
@@ -401,7 +401,7 @@ def _head_settings(fields: Fields, settings: dict[str, Any]) -> None:
     if one2many["num"]:
         query_groups.append(one2many)
     settings[_HEAD + "query_groups"] = query_groups
-    _mapvr_settings(fields, settings)
+    _rendered_mask_settings(fields, settings)
     if take("use_geo_loss", default=False):
         fields.drop(_PTS_HEAD, names="intra_loss_weight inter_loss_weight")
         fields.drop(f"{_PTS_HEAD}.loss_geo", names="type num_ins num_pts pc_range", loss_type="l1")
@@ -431,8 +431,8 @@ def _head_settings(fields: Fields, settings: dict[str, Any]) -> None:
         settings[_HEAD + "aux_heads"] = aux_heads
 
 
-def _mapvr_settings(fields: Fields, settings: dict[str, Any]) -> None:
-    """Convert the settings of MapVR's rendered masks, if the config has them."""
+def _rendered_mask_settings(fields: Fields, settings: dict[str, Any]) -> None:
+    """Convert the settings of rendered masks, if the config has them."""
     if not fields.take(f"{_PTS_HEAD}.loss_rendered_mask.type", default=None):
         return
     points_weight = settings[f"{_HEAD}losses.0.loss_weight"]

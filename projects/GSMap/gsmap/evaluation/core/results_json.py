@@ -1,4 +1,4 @@
-"""Result and ground-truth files in the JSON form of MapTR and MapVR.
+"""Result and ground-truth files in the JSON form of MapTR's evaluator.
 
 A file of results is ``{"meta": ..., "results": [{"sample_token", "vectors": [{"pts", "pts_num",
 "cls_name", "type", "confidence_level"}]}]}``. A file of ground truth is ``{"GTs": [...]}``, without
