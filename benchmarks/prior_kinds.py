@@ -101,9 +101,9 @@ def predict(truth: MapElements, rng: np.random.Generator) -> MapElements:
         lines.append(np.stack([x + shift, y], axis=1))
         labels.append(label)
     for _ in range(rng.poisson(FALSE)):
-        x = rng.uniform(-12, 12)
-        y = rng.uniform(-30, 15)
-        lines.append(np.array([[x, y], [x + rng.normal(), y + 15]]))
+        start = np.array([rng.uniform(-12, 12), rng.uniform(-30, 15)])
+        step = np.array([rng.normal(), 15.0])
+        lines.append(np.stack([start, start + step]))
         labels.append(int(rng.integers(2)))
     return MapElements.from_polylines(lines, labels, rng.uniform(0.4, 1.0, len(lines)))
 

@@ -156,3 +156,16 @@ def test_a_doubtful_element_of_the_old_map_is_a_doubtful_change():
         assert [change.kind for change in found] == ["removed", "moved"]
         confidences.append([change.confidence for change in found])
     np.testing.assert_allclose(confidences[1], np.array(confidences[0]) / 2)
+
+
+def test_only_the_part_of_an_old_map_near_the_drives_is_compared():
+    """Lines of 14,000 km would be sampled every metre."""
+    drive = straight_drive([UP], [0], np.arange(0.0, 101.0, 4.0))
+    one_pass = Pass(drive, map_of([(0, UP)]))
+    far = np.array([[1e6, 0.0], [1e7, 9e6]])
+    found = find_changes(map_of([(0, UP), (0, far)]), [one_pass])
+    assert found.changes == []
+    assert found.num_not_in_view == {"divider": 1}
+    near = np.array([[0.0, 0.0], [1e7, 1e7]])
+    with pytest.raises(ValueError, match="14142 km of lines near the drives: at most 1000 km"):
+        find_changes(map_of([(0, UP), (0, near)]), [one_pass])

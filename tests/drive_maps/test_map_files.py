@@ -324,6 +324,16 @@ HOSTILE_OSM = {
         osm(relation(20, {"left": 12}, type="lanelet", subtype="crosswalk")),
         "crosswalk '20' has no left bound",
     ),
+    "one bound of many crosswalks": (
+        osm(
+            way(10, [1, 2] * 50)
+            + "".join(
+                relation(number, {"left": 10, "right": 10}, type="lanelet", subtype="crosswalk")
+                for number in range(100)
+            )
+        ),
+        "its crosswalks share their bounds too often",
+    ),
     "nothing of use": (osm(way(10, [1, 2], type="power")), "has no element of .*class 'power'"),
     "far away": (
         osm(way(10, [1, 3], type="line_thin"), NODES.replace("v='7'", "v='1e12'")),

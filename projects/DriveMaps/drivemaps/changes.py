@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from drivemaps.area_changes import area_changes
 from drivemaps.change import (
     KINDS,
@@ -27,7 +29,11 @@ from drivemaps.geodetic import MapGrid, MapOrigin
 from drivemaps.geojson import write_features
 from drivemaps.line_changes import line_changes
 from gsmap.structures.classes import AREA_CLASSES
-from gsmap.structures.elements import MapElements
+from gsmap.structures.elements import MOST_M, MapElements
+from gsmap.structures.polylines import arc_lengths
+from gsmap.utils.errors import InputError
+
+_MARGIN_M = 60.0  # around the range of the frames, for elements that show the known ground
 
 
 def find_changes(
@@ -53,10 +59,15 @@ def find_changes(
 
     Returns:
         Changes, and numbers of elements that are not compared.
+
+    Raises:
+        ValueError: If the old map has more than 1,000 km of lines near the drives.
     """
     config = config or MergeConfig()
     passes = list(passes)
     classes = passes[0].drive.classes
+    whole = old
+    old = _near_passes(old, passes)
     changes: list[Change] = []
     for label, name in enumerate(classes):
         changes_of_class = area_changes if name in AREA_CLASSES else line_changes
@@ -68,12 +79,37 @@ def find_changes(
             if not on_known_ground(line, old).any():
                 num_on_new_ground[classes[label]] += 1
     num_not_in_view: Counter[str] = Counter()
-    views = views_of_passes(old.points[:, :2], passes).max(axis=0)
-    for index, label in enumerate(old.labels.tolist()):
-        vertices = slice(old.offsets[index], old.offsets[index + 1])
+    views = views_of_passes(whole.points[:, :2], passes).max(axis=0)
+    for index, label in enumerate(whole.labels.tolist()):
+        vertices = slice(whole.offsets[index], whole.offsets[index + 1])
         if views[vertices].max(initial=0) < MIN_VIEWS:
             num_not_in_view[classes[label]] += 1
     return Changes(changes, dict(num_on_new_ground), num_not_in_view=dict(num_not_in_view))
+
+
+def _near_passes(old: MapElements, passes: Sequence[Pass]) -> MapElements:
+    """Select the elements of an old map near the drives, which are sampled every metre.
+
+    Raises:
+        ValueError: If they are too long.
+    """
+    origins = [frame.origin for one_pass in passes for frame in one_pass.drive.frames]
+    margin_m = _MARGIN_M + max(one_pass.drive.reach_m for one_pass in passes)
+    low = np.min(origins, axis=0) - margin_m
+    high = np.max(origins, axis=0) + margin_m
+    is_near = np.zeros(len(old), dtype=np.bool_)
+    total_m = 0.0
+    for index, line in enumerate(old.polylines):
+        if len(line) and (line[:, :2].min(axis=0) <= high).all():
+            is_near[index] = bool((line[:, :2].max(axis=0) >= low).all())
+        if is_near[index]:
+            total_m += float(arc_lengths(line[:, :2])[-1])
+    if total_m > MOST_M:
+        raise InputError(
+            f"the old map has {total_m / 1000:.0f} km of lines near the drives: at most "
+            f"{MOST_M / 1000:g} km are compared; cut it to the place."
+        )
+    return old.select(is_near)
 
 
 def write_changes(

@@ -31,6 +31,7 @@ _CROSSING = "ped_crossing"
 _BLOCK = 1 << 20  # bytes
 _DEEPEST = 20  # nested elements of XML
 _MOST_PARTS = 10_000_000  # nodes, ways, relations, and references to them
+_MOST_USES = 4  # of a node by crosswalks, on average
 _KINDS = ("node", "way", "relation")
 
 
@@ -164,6 +165,7 @@ class _Parser:
         self._path = path
         self._depth = 0
         self._num_parts = 0
+        self._num_ring_nodes = 0
         self._attributes: dict[str, str] = {}
         self._tags: dict[str, str] = {}
         self._references: list[str] = []
@@ -350,4 +352,8 @@ class _Parser:
         last, first, other = self.positions([left[-1], right[0], right[-1]], is_local=is_local)
         if np.linalg.norm(other - last) <= np.linalg.norm(first - last):
             right = right[::-1]
-        return [*left, *right, left[0]]
+        ring = [*left, *right, left[0]]
+        self._num_ring_nodes += len(ring)
+        if self._num_ring_nodes > _MOST_USES * self._num_parts:
+            raise self._error("its crosswalks share their bounds too often")
+        return ring
