@@ -115,6 +115,26 @@ def test_the_direction_is_that_of_the_frames() -> None:
     assert not lane_graph_of(without, merged).lanelets
 
 
+def test_short_parts_between_forks_stay_in_the_true_map() -> None:
+    """Two lanes leave a straight one at x = 50 and 51.5; no gap is left between them.
+
+    .. code-block:: text
+
+                   / /
+        0 --------- - -------- 100
+    """
+    paths = [np.array([[0.0, 0.0], [100.0, 0.0]])]
+    for start in (50.0, 51.5):
+        leaving = np.array([start, 0.0]) + 15.0 * BEND
+        paths.append(np.concatenate([[[0.0, 0.0]], leaving]))
+    sample = drive_of().frames[0].sample
+    frame = DriveFrame(sample, MapElements.from_polylines(paths, [2] * len(paths)))
+    drive = Drive("scene", CLASSES, (-30.0, 30.0), (-15.0, 15.0), [frame])
+    united = shapely.MultiLineString(true_map(drive).polylines)
+    missing = shapely.LineString(paths[0]).difference(united.buffer(0.01))
+    assert missing.length < 0.1
+
+
 @pytest.fixture(scope="module")
 def minicity_drive(minicity_root, tmp_path_factory) -> Drive:
     """The ground truth of a drive through MiniCity, with centre lines of lanes and junctions."""

@@ -96,5 +96,6 @@ def _unite_lines(pieces: Sequence[FloatArray]) -> list[FloatArray]:
         union = shapely.union_all(lines[group], grid_size=GRID_M)
         united.append(shapely.line_merge(union))
     parts = shapely.get_parts(np.array(united, dtype=object))
-    is_long = shapely.length(parts) >= MIN_LENGTH_M
-    return stitch([shapely.get_coordinates(part) for part in parts[is_long]])
+    stitched = stitch([shapely.get_coordinates(part) for part in parts])
+    # after joining, as parts between two forks may be short
+    return [line for line in stitched if shapely.LineString(line).length >= MIN_LENGTH_M]
