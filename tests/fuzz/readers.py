@@ -27,6 +27,7 @@ from mmengine.config import Config
 from pyarrow.feather import write_feather
 
 from drivemaps.geojson_reading import read_geojson
+from drivemaps.lanelet2_reading import read_lanelet2
 from fuzz import contents, mutations
 from fuzz.attacks import CONFIG
 from fuzz.reading import Pictures, Reader
@@ -46,7 +47,9 @@ from gsmap.evaluation.analysis.changes import change_figures, changed_samples
 from gsmap.evaluation.core.match_files import SHARD_KIND as MATCHES
 from gsmap.evaluation.core.results_json import RESULTS_KEY, read_samples, vectors_of, write_results
 from gsmap.evaluation.core.results_json import SHARD_KIND as RESULTS
+from gsmap.prior import GaussianPrior, PriorSettings
 from gsmap.structures.elements import MapElements
+from gsmap.structures.grid import BEVGrid
 from gsmap.utils.shards import Shard, digest
 from mapdata.argoverse2.samples import Argoverse2Options, read_log
 from mapdata.bags import read_bag
@@ -135,6 +138,8 @@ class Files:
             "nuScenes CAN bus": self.can_bus,
             "changes of a map": self.changes,
             "map, GeoJSON": lambda: self.json(changes, lambda: read_geojson(changes, CLASSES)),
+            "map, Lanelet2": self.lanelet2,
+            "Gaussian prior": self.gaussian_prior,
             "split file": lambda: self.json(plan, lambda: read_split_file(plan)),
             "Argoverse 2 poses": lambda: self.of_log("*.feather", byte),
             "Argoverse 2 calibration": lambda: self.of_log("calibration/intr*", byte),
@@ -354,6 +359,35 @@ class Files:
     def json(self, path: Path, read: Callable[[], Any]) -> Reader:
         damages = (mutations.damaged_bytes, mutations.damaged_json, mutations.damaged_json)
         return Reader(path, read, damages)
+
+    def lanelet2(self) -> Reader:
+        nodes = [
+            f"<node id='{k}'><tag k='local_x' v='{k}'/><tag k='local_y' v='{k % 3}'/></node>"
+            for k in range(1, 9)
+        ]
+        ways = []
+        for k, kind in ((11, "line_thin"), (13, "pedestrian_marking"), (15, "curbstone")):
+            ends = f"<nd ref='{k % 10}'/><nd ref='{k % 10 + 1}'/>"
+            ways.append(f"<way id='{k}'>{ends}<tag k='type' v='{kind}'/></way>")
+        crosswalk = (
+            "<relation id='20'><member type='way' ref='13' role='left'/>"
+            "<member type='way' ref='15' role='right'/><tag k='subtype' v='crosswalk'/></relation>"
+        )
+        content = f"<osm>{''.join(nodes)}{''.join(ways)}{crosswalk}</osm>"
+        path = self.put("map.osm", content.encode())
+        return Reader(path, lambda: read_lanelet2(path, CLASSES), (mutations.damaged_bytes,))
+
+    def gaussian_prior(self) -> Reader:
+        path = self.work / "town.gaussians"
+        prior = GaussianPrior(PriorSettings(CLASSES, "town"))
+        line = MapElements.from_polylines([[[0.0, -90.0], [3.0, 90.0]]], [0])
+        prior.write(np.eye(4), BEVGrid((-15, 15), (-30, 30)), line)
+        prior.save(path)
+
+        def read() -> Any:
+            return GaussianPrior.load(path).gaussians(0)
+
+        return Reader(path, read, (mutations.damaged_bytes,), exact=True)
 
     def changes(self) -> Reader:
         path = self.work / "changes.geojson"
