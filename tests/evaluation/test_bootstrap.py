@@ -23,7 +23,7 @@ from gsmap.evaluation.core.results_json import write_results
 from gsmap.structures.elements import MapElements
 
 CHAMFER, RASTER = EVALUATOR.metrics
-HARD = MapEvaluator(CHAMFER, HardChamferConfig.of(MetricSettings(CLASSES)), RASTER)
+HARD = MapEvaluator(CHAMFER, HardChamferConfig.from_settings(MetricSettings(CLASSES)), RASTER)
 COUNT = 20
 
 

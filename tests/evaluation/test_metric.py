@@ -46,7 +46,7 @@ class Lengths(Metric):
     classes: tuple[str, ...]
 
     @classmethod
-    def of(cls, settings):
+    def from_settings(cls, settings):
         return cls(settings.classes)
 
     def match(self, sample):

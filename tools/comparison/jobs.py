@@ -164,7 +164,7 @@ def execute(runs: Sequence[Run]) -> Iterator[tuple[Run, str]]:
     waiting = deque(run for run in runs if not run.is_done)
     jobs: dict[str | None, Job] = {}
     usable_devices = devices()
-    initial = sum(run.position for run in runs)
+    initial = sum(run.iterations_so_far for run in runs)
     total = sum(run.iterations for run in runs)
     progress = Progress(
         initial=initial,
@@ -189,8 +189,8 @@ def execute(runs: Sequence[Run]) -> Iterator[tuple[Run, str]]:
                 num_done = sum(run.is_done for run in runs)
                 summary = f"{num_done} of {len(runs)} runs done"
                 bar.set_description(", ".join([summary, *stages]), refresh=False)
-                position = sum(run.position for run in runs)
-                bar.update(position - bar.n)  # takes the increment
+                iterations = sum(run.iterations_so_far for run in runs)
+                bar.update(iterations - bar.n)  # takes the increment
                 if jobs:
                     time.sleep(_PAUSE_S)
         finally:

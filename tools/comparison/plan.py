@@ -128,10 +128,11 @@ class Run:
         return (self.folder / "metrics.json").is_file()
 
     @property
-    def position(self) -> int:
+    def iterations_so_far(self) -> int:
         """Number of iterations in the log."""
         if self.is_done:
             return self.iterations
+        # MMEngine names the folder of each start by its time, such as 20261127_093000.
         logs = sorted(self.folder.glob("2*/vis_data/scalars.json"))
         if not logs:
             return 0
@@ -230,27 +231,78 @@ def _processes(protocol: Protocol) -> int:
     """Number of processes of each run, which divides the batch."""
     if torch.cuda.device_count():
         return 1
-    numbers = []
+    candidates = []
     for path in protocol.out.glob(f"*/seed_*/{SETTINGS}"):  # earlier runs
-        numbers.append(_read_settings(path)["processes"])
+        candidates.append(_read_settings(path)["processes"])
     cores = len(os.sched_getaffinity(0))
-    numbers.extend(range(cores, 0, -1))
-    # The first number that divides the batch; 1 is the last and always does.
-    return next(number for number in numbers if number > 0 and protocol.batch % number == 0)
+    candidates.extend(range(cores, 0, -1))
+    for number in candidates:
+        if number > 0 and protocol.batch % number == 0:
+            return number
+    return 1
 
 
 def _plan_run(entry: Entry, seed: int, protocol: Protocol, processes: int) -> Run:
     """Plan one run; build its data set and its model once, so that faults are found early."""
-    words = [f"train_dataloader.batch_size={protocol.batch // processes}"]
-    words += ["val_evaluator.eval=chamfer,raster", f"randomness.seed={seed}"]
-    init = None if protocol.init is None else find_checkpoint(protocol.init).resolve()
-    if init is not None:
-        words.append(f"load_from={init}")
-    overrides = (*entry.options, *protocol.options)
-    cfg = read_config(entry.config, parse_options([*words, *overrides]))
+    initial_weights = None
+    own_options = [  # of the comparison; the overrides of the user come after them
+        f"train_dataloader.batch_size={protocol.batch // processes}",
+        "val_evaluator.eval=chamfer,raster",
+        f"randomness.seed={seed}",
+    ]
+    if protocol.init is not None:
+        initial_weights = find_checkpoint(protocol.init).resolve()
+        own_options.append(f"load_from={initial_weights}")
+    user_options = (*entry.options, *protocol.options)
+    cfg = read_config(entry.config, parse_options([*own_options, *user_options]))
+    epochs = _count_epochs(entry, cfg, protocol=protocol, processes=processes)
+    own_options.append(f"train_cfg.max_epochs={epochs}")
+    own_options.append(f"train_cfg.val_interval={max(1, epochs // 4)}")
+    for index, scheduler in enumerate(cfg.get("param_scheduler") or []):
+        if "T_max" in scheduler and scheduler.get("by_epoch", True):
+            own_options.append(f"param_scheduler.{index}.T_max={epochs}")
+    options = (*own_options, *user_options)
+    cfg = read_config(entry.config, parse_options(options))
+    check_config(cfg)
+    if cfg.train_cfg.max_epochs != epochs:
+        raise InputError(f"{entry.name}: the budget decides train_cfg.max_epochs; leave it out.")
     with building(cfg):
-        samples = len(DATASETS.build(cfg.train_dataloader.dataset))
-    samples_per_process = math.ceil(samples / processes)
+        MODELS.build(cfg.model)
+    dataset = plain(cfg.train_dataloader.dataset)
+    for key in ("data_root", "ann_file"):  # the data may move; its digest is part of "data"
+        dataset.pop(key, None)
+    settings = {key: plain(cfg.get(key)) for key in _TRAINING_KEYS}
+    settings["processes"] = processes
+    settings["batch"] = protocol.batch
+    settings["data"] = _data_settings(cfg)
+    settings["sampler"] = plain(cfg.train_dataloader.get("sampler"))
+    settings["dataset"] = dataset
+    settings["init"] = None
+    if initial_weights is not None:
+        settings["init"] = _digest(initial_weights)
+    folder = protocol.out.resolve() / entry.name / f"seed_{seed}"
+    return Run(
+        name=entry.name,
+        seed=seed,
+        folder=folder,
+        config=entry.config,
+        options=options,
+        epochs=epochs,
+        iterations=protocol.budget,
+        processes=processes,
+        settings=settings,
+    )
+
+
+def _count_epochs(entry: Entry, cfg: Config, protocol: Protocol, processes: int) -> int:
+    """Number of epochs that have the optimizer steps of the budget.
+
+    Raises:
+        ValueError: If the budget is not a whole number of epochs.
+    """
+    with building(cfg):
+        num_samples = len(DATASETS.build(cfg.train_dataloader.dataset))
+    samples_per_process = math.ceil(num_samples / processes)
     steps_per_epoch = math.ceil(samples_per_process / cfg.train_dataloader.batch_size)
     epochs = round(protocol.budget / steps_per_epoch) or 1
     if epochs * steps_per_epoch != protocol.budget:
@@ -258,38 +310,7 @@ def _plan_run(entry: Entry, seed: int, protocol: Protocol, processes: int) -> Ru
             f"a budget of {protocol.budget} iterations is no whole number of epochs of {entry.name}"
             f" ({steps_per_epoch} iterations each): give {epochs * steps_per_epoch}."
         )
-    words += [f"train_cfg.max_epochs={epochs}", f"train_cfg.val_interval={max(1, epochs // 4)}"]
-    for index, scheduler in enumerate(cfg.get("param_scheduler") or []):
-        if "T_max" in scheduler and scheduler.get("by_epoch", True):
-            words.append(f"param_scheduler.{index}.T_max={epochs}")
-    cfg = read_config(entry.config, parse_options([*words, *overrides]))
-    check_config(cfg)
-    if cfg.train_cfg.max_epochs != epochs:
-        raise InputError(f"{entry.name}: the budget decides train_cfg.max_epochs; leave it out.")
-    with building(cfg):
-        MODELS.build(cfg.model)
-    dataset = plain(cfg.train_dataloader.dataset)
-    for place in ("data_root", "ann_file"):  # the data may move; its digest is part of "data"
-        dataset.pop(place, None)
-    settings = {key: plain(cfg.get(key)) for key in _TRAINING_KEYS}
-    settings["processes"] = processes
-    settings["batch"] = protocol.batch
-    settings["data"] = _data_settings(cfg)
-    settings["sampler"] = plain(cfg.train_dataloader.get("sampler"))
-    settings["dataset"] = dataset
-    settings["init"] = None if init is None else _digest(init)
-    folder = protocol.out.resolve() / entry.name / f"seed_{seed}"
-    return Run(
-        name=entry.name,
-        seed=seed,
-        folder=folder,
-        config=entry.config,
-        options=(*words, *overrides),
-        epochs=epochs,
-        iterations=protocol.budget,
-        processes=processes,
-        settings=settings,
-    )
+    return epochs
 
 
 def _data_settings(cfg: Config) -> dict[str, Any]:
@@ -316,7 +337,7 @@ def _read_settings(path: Path) -> dict[str, Any]:
     """Read the settings of an earlier start."""
     settings = read_json(path)
     if not isinstance(settings, dict) or not isinstance(settings.get("processes"), int):
-        raise InputError(f"{path} is not what a run noted: give another --out, or remove the run.")
+        raise InputError(f"{path} holds no settings of a run: give another --out, or remove it.")
     return settings
 
 

@@ -115,7 +115,9 @@ def uncertainty_report(args: argparse.Namespace, settings: MetricSettings) -> Me
     from gsmap.evaluation.analysis import calibration
 
     classes = settings.classes
-    rules = ChamferConfig.of(settings) if "chamfer" in args.eval else ChamferConfig(classes)
+    rules = ChamferConfig(classes)
+    if "chamfer" in args.eval:
+        rules = ChamferConfig.from_settings(settings)
     pairs = open_pairs(args, args.results, classes=classes, gaussians=True)
     vertices = calibration.matched_vertices(pairs, rules)
     law = args.law or law_of(pairs.about)

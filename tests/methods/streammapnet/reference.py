@@ -238,7 +238,7 @@ def fusion_rows(
     fused, first, scalar = [], [], 0.0
     for frame, value in enumerate(feats):
         metas = metas_of(data, frame)
-        before = memory.streams.previous([Frame.of(meta) for meta in metas])
+        before = memory.streams.previous([Frame.from_meta(meta) for meta in metas])
         first.append([state is None for state in before])
         with memory.remember_batch({"bev_feats": flipped(value)}, metas) as batch:
             fused.append(flipped(batch.outputs["bev_feats"]))

@@ -63,7 +63,7 @@ class Recorder:
     def run(self, data: Mapping[str, np.ndarray], frame: int, bev: Tensor) -> None:
         """Run one frame."""
         metas = metas_of(data, frame)
-        frames = [Frame.of(meta) for meta in metas]
+        frames = [Frame.from_meta(meta) for meta in metas]
         first = [state is None for state in self.memory.streams.previous(frames)]
         gts = [truth_of(data, f"t{frame}_b{slot}", self.head) for slot in range(BATCH)]
         layer_in: list[tuple] = []

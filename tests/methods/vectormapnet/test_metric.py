@@ -36,7 +36,7 @@ def test_groups_and_resamples_are_files_of_their_samples():
 
 def test_vectormapnets_rule_leaves_out_samples_without_either_side():
     samples = [sample[1:] for sample in sample_set()]
-    hard = HardChamferConfig.of(MetricSettings(CLASSES))
+    hard = HardChamferConfig.from_settings(MetricSettings(CLASSES))
     metrics = figures(*samples, evaluator=MapEvaluator(*TWO_SIDED.metrics, hard))
     kept = [sample for sample in samples if len(sample[0]) and len(sample[1])]
     assert len(kept) == len(samples) - 3

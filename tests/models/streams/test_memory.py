@@ -183,16 +183,16 @@ def test_a_sample_without_a_pose_is_named():
 
 def test_slots_start_anew_where_a_sample_does_not_follow():
     slots = Slots(max_gap_s=2.0)
-    slots.keep([StreamState(Frame.of(meta(4, scene))) for scene in "abcd"])
+    slots.keep([StreamState(Frame.from_meta(meta(4, scene))) for scene in "abcd"])
     frames = [meta(5), meta(5, "x"), meta(3, "c"), meta(9, "d")]
-    found = slots.previous([Frame.of(each) for each in frames])
+    found = slots.previous([Frame.from_meta(each) for each in frames])
     assert [state is not None for state in found] == [True, False, False, False]
 
 
 def test_only_the_latest_scenes_are_kept():
     scenes = Scenes(2.0, max_streams=2)
     for scene in "abc":
-        scenes.keep([StreamState(Frame.of(meta(0, scene)))])
+        scenes.keep([StreamState(Frame.from_meta(meta(0, scene)))])
     assert list(scenes.states) == ["b", "c"]
 
 
@@ -313,7 +313,7 @@ def test_a_query_that_has_moved_as_the_vehicle_has_no_loss(config):
     with memory.remember_batch({"bev_feats": features(0)}, [start]) as batch:
         (sample,) = make_samples(LANES)
         head.loss(batch.outputs, [sample], **batch.hooks)
-    past = stack_past([Frame.of(turned)], memory.streams.states, torch.device("cpu"))
+    past = stack_past([Frame.from_meta(turned)], memory.streams.states, torch.device("cpu"))
     batch = memory.recall({"bev_feats": features(1)}, past)
     head(batch.outputs, **batch.hooks)
     propagation = batch.propagation

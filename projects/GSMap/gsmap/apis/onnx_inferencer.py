@@ -265,7 +265,7 @@ class OnnxInferencer:
                 "which new_stream() starts."
             )
         stream.claim(self)
-        frame = Frame.of(meta)
+        frame = Frame.from_meta(meta)
         (previous,) = stream.previous([frame])
         continues = previous is not None
         if previous is None:
@@ -290,7 +290,7 @@ class OnnxInferencer:
             outputs: Outputs of `run` for the frame.
         """
         memory = {name: outputs[f"new_{name}"] for name in self._initial_memory}
-        stream.keep([StreamState(Frame.of(meta), values=memory)])
+        stream.keep([StreamState(Frame.from_meta(meta), values=memory)])
 
     def _check_images(self, images: Sequence[NDArray[Any]] | NDArray[Any]) -> None:
         """Raise ValueError if the number or the shapes of images do not fit the cameras."""

@@ -41,7 +41,7 @@ class Frame:
             )
 
     @classmethod
-    def of(cls, meta: Mapping[str, Any]) -> "Frame":
+    def from_meta(cls, meta: Mapping[str, Any]) -> "Frame":
         """Create a frame from the metainfo of a sample.
 
         Args:

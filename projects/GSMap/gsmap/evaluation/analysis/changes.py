@@ -185,8 +185,8 @@ def change_figures(
             f"{sorted(views)!r:.200}: give the annotation file of its drives."
         )
     targets = _targets(truth, views)
-    strict = _Comparison.of(found, truth, targets=targets, same_kind=True)
-    loose = _Comparison.of(found, truth, targets=targets, same_kind=False)
+    strict = _Comparison.from_changes(found, truth, targets=targets, same_kind=True)
+    loose = _Comparison.from_changes(found, truth, targets=targets, same_kind=False)
     figures: dict[str, float] = {}
     for kind in (*KINDS, "all"):
         is_found_kind = _has_kind(found, kind)
@@ -220,7 +220,7 @@ class _Comparison:
     limits: FloatArray
 
     @classmethod
-    def of(
+    def from_changes(
         cls,
         found: Sequence[MapChange],
         truth: Sequence[MapChange],

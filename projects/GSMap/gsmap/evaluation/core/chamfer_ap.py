@@ -76,7 +76,7 @@ class ChamferConfig(Metric):
             raise InputError(f"dim must be 2 or 3, got {self.dim!r}.")
 
     @classmethod
-    def of(cls, settings: MetricSettings) -> "ChamferConfig":
+    def from_settings(cls, settings: MetricSettings) -> "ChamferConfig":
         """Create the metric from the settings of a command or config."""
         return cls(
             classes=settings.classes,
@@ -109,9 +109,11 @@ class HardChamferConfig(ChamferConfig):
     companions: ClassVar[tuple[str, ...]] = ("chamfer",)
 
     @classmethod
-    def of(cls, settings: MetricSettings) -> "HardChamferConfig":
+    def from_settings(cls, settings: MetricSettings) -> "HardChamferConfig":
         """Create the metric from the settings of a command or config, except the thresholds."""
-        rules = vars(ChamferConfig.of(settings)) | {"thresholds": HARD_CHAMFER_THRESHOLDS}
+        rules = vars(ChamferConfig.from_settings(settings)) | {
+            "thresholds": HARD_CHAMFER_THRESHOLDS
+        }
         return cls(**rules)
 
 

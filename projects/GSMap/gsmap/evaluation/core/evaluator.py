@@ -82,12 +82,12 @@ class MapEvaluator:
             for companion in metric_type.companions:
                 metric_types.setdefault(companion, metric_class(companion))
             metric_types[name] = metric_type
-        metrics = [metric_type.of(settings) for metric_type in metric_types.values()]
+        metrics = [metric_type.from_settings(settings) for metric_type in metric_types.values()]
         return cls(*metrics, ground_truth_points=ground_truth_points)
 
     @cached_property
     def _matches(self) -> list[SampleMatches]:
-        """Records of the samples so far."""
+        """Records of the samples so far, in a list that the first use creates."""
         return []
 
     def update(

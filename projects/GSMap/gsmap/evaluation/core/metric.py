@@ -167,7 +167,7 @@ class Metric(ABC):
 
     @classmethod
     @abstractmethod
-    def of(cls, settings: MetricSettings) -> "Metric":
+    def from_settings(cls, settings: MetricSettings) -> "Metric":
         """Create the metric from the settings of a command or config."""
 
     @abstractmethod

@@ -102,7 +102,7 @@ class RasterConfig(Metric):
         return thresholds
 
     @classmethod
-    def of(cls, settings: MetricSettings) -> "RasterConfig":
+    def from_settings(cls, settings: MetricSettings) -> "RasterConfig":
         """Create the metric from the settings of a command or config."""
         return cls(
             classes=settings.classes,

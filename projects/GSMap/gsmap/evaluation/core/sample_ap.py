@@ -74,7 +74,7 @@ class SampleAP(Metric):
             raise InputError(f"min_score must be in [0, 1], got {self.min_score}.")
 
     @classmethod
-    def of(cls, settings: MetricSettings) -> "SampleAP":
+    def from_settings(cls, settings: MetricSettings) -> "SampleAP":
         """Create the metric from the settings of a command or config."""
         min_score = settings.min_score or 0.0
         return cls(classes=settings.classes, grid=settings.canvas, min_score=min_score)
@@ -154,7 +154,7 @@ class _MaskPixels:
     owners: IntArray
 
     @classmethod
-    def of(cls, mask: MaskArray) -> "_MaskPixels":
+    def from_mask(cls, mask: MaskArray) -> "_MaskPixels":
         """List the pixels of a mask of element indices."""
         rows, columns = np.nonzero(mask >= 0)
         indices, owners = np.unique(mask[rows, columns], return_inverse=True)
@@ -271,8 +271,8 @@ def line_distances(
         Distances in metres, infinite where they are not measured (n, k); indices of the predictions
         with a pixel (n,); and indices of the ground truths with a pixel (k,).
     """
-    pred = _MaskPixels.of(pred_mask)
-    gt = _MaskPixels.of(gt_mask)
+    pred = _MaskPixels.from_mask(pred_mask)
+    gt = _MaskPixels.from_mask(gt_mask)
     box_distances = np.sqrt(
         _squared_gaps(gt, pred, axis="rows") + _squared_gaps(gt, pred, axis="columns")
     )  # (k, n)

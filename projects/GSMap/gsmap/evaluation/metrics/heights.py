@@ -43,7 +43,7 @@ class Heights(Metric):
         object.__setattr__(self, "classes", checked_classes(self.classes))
 
     @classmethod
-    def of(cls, settings: MetricSettings) -> "Heights":
+    def from_settings(cls, settings: MetricSettings) -> "Heights":
         """Create the metric from the settings of a command or config."""
         thresholds = settings.thresholds or CHAMFER_THRESHOLDS
         return cls(classes=settings.classes, thresholds=thresholds)

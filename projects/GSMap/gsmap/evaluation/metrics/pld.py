@@ -213,7 +213,7 @@ class PLD(Metric):
             raise InputError(f"cutoffs_m must be > 0 m, at least one, got {cutoffs}.")
 
     @classmethod
-    def of(cls, settings: MetricSettings) -> "PLD":
+    def from_settings(cls, settings: MetricSettings) -> "PLD":
         """Create the metric from the settings of a command or config."""
         cutoffs_m = settings.thresholds or CHAMFER_THRESHOLDS
         return cls(classes=settings.classes, cutoffs_m=cutoffs_m)

@@ -62,7 +62,7 @@ class Topology(Metric):
             )
 
     @classmethod
-    def of(cls, settings: MetricSettings) -> "Topology":
+    def from_settings(cls, settings: MetricSettings) -> "Topology":
         """Create the metric from the settings of a command or config."""
         metric = cls(classes=settings.classes, area_labels=settings.areas)
         if settings.min_score is None:

@@ -173,7 +173,7 @@ class StreamMemory(BaseModule):
             # The memory of elements is unused in training: samples need no poses.
             yield BatchMemory(outputs)
             return
-        frames = [Frame.of(meta) for meta in metas]
+        frames = [Frame.from_meta(meta) for meta in metas]
         states = self.streams.previous(frames)
         past = stack_past(frames, states=states, device=outputs["bev_feats"].device)
         batch = self.recall(outputs, past)

@@ -27,7 +27,7 @@ class VectorMapNetAP(ChamferConfig):
     companions: ClassVar[tuple[str, ...]] = ("chamfer",)
 
     @classmethod
-    def of(cls, settings: MetricSettings) -> "VectorMapNetAP":
+    def from_settings(cls, settings: MetricSettings) -> "VectorMapNetAP":
         """Create the metric from the settings of a command or config.
 
         Raises:
@@ -62,13 +62,13 @@ class ShrunkVectorMapNetAP(VectorMapNetAP):
     grid: BEVGrid = field(kw_only=True)
 
     @classmethod
-    def of(cls, settings: MetricSettings) -> "ShrunkVectorMapNetAP":
+    def from_settings(cls, settings: MetricSettings) -> "ShrunkVectorMapNetAP":
         """Create the metric from the settings of a command or config.
 
         Raises:
             ValueError: If the settings ask for heights or for lines that are not resampled.
         """
-        plain = VectorMapNetAP.of(settings)
+        plain = VectorMapNetAP.from_settings(settings)
         return cls(plain.classes, grid=settings.canvas)
 
     def match(self, sample: Sample) -> FrameMatches:
