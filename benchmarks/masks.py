@@ -20,7 +20,7 @@ BANDS_M = (0.75, 4.0)  # widths of the ground-truth mask
 ERRORS_M = (0.1, 0.5, 1.0, 2.0, 3.0)  # standard deviations of the centres' errors
 SCALES_M = (0.15, 0.25, 0.5, 1.0, 1.5)  # standard deviations of the Gaussians
 LENGTHS_M = (4.0, 10.0, 60.0)  # lengths of missed lines
-MISS_SIZES = ((128, 64), (200, 100), (256, 128))  # rows and columns of the raster
+RASTER_SIZES = ((128, 64), (200, 100), (256, 128))  # rows and columns of the raster
 # Name in the tables, and ``normalize`` and ``foreground_weight`` of `raster_loss`.
 REDUCTIONS = {
     "both": ("both", 1.0),
@@ -49,9 +49,9 @@ def run(args: argparse.Namespace) -> None:
     for reduction in REDUCTIONS:
         for band_m in BANDS_M:
             parts.append(f"{reduction}, band of {band_m:g} m:\n")
-            parts.append(push_table(reduction, band_m, seeds=args.seeds))
+            parts.append(gradient_table(reduction, band_m, seeds=args.seeds))
     parts.append("Loss of a miss, by the length of the element:\n")
-    parts.append(miss_table())
+    parts.append(missed_line_table())
     parts.append(
         "IoU of a crossing of 10 x 4 m with the polygon of the centres that fit its mask:\n"
     )
@@ -67,7 +67,7 @@ def straight_line(length_m: float) -> Tensor:
     return torch.stack([torch.zeros(POINTS), y], dim=-1)
 
 
-def push(
+def scale_gradients(
     reduction: str, band_m: float, error_m: float, scale_m: float, seeds: int = 64
 ) -> tuple[float, float]:
     """Measure the gradient of the loss in the scales of round Gaussians along a line of 60 m.
@@ -95,7 +95,7 @@ def push(
     return along, across
 
 
-def push_table(reduction: str, band_m: float, seeds: int) -> str:
+def gradient_table(reduction: str, band_m: float, seeds: int) -> str:
     """Measure one reduction and band at every error and scale.
 
     Args:
@@ -112,13 +112,17 @@ def push_table(reduction: str, band_m: float, seeds: int) -> str:
     for error_m in ERRORS_M:
         row = [f"{error_m:g} m"]
         for scale_m in SCALES_M:
-            along, across = push(reduction, band_m, error_m=error_m, scale_m=scale_m, seeds=seeds)
+            along, across = scale_gradients(
+                reduction, band_m, error_m=error_m, scale_m=scale_m, seeds=seeds
+            )
             row.append(f"{1e3 * along:+.2f} / {1e3 * across:+.2f}")
         rows.append(row)
     return markdown_table(header, rows)
 
 
-def miss(reduction: str, band_m: float, length_m: float, size: tuple[int, int]) -> float:
+def missed_line_loss(
+    reduction: str, band_m: float, length_m: float, size: tuple[int, int]
+) -> float:
     """Loss of an empty prediction for a line.
 
     Args:
@@ -137,17 +141,19 @@ def miss(reduction: str, band_m: float, length_m: float, size: tuple[int, int]) 
     return raster_loss(empty, target, foreground_weight=weight, normalize=normalize).item()
 
 
-def miss_table() -> str:
-    """Table of the loss of a miss at every reduction, band, raster size and length."""
+def missed_line_table() -> str:
+    """Table of the loss of a missed line at every reduction, band, raster size and length."""
     header = ["reduction", "band", "raster"]
     header += [f"{length_m:g} m" for length_m in LENGTHS_M]
     rows = []
     for reduction in REDUCTIONS:
         for band_m in BANDS_M:
-            for height, width in MISS_SIZES:
+            for height, width in RASTER_SIZES:
                 row = [reduction, f"{band_m:g} m", f"{height} x {width}"]
                 for length_m in LENGTHS_M:
-                    loss = miss(reduction, band_m, length_m=length_m, size=(height, width))
+                    loss = missed_line_loss(
+                        reduction, band_m, length_m=length_m, size=(height, width)
+                    )
                     row.append(f"{loss:.3f}")
                 rows.append(row)
     return markdown_table(header, rows)

@@ -52,7 +52,7 @@ if TYPE_CHECKING:  # slow to import
 _ONE_SAMPLE_HZ = 1e-4  # rate at which a drive has one sample
 _SAMPLES = ".arrow"  # suffix of the file with the samples, in place of the one of --out
 SKIPPED = 1  # exit code after broken frames
-DOUBTFUL = 1  # exit code for an implausible calibration
+IMPLAUSIBLE = 1  # exit code for an implausible calibration
 
 
 def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
@@ -472,8 +472,8 @@ def main(argv: list[str] | None = None) -> str | None:
         return run_on_ray(args, sys.argv)
     if args.check_calibration:
         with TemporaryDirectory() as frames:
-            doubts = check_calibration(args, read_input(args, Path(frames)))
-        sys.exit(DOUBTFUL if doubts else 0)
+            warnings = check_calibration(args, read_input(args, Path(frames)))
+        sys.exit(IMPLAUSIBLE if warnings else 0)
     if not args.out and not args.show_dir:
         raise InputError("Nothing to do: give --out FILE, --show-dir FOLDER, or both.")
     if args.width is not None and args.width < 1:

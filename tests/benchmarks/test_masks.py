@@ -12,12 +12,11 @@ def test_the_command_writes_a_table_per_reduction_and_band_and_one_of_misses(tmp
     args = parser.parse_args(f"--seeds 2 --out {tmp_path / 'out.md'}".split())
     masks.run(args)
     report = (tmp_path / "out.md").read_text()
-    along, across = masks.push("both", 0.75, 1.0, 0.25, seeds=2)
+    along, across = masks.scale_gradients("both", 0.75, 1.0, 0.25, seeds=2)
     assert f"| 1 m | {1e3 * along:+.2f} / {1e3 * across:+.2f} |" in report
     assert report.count("\n| --- |") == len(masks.REDUCTIONS) * len(masks.BANDS_M) + 1
-    assert (
-        f"| both | 0.75 m | 128 x 64 | {masks.miss('both', 0.75, 10.0, (128, 64)):.3f} |" in report
-    )
+    loss = masks.missed_line_loss("both", 0.75, 10.0, (128, 64))
+    assert f"| both | 0.75 m | 128 x 64 | {loss:.3f} |" in report
 
 
 def test_a_filled_mask_draws_the_centres_off_the_outline():

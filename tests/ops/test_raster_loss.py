@@ -5,7 +5,7 @@ import pytest
 import torch
 from raster_loss_cases import MASKS, SETTINGS, sparse_masks
 
-from benchmarks.masks import ERRORS_M, LENGTHS_M, MISS_SIZES, miss, push
+from benchmarks.masks import ERRORS_M, LENGTHS_M, RASTER_SIZES, missed_line_loss, scale_gradients
 from gsmap.ops.raster_loss import NORMALIZATIONS, raster_loss
 from gsmap.ops.raster_loss.reference import dssim_map, gaussian_window
 
@@ -83,11 +83,13 @@ def test_a_tiny_ground_truth_counts_as_half_a_percent_of_the_raster_by_its_foreg
     torch.testing.assert_close(loss, torch.tensor([1 / 5]))
 
 
-@pytest.mark.parametrize("size", MISS_SIZES)
+@pytest.mark.parametrize("size", RASTER_SIZES)
 @pytest.mark.parametrize("band_m", [0.75, 4.0])
 def test_missing_an_element_costs_about_one_whatever_its_size_and_the_raster(band_m, size):
     # the L1 term is 1; D-SSIM's mean depends a little on how the band falls on the pixels
-    assert all(0.98 < miss("both", band_m, length_m, size) < 1.02 for length_m in LENGTHS_M)
+    assert all(
+        0.98 < missed_line_loss("both", band_m, length_m, size) < 1.02 for length_m in LENGTHS_M
+    )
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -103,11 +105,11 @@ def test_missing_an_element_costs_the_same_on_a_larger_raster(backend):
 
 @pytest.mark.parametrize("error_m", ERRORS_M)
 def test_small_gaussians_off_their_line_are_pushed_to_grow(error_m):
-    assert min(push("both", 0.75, error_m, 0.25, seeds=16)) > 0
+    assert min(scale_gradients("both", 0.75, error_m, 0.25, seeds=16)) > 0
 
 
 def test_a_loss_by_the_foreground_pushes_gaussians_two_metres_off_to_shrink():
-    assert max(push("foreground, weight 5", 0.75, 2.0, 0.25, seeds=16)) < 0
+    assert max(scale_gradients("foreground, weight 5", 0.75, 2.0, 0.25, seeds=16)) < 0
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

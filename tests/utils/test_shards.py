@@ -73,8 +73,8 @@ def change(where: Path, **entries) -> None:
     ("damage", "message"),
     [
         (lambda t: part(t, 1, ".manifest").unlink(), r"lacks 1 of its 3 shards: 1; .*--shard 1/3"),
-        (lambda t: part(t, 1).unlink(), "is missing, or not what its manifest"),
-        (lambda t: part(t, 1).write_text("part 7"), "is missing, or not what its manifest"),
+        (lambda t: part(t, 1).unlink(), "is missing or does not fit"),
+        (lambda t: part(t, 1).write_text("part 7"), "is missing or does not fit"),
         (lambda t: part(t, 1, ".manifest").write_text("{"), r"manifest is damaged"),
         (lambda t: change(t, options=[]), r"manifest is damaged"),
         (lambda t: change(t, shard="1"), r"manifest is damaged"),

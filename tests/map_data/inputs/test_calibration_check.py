@@ -201,7 +201,7 @@ def test_the_command_warns_draws_and_says_so_by_its_exit_code(tmp_path, capsys):
         path.write_text(yaml.safe_dump(calibrated))
         with pytest.raises(SystemExit) as end:
             infer.main(words)
-        assert end.value.code == (infer.DOUBTFUL if warned else 0)
+        assert end.value.code == (infer.IMPLAUSIBLE if warned else 0)
         printed = capsys.readouterr().out
         assert ("calibration: camera 'left' has 'left' in its name" in printed) == warned
         assert picture.stat().st_size > 10_000

@@ -176,8 +176,8 @@ def change_frame(
     mount = Mount(wanted) if isinstance(wanted, str) else wanted
     if mount.suits(frame, ground_z_m):
         return sample
-    ground = ground_from_frame(sample, frame=frame, ground_z_m=ground_z_m)
-    frame_from_new = invert_rigid(ground) @ mount.matrix
+    ground_from_old = ground_from_frame(sample, frame=frame, ground_z_m=ground_z_m)
+    frame_from_new = invert_rigid(ground_from_old) @ mount.matrix
     lidar = sample.lidar
     if lidar is not None:
         lidar = _transform_lidar(lidar, new_from_frame=invert_rigid(frame_from_new))

@@ -124,7 +124,7 @@ def _describe_machine_error(error: BaseException, text: str) -> str | None:
     if isinstance(error, MemoryError) or reports_memory:
         return f"out of memory ({reason}): {_REDUCE_MEMORY}."
     if is_runtime_error and _NO_PEER.search(text):
-        return "another rank has ended; its own words say why."
+        return "another rank has ended; its own message says why."
     if isinstance(error, (RuntimeError, AssertionError)) and _NO_DEVICE.search(text):
         return f"this machine does not have the device that was asked for ({reason}): give cpu."
     return None

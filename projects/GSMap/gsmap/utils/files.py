@@ -239,7 +239,7 @@ def open_to_append(path: Path) -> io.FileIO:
             return file
         file.close()
     raise InputError(
-        f"{path} is a link, a pipe or a folder, and no file of this program: take it away, or "
+        f"{path} is a link, a pipe or a folder, and no file of this program: remove it, or "
         "write elsewhere."
     )
 
@@ -261,7 +261,7 @@ def require_no_link(path: Path, below: Path | None = None) -> None:
             return
         if folder.is_symlink():
             raise InputError(
-                f"{folder} is a link, and what is written there would go elsewhere: take it away, "
+                f"{folder} is a link, and what is written there would go elsewhere: remove it, "
                 "or write elsewhere."
             )
 

@@ -173,7 +173,7 @@ def require_own_file(path: Path, mark: bytes) -> None:
         return
     if not stat.S_ISREG(mode) or not has_mark(path, mark):
         raise InputError(
-            f"{path} is there, and no file of this command, which would replace it: take it away, "
+            f"{path} is there, and no file of this command, which would replace it: remove it, "
             "or give another output."
         )
 

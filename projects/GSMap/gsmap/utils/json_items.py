@@ -61,10 +61,9 @@ class _Parser:
         self._decode = getincrementaldecoder("utf-8")().decode
         self._text = ""
         self._position = 0  # start of the next value in the text
-        starts_with_mark = file.read(len(BOM_UTF8)) == BOM_UTF8
-        self._offset = (
-            len(BOM_UTF8) if starts_with_mark else 0
-        )  # start of the next value in the file
+        self._offset = 0  # start of the next value in the file
+        if file.read(len(BOM_UTF8)) == BOM_UTF8:
+            self._offset = len(BOM_UTF8)
         file.seek(self._offset)
 
     def items(self, key: str | None, other_entries: dict[str, Any]) -> Iterator[tuple[Any, Place]]:

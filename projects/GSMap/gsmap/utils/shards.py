@@ -21,8 +21,8 @@ from gsmap.utils.inputs import require_own_file
 
 Items = TypeVar("Items", bound=Sequence[Any])
 
-_COMMON = ("kind", "target", "of", "version", "input", "options")  # equal for all shards
-_TYPES = {  # types of the entries of a manifest
+_SHARED_ENTRIES = ("kind", "target", "of", "version", "input", "options")  # equal for all shards
+_ENTRY_TYPES = {  # types of the entries of a manifest
     "kind": str,
     "target": str,
     "version": str,
@@ -153,14 +153,14 @@ def add_shard_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--per-shard",
         nargs="+",
-        type=_amount,
+        type=_parse_amount,
         default=[],
         metavar="NAME=AMOUNT",
         help="resources of each in Ray, such as num_cpus=4 num_gpus=1 (default: num_cpus=1)",
     )
 
 
-def _amount(text: str) -> tuple[str, float]:
+def _parse_amount(text: str) -> tuple[str, float]:
     """Parse ``NAME=AMOUNT`` of a resource of Ray."""
     name, _, amount = text.partition("=")
     if name not in ("num_cpus", "num_gpus", "memory"):
@@ -196,7 +196,7 @@ def digest(path: Path) -> str:
 
 def digest_of_common(file: ShardFile) -> str:
     """Return a digest of the manifest entries that all shards of one file share."""
-    common = {name: file.manifest[name] for name in _COMMON}
+    common = {name: file.manifest[name] for name in _SHARED_ENTRIES}
     text = json.dumps(common, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -214,22 +214,24 @@ def read_shard(path: Path) -> ShardFile:
     manifest_path = _manifest_path(path)
     try:
         manifest = json.loads(manifest_path.read_text(encoding="utf-8"))
-        wrong_names = [name for name, kind in _TYPES.items() if type(manifest[name]) is not kind]
+        wrong_names = [
+            name for name, kind in _ENTRY_TYPES.items() if type(manifest[name]) is not kind
+        ]
         shard = Shard(index=manifest["shard"], count=manifest["of"])
         is_shard = 0 <= shard.index < shard.count <= _MAX_SHARDS
         if wrong_names or not is_shard or manifest["samples"] < 0:
-            raise InputError(f"{wrong_names or ['shard', 'of', 'samples']} cannot be")
+            raise InputError(f"wrong values of {wrong_names or ['shard', 'of', 'samples']}")
         named_path = shard.path_of(path.with_name(manifest["target"]))
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         message = f"{manifest_path} is damaged ({error!r}): make that shard again."
         raise InputError(message) from error
     same_size = path.is_file() and path.stat().st_size == manifest["bytes"]
     if not same_size or digest(path) != manifest["sha256"]:
-        raise InputError(f"{path} is missing, or not what its manifest tells of: make it again.")
+        raise InputError(f"{path} is missing or does not fit its manifest: make it again.")
     if path != named_path:
         raise InputError(
             f"{path} is another shard by its manifest: {shard.index} of {shard.count} of "
-            f"{manifest['target']}; take it away, and make the right one."
+            f"{manifest['target']}; remove it, and make the right one."
         )
     return ShardFile(path=path, manifest=manifest)
 
@@ -259,7 +261,7 @@ def find_shards(target: Path) -> list[ShardFile]:
         if differences:
             raise InputError(
                 f"{first.path} and {other.path} are shards of different work, by {differences}: "
-                "make those anew that are not of this."
+                "make the wrong ones again."
             )
     count = first.manifest["of"]
     indices = {shard.manifest["shard"] for shard in shards}
@@ -282,7 +284,7 @@ def _manifest_path(path: Path) -> Path:
 def _differences(first: Mapping[str, Any], other: Mapping[str, Any]) -> str:
     """Describe the entries and options in which two manifests differ; empty if there are none."""
     pairs: dict[str, tuple[Any, Any]] = {}
-    for name in _COMMON:
+    for name in _SHARED_ENTRIES:
         if name != "options":
             pairs[name] = (first[name], other[name])
     first_options = first["options"]
