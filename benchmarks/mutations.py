@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> None:
         order = rng.permutation(len(places))
         unchanged = verdict(module="", source="", tests=tests_of(room, None), seconds=None)
         if unchanged != SURVIVED:
-            raise InputError(f"the tests of {room} fail without a mutation: mend them first.")
+            raise InputError(f"the tests of {room} fail without a mutation: repair them first.")
         verdicts = []
         for k in order[:num_mutants]:
             name, index = places[k]

@@ -1,11 +1,12 @@
 #!/usr/bin/env bash
-# Every check that wants a GPU, the most valuable first, in eight minutes on one: tools/gpu_checks.sh [WORK_FOLDER]. What
-# it measures is appended to WORK_FOLDER/results.md after each part, with date and device. A part that fails or takes too
-# long is named, and the others still run. The last lines say which options may now be turned on.
-#   PYTHON=.venv/bin/python   the interpreter        RESULTS=FILE   where to append instead
+# Run all checks that need a GPU, the most important ones first, in eight minutes: tools/gpu_checks.sh [WORK_FOLDER].
+# The results of each part are appended to WORK_FOLDER/results.md, with date and device. If a part fails or takes too
+# long, the script prints its name and goes on. The last lines list the options that these checks allow to turn on.
+#   PYTHON=.venv/bin/python   interpreter
+#   RESULTS=FILE              file to append the results to, instead of WORK_FOLDER/results.md
 #   WHEELS=FOLDER             packages to install first, from tools/gpu_wheels.sh
-#   IMAGES=FOLDER             six JPEG files, such as a frame of nuScenes: also measures what the cores feed
-#   REDUCED=1                 each part at its smallest, on the CPU: whether the script works, not how fast anything is
+#   IMAGES=FOLDER             six JPEG files, such as a frame of nuScenes: also measures the reading of samples
+#   REDUCED=1                 run each part at its smallest size on the CPU, to test this script
 set -uo pipefail
 cd "$(dirname "$0")/.."
 work=$(realpath -m "${1:-work_dirs/gpu_checks}")
@@ -38,7 +39,7 @@ else
 fi
 
 failed=()
-part() { # part TITLE SECONDS COMMAND...: run it, and append its output with the command that made it
+part() { # part TITLE SECONDS COMMAND...: run a command with a time limit, and append it and its output to the results
     local title=$1 limit=${REDUCED:+3600} start=$SECONDS
     limit=${limit:-$2}
     shift 2

@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
-# What tools/gpu_checks.sh needs on a GPU machine that has torch, Triton, numpy, numba, OpenCV and pytest but no network:
-# tools/gpu_wheels.sh FOLDER [PYTHON_VERSION]. Copy the folder there and name it: WHEELS=FOLDER tools/gpu_checks.sh.
+# Download the packages that tools/gpu_checks.sh needs: tools/gpu_wheels.sh FOLDER [PYTHON_VERSION].
+# They are for a GPU machine without network that has torch, Triton, numpy, numba, OpenCV and pytest. Copy the folder to
+# this machine, and run WHEELS=FOLDER tools/gpu_checks.sh there.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 folder=${1:?usage: tools/gpu_wheels.sh FOLDER [PYTHON_VERSION]}

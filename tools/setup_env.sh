@@ -1,11 +1,12 @@
 #!/usr/bin/env bash
-# Build the Python environment in .venv (or the folder given): `tools/setup_env.sh [VENV]`.
-# Safe to run again: what is there is kept, a finished environment is recognised in a second, an interrupted one goes on.
-#   PYTHON=python3.11     the interpreter that makes the environment
-#   TORCH=2.8.0           the version of torch (default: the one that is there, else that of requirements.txt)
-#   TORCH_INDEX_URL=URL   where torch comes from, for a particular build (default: pip's own index)
-#   GSMAP_MMCV_OPS=1      compile mmcv's operators, also for CUDA where there is nvcc; 0: without again
-#   GSMAP_DEV=1           also what the tests, the linters and the documentation's site need
+# Build the Python environment in .venv or in another folder: tools/setup_env.sh [VENV].
+# Run it again to continue an interrupted build; installed packages are kept. If the environment is complete, the script
+# ends within a second.
+#   PYTHON=python3.11     interpreter that creates the environment
+#   TORCH=2.8.0           version of torch (default: the installed one, else the one in requirements.txt)
+#   TORCH_INDEX_URL=URL   package index for a particular build of torch (default: pip's own index)
+#   GSMAP_MMCV_OPS=1      compile mmcv's operators, for CUDA if nvcc is installed; 0 replaces them by mmcv-lite
+#   GSMAP_DEV=1           also install the packages of the tests, the linters and the documentation
 set -euo pipefail
 cd "$(dirname "$0")/.."
 venv=${1:-.venv}
@@ -30,7 +31,7 @@ fi
 started=$SECONDS
 step() { printf '\n[%s] %s  (%d s so far)\n' "$1" "$2" $((SECONDS - started)); }
 pip() { "$venv/bin/python" -m pip --disable-pip-version-check --no-input "$@"; }
-# Python compiles to bytecode what it imports; compiling all that is there would take longer than to install it.
+# Without bytecode: Python compiles the modules that it imports, and compiling all of them takes longer than the download.
 add() { pip install -q --no-compile "$@"; }
 
 "$python" - <<'PY'
@@ -45,7 +46,7 @@ fi
 
 step 1/4 "virtual environment $venv"
 [ -x "$venv/bin/python" ] || "$python" -m venv "$venv"
-add "pip>=25"  # earlier ones take half a minute to choose versions
+add "pip>=25"  # earlier versions take half a minute to resolve the requirements
 
 [ -z "$torch" ] || fits || torch=""
 wanted="torch==${torch:-${TORCH:-$(pinned torch | cut -d= -f3)}}"
@@ -56,13 +57,13 @@ step 3/4 "OpenMMLab, the devkits and the rest"
 more=()
 if [ "$dev" = 1 ]; then
     more=(-r requirements-dev.txt)
-    # A CUDA build of torch brings the Triton that fits it; beside the CPU build any recent one serves the interpreter.
+    # A CUDA build of torch has installed its Triton. The CPU build has none; a recent one is installed.
     [ -n "$(installed triton)" ] || more+=(triton==3.9.0)
 fi
-[ "$ops" = 1 ] || [ "$compiled" = 0 ] || pip uninstall -q -y mmcv  # it shares its folder with mmcv-lite
+[ "$ops" = 1 ] || [ "$compiled" = 0 ] || pip uninstall -q -y mmcv  # mmcv-lite has the same folder
 sed "s/^torch==.*/$wanted/; $([ "$ops" = 0 ] || echo '/^mmcv-lite==/d')" requirements.txt | add -r /dev/stdin "${more[@]}"
 add -q --no-deps --no-build-isolation -e .
-# Where mmcv has no compiled operators, `import gsmap` puts a stand-in in place: here before anything is imported.
+# Without compiled operators in mmcv, `import gsmap` provides replacements. The .pth file imports it at Python's start.
 echo "import gsmap" > "$("$venv/bin/python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/gsmap-mmcv.pth"
 
 has_ops() { "$venv/bin/python" -c 'from mmcv import _ext; exit(_ext.__file__.endswith(".py"))' 2>/dev/null; }
@@ -70,8 +71,8 @@ if [ "$ops" = 1 ] && ! has_ops; then
     mmcv=$(pinned mmcv-lite | sed s/-lite//)
     step operators "$mmcv from source (about 5 minutes on 2 cores the first time; pip keeps the wheel)"
     add ninja psutil
-    # -O2 -g0 builds three times as fast as the default -O3 -g, and the operators run as fast.
-    # They fit one build of torch, so each has a cache of its own.
+    # -O2 -g0 builds three times as fast as the default -O3 -g, and the operators are as fast.
+    # The operators work with one build of torch only, so each build has its own cache of wheels.
     log="$venv/mmcv-build.log"
     CFLAGS="-O2 -g0" CXXFLAGS="-O2 -g0" MMCV_WITH_OPS=1 MAX_JOBS=${MAX_JOBS:-$(nproc)} \
         pip wheel -v --no-build-isolation --no-deps -w "$venv/wheels" \

@@ -35,9 +35,9 @@ def ground_truth_elements(results: Mapping[str, Any], transform: object) -> Sequ
     return elements
 
 
-FARTHEST_M = 1e5
+MAX_LENGTH_M = 1e5
 """Largest distance in metres of a point of a map from the vehicle, and largest length of a line."""
-MOST_M = 1e6
+MAX_TOTAL_LENGTH_M = 1e6
 """Largest length in metres of all lines of the map around a vehicle together."""
 
 

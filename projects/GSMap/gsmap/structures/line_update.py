@@ -97,15 +97,15 @@ def update_from_known_lines(
     if not len(rows):
         return now
     places = nearest_places(now.means[rows], known.means[cols])
-    count = places.beside.sum(-1)
-    mean = (places.distances * places.beside).sum(-1) / count.clamp(min=1)  # (K,)
-    is_far = (count < 2) | (mean >= gate_m)
-    distances = mean.new_full((len(labels), len(known_labels)), torch.inf)  # (N, M)
-    distances[rows, cols] = mean.masked_fill(is_far, torch.inf)
+    num_beside = places.beside.sum(-1)
+    means_of_pairs = (places.distances * places.beside).sum(-1) / num_beside.clamp(min=1)  # (K,)
+    is_far = (num_beside < 2) | (means_of_pairs >= gate_m)
+    mean_distances = means_of_pairs.new_full((len(labels), len(known_labels)), torch.inf)  # (N, M)
+    mean_distances[rows, cols] = means_of_pairs.masked_fill(is_far, torch.inf)
     # Number of the pair of each element and line, to look up the nearest line of an element.
-    pairs = torch.zeros_like(distances, dtype=torch.long)
+    pairs = torch.zeros_like(mean_distances, dtype=torch.long)
     pairs[rows, cols] = torch.arange(len(rows), device=rows.device)
-    nearest, line = distances.min(1)
+    smallest_mean, line = mean_distances.min(1)
     pair = pairs.gather(1, line[:, None])[:, 0]
     point_distances = places.distances[pair]  # (N, P)
     segments = places.segments[pair]
@@ -127,10 +127,11 @@ def update_from_known_lines(
     gain = toward / (normal.mT @ (toward + line_covariance @ normal))
     means = now.means + (gain @ (normal.mT @ offset[..., None]))[..., 0]
     updated = with_covariances(means, covariance - gain @ toward.mT, near=now.rotations)
-    close = (nearest < gate_m)[:, None] & places.beside[pair] & (point_distances < gate_m)
-    close &= along.norm(dim=-1) > 0.5  # a segment without length has no direction
+    belongs = (smallest_mean < gate_m)[:, None]
+    is_updated = belongs & places.beside[pair] & (point_distances < gate_m)  # (N, P)
+    is_updated &= along.norm(dim=-1) > 0.5  # a segment without length has no direction
     return Gaussians(
-        means=torch.where(close[..., None], updated.means, now.means),
-        scales=torch.where(close[..., None], updated.scales, now.scales),
-        rotations=torch.where(close, updated.rotations, now.rotations),
+        means=torch.where(is_updated[..., None], updated.means, now.means),
+        scales=torch.where(is_updated[..., None], updated.scales, now.scales),
+        rotations=torch.where(is_updated, updated.rotations, now.rotations),
     )

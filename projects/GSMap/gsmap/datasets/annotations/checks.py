@@ -9,7 +9,7 @@ import pyarrow.compute as pc
 from gsmap.datasets.annotations.record import AnnotationMeta
 from gsmap.datasets.annotations.schema import matrices_of
 from gsmap.structures.calibration import NUM_CAN_BUS
-from gsmap.structures.elements import FARTHEST_M
+from gsmap.structures.elements import MAX_LENGTH_M
 from gsmap.structures.rigid import is_rigid
 from gsmap.utils.errors import InputError
 
@@ -159,7 +159,7 @@ def _are_polylines(lists: pa.ListArray, _: np.ndarray, meta: AnnotationMeta) -> 
     """Test which polylines have two or more points, all finite and within the limit."""
     counts = np.diff(lists.offsets.to_numpy())  # coordinates of each polyline
     are_good = (counts % meta.dim == 0) & (counts >= 2 * meta.dim)
-    are_near = np.abs(lists.values.to_numpy(zero_copy_only=False)) <= FARTHEST_M  # False for NaN
+    are_near = np.abs(lists.values.to_numpy(zero_copy_only=False)) <= MAX_LENGTH_M  # False for NaN
     if not are_near.all():
         line_numbers = np.repeat(np.arange(len(counts)), counts)
         are_good[line_numbers[~are_near]] = False

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from gsmap.structures.bezier import curve_points
-from gsmap.structures.elements import FARTHEST_M, MOST_M, MapElements
+from gsmap.structures.elements import MAX_LENGTH_M, MAX_TOTAL_LENGTH_M, MapElements
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import atomic_write
 from gsmap.utils.json_items import Place, items_of
@@ -227,24 +227,25 @@ def _check_lengths(elements: MapElements) -> None:
         return
     max_coordinate = np.abs(points).max()
     max_step = 2 * float(max_coordinate) * points.shape[1] ** 0.5
-    if max_step * len(points) <= FARTHEST_M:  # a bound on the length of all lines
+    if max_step * len(points) <= MAX_LENGTH_M:  # a bound on the length of all lines
         return
     steps = np.linalg.norm(np.diff(points, axis=0, prepend=points[:1]), axis=1)
     starts = elements.offsets[:-1]
     first_vertices = starts[starts < len(steps)]  # a last line may have no vertex
     steps[first_vertices] = 0.0
     total = steps.sum()
-    if max_coordinate > FARTHEST_M or total > FARTHEST_M:
+    if max_coordinate > MAX_LENGTH_M or total > MAX_LENGTH_M:
         lengths = [steps[start:end].sum() for start, end in pairwise(elements.offsets)]
         worst = max([max_coordinate, *lengths])
-        if worst > FARTHEST_M:
+        if worst > MAX_LENGTH_M:
             raise InputError(
                 f"a line of {worst:.3g} m, or that far from the vehicle: at most "
-                f"{FARTHEST_M / 1000:g} km are read"
+                f"{MAX_LENGTH_M / 1000:g} km are read"
             )
-    if total > MOST_M:
+    if total > MAX_TOTAL_LENGTH_M:
         raise InputError(
-            f"lines of {total:.3g} m in all: at most {MOST_M / 1000:g} km of a sample are read"
+            f"lines of {total:.3g} m in all: at most {MAX_TOTAL_LENGTH_M / 1000:g} km of a sample "
+            "are read"
         )
 
 
