@@ -47,7 +47,7 @@ def main(argv: list[str] | None = None) -> str:
         nargs="+",
         default=[],
         metavar="MODULE",
-        help="modules with metrics of one's own that the parts have",
+        help="modules that register your own metrics, if the parts have some",
     )
     args = parser.parse_args(argv)
     for module in args.custom_imports:
@@ -57,7 +57,7 @@ def main(argv: list[str] | None = None) -> str:
         shards = find_shards(target)
         kind = shards[0].manifest["kind"]
         if kind not in MERGE:
-            raise InputError(f"{shards[0].path} holds {kind!r}, of which no whole is made.")
+            raise InputError(f"{shards[0].path} holds {kind!r}, which cannot be joined.")
         count = MERGE[kind](target, shards)
         lines.append(
             f"{target}: {format_count(count, 'sample')} of {format_count(len(shards), 'shard')}"

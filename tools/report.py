@@ -79,11 +79,13 @@ def parse_args() -> argparse.Namespace:
     args = parser.parse_args()
     is_film = args.out.suffix.lower() == ".mp4"
     if is_film and (args.by or args.allow_mismatch or args.image_width is not None):
-        parser.error("--by, --allow-mismatch and --image-width are of pages: leave them out")
+        parser.error("--by, --allow-mismatch and --image-width apply to pages: leave them out")
     if is_film and (args.allow_other_split or args.law or args.changes):
-        parser.error("--allow-other-split, --law and --changes are of pages: leave them out")
+        parser.error("--allow-other-split, --law and --changes apply to pages: leave them out")
     if args.scene and not is_film:
-        parser.error("--scene is of films: give --out NAME.mp4; a page has a field for the scene")
+        parser.error(
+            "--scene applies to films: give --out NAME.mp4; a page has a field for the scene"
+        )
     return args
 
 

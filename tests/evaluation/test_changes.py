@@ -185,7 +185,7 @@ def test_the_command_scores_changes_and_groups(tmp_path, drive, capsys):
     [
         (["f.geojson", "val.arrow"], "give the true ones as --changes"),
         (["r.json", "val.arrow", "--changes", "t.geojson"], "scores a file of changes"),
-        (["f.geojson", "val.arrow", "--changes", "t", "--by", "map"], "--by is of elements"),
+        (["f.geojson", "val.arrow", "--changes", "t", "--by", "map"], "--by applies to elements"),
         (["f.geojson", "val.arrow", "--changes", "t", "--shard", "0/2", "--out", "o"], "--shard"),
     ],
 )

@@ -136,9 +136,9 @@ report: damaged.json --ann VAL | damaged.json is empty or holds no complete list
 report: nothing.json --ann VAL | nothing.json: 2 samples have no results
 report: nothing.json --ann VAL --out . | Is a directory
 report: nothing.json --ann VAL --allow-mismatch --data-root . --out r.html | no readable image at
-report: nothing.json --ann VAL --scene a --out r.html | --scene is of films
+report: nothing.json --ann VAL --scene a --out r.html | --scene applies to films
 report: nothing.json --ann VAL --by map --out r.mp4 | --by, --allow-mismatch and --image-width are of
-report: nothing.json --ann VAL --image-width 90 --out r.mp4 | and --image-width are of pages
+report: nothing.json --ann VAL --image-width 90 --out r.mp4 | and --image-width apply to pages
 report: nothing.json --ann VAL --scene a --out r.mp4 | no scene 'a': give one of
 build_map: damaged.json --ann VAL --out maps | damaged.json is empty or holds no complete list
 build_map: nothing.json --ann VAL --out maps | no sample of scene

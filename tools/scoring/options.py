@@ -81,7 +81,7 @@ def add_metrics(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="MODULE",
-        help="modules with metrics of one's own, which --eval then knows",
+        help="modules that register your own metrics for --eval",
     )
     group.add_argument(
         "--topology",
@@ -201,7 +201,7 @@ def add_analysis(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--law",
         choices=LAW_NAMES,
-        help="with --uncertainty: law of the errors (that of the calibration, or normal)",
+        help="with --uncertainty: distribution of the errors (that of the calibration, or normal)",
     )
     group.add_argument(
         "--reliability", type=output_file, help="with --uncertainty: draw its curves"
@@ -252,7 +252,7 @@ def check_changes(parser: argparse.ArgumentParser, args: argparse.Namespace) -> 
     for name in ("by", "bootstrap", "against", "consistency", "uncertainty", "pr_curves"):
         if getattr(args, name) not in (None, False):
             option = "--" + name.replace("_", "-")
-            parser.error(f"{option} is of elements, not of changes: leave it or --changes out")
+            parser.error(f"{option} applies to elements, not to changes: leave it or --changes out")
 
 
 def check_prior(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:

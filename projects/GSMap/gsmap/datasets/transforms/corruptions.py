@@ -116,18 +116,18 @@ class CorruptImages(BaseTransform):
         if self.kind == "camera_lost":
             num_lost = min(self.severity, len(views) - 1)
             lose_cameras(results, rng.permutation(len(views))[:num_lost])
-        elif self.kind in _CALIBRATIONS:
+        elif self.kind in _CALIBRATION_ERRORS:
             for view in views:
                 axis = rng.normal(size=3)
-                shift = _CALIBRATIONS[self.kind](axis / np.linalg.norm(axis), level)
-                lidar2cam = shift @ results["lidar2cam"][view]
+                error = _CALIBRATION_ERRORS[self.kind](axis / np.linalg.norm(axis), level)
+                lidar2cam = error @ results["lidar2cam"][view]
                 _set_extrinsics(results, view, lidar2cam=lidar2cam)
         elif self.kind == "fog":
             for view in views:
                 results["img"][view] = fog(results, view, visibility_m=_VISIBILITY_M[level])
         else:
             for view, image in enumerate(results["img"]):
-                corrupt = _IMAGES[self.kind]
+                corrupt = _IMAGE_CORRUPTIONS[self.kind]
                 corrupted = corrupt(_grey_levels(image), level, rng)
                 results["img"][view] = corrupted.astype(image.dtype)
         return results
@@ -240,14 +240,14 @@ def _translation(axis: NDArray[np.float64], level: int) -> NDArray[np.float64]:
     return rigid(np.eye(3), translation=axis * _SHIFTS_M[level])
 
 
-_CALIBRATIONS: dict[str, Callable[[NDArray[np.float64], int], NDArray[np.float64]]] = {
+_CALIBRATION_ERRORS: dict[str, Callable[[NDArray[np.float64], int], NDArray[np.float64]]] = {
     "rotation": _rotation,
     "translation": _translation,
 }
-_IMAGES: dict[str, Callable[[Image, int, np.random.Generator], Image]] = {
+_IMAGE_CORRUPTIONS: dict[str, Callable[[Image, int, np.random.Generator], Image]] = {
     "rain": rain, "night": night, "motion_blur": motion_blur, "jpeg": jpeg,
 }  # fmt: skip
-KINDS = ("camera_lost", *_CALIBRATIONS, "fog", *_IMAGES)
+KINDS = ("camera_lost", *_CALIBRATION_ERRORS, "fog", *_IMAGE_CORRUPTIONS)
 
 
 @TRANSFORMS.register_module()

@@ -133,9 +133,8 @@ def page_data(
     frames = []
     for index in chosen:
         sample = file[index]
-        sample_view = view.with_mounting(
-            sample.ego_from_frame
-        )  # knows the slope of the ground in the images
+        # The mounting contains the slope of the ground, which is visible in the images.
+        sample_view = view.with_mounting(sample.ego_from_frame)
         cameras = cameras_of(sample, view=sample_view, data_root=root, width_px=options.image_width)
         predictions = []
         for result in scored:
