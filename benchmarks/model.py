@@ -121,7 +121,7 @@ def image_shape(path: str, args: argparse.Namespace) -> tuple[int, int, int]:
         height, width = args.size
         return cameras, height, width
     if "_file_size" not in cfg:
-        raise InputError(f"{path} says nothing of _file_size (width, height): give --size H W.")
+        raise InputError(f"{path} does not set _file_size (width, height): give --size H W.")
     scaling: dict = {}
     for step in dataset.pipeline:
         if step.type == "ScaleImages":

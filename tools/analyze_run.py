@@ -5,7 +5,7 @@ Example: ``python tools/analyze_run.py work_dirs/maptr work_dirs/gsmap --out cur
 ``--keys soft_iou/divider at_floor`` draws these logged values instead, one panel each.
 """
 
-import gsmap  # noqa: F401 - first: it handles Ctrl-C during imports and bars foreign settings
+import gsmap  # noqa: F401 - first: it handles Ctrl-C and guards against settings files
 
 # isort: split
 import argparse

@@ -9,7 +9,7 @@ Examples:
     python tools/build_map.py --map town.osm --ann annotations.arrow --prior town.prior
 """
 
-import gsmap  # noqa: F401 - first: it handles Ctrl-C during imports and bars foreign settings
+import gsmap  # noqa: F401 - first: it handles Ctrl-C and guards against settings files
 
 # isort: split
 import argparse

@@ -13,7 +13,7 @@ Examples:
     python tools/compare.py --list --tables 'GSMap Table 5*'
 """
 
-import gsmap  # noqa: F401 - first: it handles Ctrl-C during imports and bars foreign settings
+import gsmap  # noqa: F401 - first: it handles Ctrl-C and guards against settings files
 
 # isort: split
 import argparse

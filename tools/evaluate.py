@@ -12,9 +12,9 @@ Examples:
 import os
 
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(_name, "1")  # idle threads would only stand in the workers' way
+    os.environ.setdefault(_name, "1")  # more threads would slow the worker processes down
 
-import gsmap  # noqa: F401 - first: it handles Ctrl-C during imports and bars foreign settings
+import gsmap  # noqa: F401 - first: it handles Ctrl-C and guards against settings files
 
 # isort: split
 import argparse
@@ -104,14 +104,15 @@ def build_evaluator(args: argparse.Namespace, settings: MetricSettings) -> MapEv
     uses_min_score = any(metric.takes_min_score for metric in evaluator.metrics)
     if args.min_score is not None and not uses_min_score:
         takers = [name for name in metric_files() if metric_class(name).takes_min_score]
-        raise InputError(f"--min-score is of {', '.join(takers)}: leave it out.")
+        raise InputError(f"--min-score applies to {', '.join(takers)}: leave it out.")
     if args.pr_curves and not any(metric.has_curves for metric in evaluator.metrics):
         raise InputError(
-            "--pr-curves draws what counts predictions of all samples: name chamfer or raster."
+            "--pr-curves draws metrics that rank predictions over all samples: name chamfer or "
+            "raster."
         )
     needs_ap = args.by or args.bootstrap is not None or args.against
     if needs_ap and not any(metric.ranks for metric in evaluator.metrics):
-        raise InputError("--by, --bootstrap and --against are of AP: name chamfer or raster.")
+        raise InputError("--by, --bootstrap and --against apply to AP: name chamfer or raster.")
     return evaluator
 
 

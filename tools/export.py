@@ -8,7 +8,7 @@ Examples:
 The config sets the cameras. The image size is that of its test samples, or ``--size``.
 """
 
-import gsmap  # noqa: F401 - first: it handles Ctrl-C during imports and bars foreign settings
+import gsmap  # noqa: F401 - first: it handles Ctrl-C and guards against settings files
 
 # isort: split
 import argparse

@@ -8,7 +8,7 @@ Example:
     python tools/robustness.py gsmap_r18_minicity --data-root data/minicity --samples 50 --out r
 """
 
-import gsmap  # noqa: F401 - first: it handles Ctrl-C during imports and bars foreign settings
+import gsmap  # noqa: F401 - first: it handles Ctrl-C and guards against settings files
 
 # isort: split
 import argparse

@@ -4,7 +4,7 @@
 Or give the name of a model that ships: ``python tools/test.py gsmap_r18_minicity``.
 """
 
-import gsmap  # noqa: F401 - first: it handles Ctrl-C during imports and bars foreign settings
+import gsmap  # noqa: F401 - first: it handles Ctrl-C and guards against settings files
 
 # isort: split
 import argparse

@@ -1,7 +1,7 @@
 #!/usr/bin/env python
 """Train a model: ``python tools/train.py CONFIG``."""
 
-import gsmap  # noqa: F401 - first: it handles Ctrl-C during imports and bars foreign settings
+import gsmap  # noqa: F401 - first: it handles Ctrl-C and guards against settings files
 
 # isort: split
 import argparse

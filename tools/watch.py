@@ -5,7 +5,7 @@ Plugins of other packages are left out. The plugin of open3d, which mmdet3d inst
 usual command on machines without libusb.
 """
 
-import gsmap  # noqa: F401 - first: it handles Ctrl-C during imports and bars foreign settings
+import gsmap  # noqa: F401 - first: it handles Ctrl-C and guards against settings files
 
 # isort: split
 from absl import app

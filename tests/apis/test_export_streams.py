@@ -125,5 +125,5 @@ def test_a_stream_of_a_file_follows_the_rules_of_streams(with_memory):
     with pytest.raises(ValueError, match=r"has no \['scene'\] in its metainfo"):
         with_memory(images, frame_of(10, scene=None), stream)
     other = OnnxInferencer(with_memory.path)
-    with pytest.raises(ValueError, match=r"is of .*model\.onnx, and .* start a new stream"):
+    with pytest.raises(ValueError, match=r"belongs to .*model\.onnx, and .* start a new stream"):
         other(images, frame_of(10), stream)

@@ -248,7 +248,7 @@ def test_a_stream_of_ones_own_gives_what_the_whole_drive_gives(inferencer, tmp_p
     assert not torch.allclose(alone.pred_instances_3d.pts, whole[3].pred_instances_3d.pts)
     with pytest.raises(ValueError, match=r"'scene1' .* comes too late: its stream is at 'scene3'"):
         remembering(samples[1:2], tmp_path, stream=stream)
-    with pytest.raises(ValueError, match=r"'other0' .* of another scene than 'scene3'"):
+    with pytest.raises(ValueError, match=r"'other0' .* belongs to another scene than 'scene3'"):
         remembering(drive(tmp_path, 1, "other"), tmp_path, stream=stream)
     with pytest.raises(ValueError, match="the model has no memory"):
         inferencer.new_stream()

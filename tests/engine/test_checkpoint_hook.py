@@ -311,7 +311,7 @@ def test_weights_alone_cannot_be_resumed_from(tmp_path):
 def test_data_of_another_split_is_refused_unless_allowed(tmp_path):
     near, far = listed("near@" + "0" * 16, 2), listed("far@" + "0" * 16)
     with pytest.raises(
-        ValueError, match=r"trained on the split near@0+, .* is of far@0+, .*allow_"
+        ValueError, match=r"trained on the split near@0+, .* belongs to far@0+, .*allow_"
     ):
         learn(tmp_path, 2, train=near, val=far)
     learn(tmp_path, 1, train=near, val=far, allow_other_split=True)

@@ -374,8 +374,11 @@ def test_bad_settings_are_refused(tmp_path):
     write_results(truth, truth_of(2), key="GTs")
     for words, message in (
         (["--eval", "bemapnet", "--pr-curves", "a.png"], "name chamfer or raster"),
-        (["--min-score", "0.4"], "--min-score is of topology, bemapnet, hdmapnet: leave it out"),
-        (["--eval", "pld", "--bootstrap"], "are of AP: name chamfer or raster"),
+        (
+            ["--min-score", "0.4"],
+            "--min-score applies to topology, bemapnet, hdmapnet: leave it out",
+        ),
+        (["--eval", "pld", "--bootstrap"], "apply to AP: name chamfer or raster"),
         (["--eval", "chamfers"], "there is no metric .*'chamfers'"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -62,7 +62,7 @@ def test_runs_are_planned_with_one_budget_seed_by_seed(tiny_config, protocol):
         (["nowhere.py"], "no config file nowhere.py"),
         (
             ["a=CONFIG", "b=CONFIG,test_dataloader.dataset.split=train"],
-            "of different data: test.spl",
+            "use different data: test.spl",
         ),
         (["a=CONFIG,train_cfg.max_epochs=5"], "leave it out"),
         (["a=CONFIG,model.map_head.no_such_part=1"], "no_such_part"),

@@ -89,7 +89,7 @@ def test_data_of_another_split_is_refused_unless_allowed(tool, tmp_path, monkeyp
         torch.save({"state_dict": state, "meta": {"dataset_meta": trained}}, tmp_path / "a.pth")
         if (dataset, split) != ("minicity", other):
             tool.require_own_split(tmp_path / "a.pth", settings)
-    with pytest.raises(ValueError, match=f"a.pth was trained on the split {other}, .* of {here}"):
+    with pytest.raises(ValueError, match=f"a.pth was trained on the split {other}, .* to {here}"):
         tool.require_own_split(tmp_path / "a.pth", settings)
 
 

@@ -213,7 +213,7 @@ def plan(entries: Sequence[Entry], protocol: Protocol) -> list[Run]:
     for run in runs[1:]:
         _refuse_differences(
             differences(runs[0].settings["data"], run.settings["data"]),
-            fault=f"{runs[0].label} and {run.label} are of different data",
+            fault=f"{runs[0].label} and {run.label} use different data",
             remedy="Compare configs of one data set, split, range and class list.",
         )
     for one, other in combinations(runs[: len(entries)], 2):

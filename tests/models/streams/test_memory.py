@@ -153,10 +153,10 @@ def test_a_stream_of_one_model_is_refused_by_another_and_both_are_named():
     stream, unused = memory.new_stream(), MapStream()
     with memory.using(stream):
         step(head, memory, meta(0))
-    refusal = r"is of a\.py with a\.pth, and b\.py with b\.pth cannot read"
+    refusal = r"belongs to a\.py with a\.pth, and b\.py with b\.pth cannot read"
     with pytest.raises(ValueError, match=refusal), other.using(stream):
         pass
-    with other.using(unused), pytest.raises(ValueError, match=r"of b\.py .* a\.py .*new_stream"):
+    with other.using(unused), pytest.raises(ValueError, match=r"to b\.py .* a\.py .*new_stream"):
         unused.claim(memory)
 
 

@@ -165,7 +165,7 @@ class VectorizedMapDataset(BaseDataset):
             self.annotations.require_rate(self._rate_hz)
         if not self.annotations.sealed:
             print_log(
-                f"{self.ann_file} is of an earlier version and has no checksum: damage to it may "
+                f"{self.ann_file} comes from an earlier version and has no checksum: damage may "
                 f"go unnoticed until you {self.annotations.remedy}",
                 logger="current",
             )

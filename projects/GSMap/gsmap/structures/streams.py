@@ -160,7 +160,7 @@ class Scenes:
             self.owner = owner
         if self.owner is not owner:
             raise InputError(
-                f"this stream is of {self.owner}, and {owner} cannot read its memory: "
+                f"this stream belongs to {self.owner}, and {owner} cannot read its memory: "
                 "start a new stream for each model (new_stream)."
             )
 
@@ -253,7 +253,7 @@ class MapStream(Scenes):
                 last = frame
             if frame.scene != last.scene:
                 raise InputError(
-                    f"frame {frame} is of another scene than {last}, where the stream is: "
+                    f"frame {frame} belongs to another scene than {last}, where the stream is: "
                     "start a new stream for each scene."
                 )
         return super().previous(frames)

@@ -63,9 +63,9 @@ def require_same_list(model: Any, data: Any, subject: str, remedy: str) -> None:
     data_identity = checked_identity(data)
     if model_identity and data_identity and model_identity != data_identity:
         raise InputError(
-            f"{subject} was trained on the split {model_identity}, and the data to score is of "
-            f"{data_identity}, whose places may be among those of the training: take data of the "
-            f"same split, or allow it with {remedy}."
+            f"{subject} was trained on the split {model_identity}, and the data to score belongs "
+            f"to {data_identity}, whose places may be among those of the training: take data of "
+            f"the same split, or allow it with {remedy}."
         )
 
 
