@@ -141,7 +141,7 @@ def test_a_copy_of_a_stream_goes_on_from_where_it_was(again):
     _, other = with_memory()
     other.name = "b.py with b.pth"
     with (
-        pytest.raises(ValueError, match=r"of a model with MapHead, and b\.py with b\.pth cannot"),
+        pytest.raises(ValueError, match=r"to a model with MapHead, and b\.py with b\.pth cannot"),
         other.using(again(stream)),
     ):
         pass
