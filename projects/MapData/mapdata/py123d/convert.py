@@ -10,6 +10,7 @@ import numpy as np
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import CLASSES, RANGES
+from gsmap.datasets.errors import explain_errors
 from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.errors import InputError, WorkError
 from gsmap.utils.files import file_name
@@ -227,10 +228,11 @@ def _cameras(
     cameras = []
     for camera in log.cameras:
         row = rows[camera.name]
-        global_from_camera = camera.global_from_camera(row, track=log.track)
-        record = camera.calibration
-        record["path"] = camera.image_path(row, root=root, scene=log.name)
-        record["cam_from_frame"] = invert_rigid(global_from_camera) @ global_from_axle
+        with explain_errors(f"camera {camera.name!r}", REMEDY):
+            global_from_camera = camera.global_from_camera(row, track=log.track)
+            record = camera.calibration
+            record["path"] = camera.image_path(row, root=root, scene=log.name)
+            record["cam_from_frame"] = invert_rigid(global_from_camera) @ global_from_axle
         cameras.append(record)
     return cameras
 

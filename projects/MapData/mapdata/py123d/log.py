@@ -68,6 +68,8 @@ class Camera:
         return f"{self.key}.{name}"
 
     def _value(self, name: str, row: int) -> Any:
+        if not 0 <= row < self.image_rows:
+            raise InputError(f"camera {self.name!r} has {self.image_rows} images, not row {row}")
         return self._table[self._column(name)][row].as_py()
 
     @property
