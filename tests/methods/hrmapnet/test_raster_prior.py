@@ -8,6 +8,7 @@ import torch
 from methods.hrmapnet.prior_cases import CLASSES, PRIOR, frames, pose_at, prior_model
 from model_cases import build_small, make_images
 
+from gsmap.models.hrmapnet import raster_prior
 from gsmap.models.hrmapnet.maps import Place
 from gsmap.models.hrmapnet.raster_prior import CELLS, KEYS, VALID
 from gsmap.prior import KeepMaximum, LastSeen, MapPrior, PriorSettings
@@ -182,6 +183,19 @@ def test_a_given_prior_is_read_and_stays_over_tests():
     with model.prior.using(model.prior.maps_of([prior], update=True)):
         predict(model, frames(("town", "a", 8.0)), seed=3)
     assert not torch.equal(prior.read(pose_at(0), model.prior.window), before)
+
+
+def test_several_processes_that_keep_maps_are_warned(monkeypatch):
+    model = prior_model()
+    lines = []
+    monkeypatch.setattr(raster_prior, "print_log", lambda line, **_: lines.append(line))
+    model.eval()
+    assert not lines
+    monkeypatch.setattr(raster_prior, "get_world_size", lambda: 2)
+    model.train()
+    assert not lines
+    model.eval()
+    assert "each process keeps its own map" in lines[0]
 
 
 def test_a_model_with_a_map_can_be_copied():

@@ -1,5 +1,6 @@
 """Raster prior of a detector: reads the map of earlier frames, and writes its predictions."""
 
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -8,6 +9,8 @@ import torch
 import torch.nn.functional as F
 from mmdet.models.layers import LearnedPositionalEncoding
 from mmdet3d.registry import MODELS
+from mmengine.dist import get_world_size
+from mmengine.logging import print_log
 from mmengine.model import BaseModule
 from torch import Tensor
 
@@ -197,6 +200,13 @@ class RasterPrior(BaseModule):
     def train(self, mode: bool = True) -> "RasterPrior":
         """Set the mode, and empty the maps of the model."""
         super().train(mode)
+        if not mode and self.test_memory == "kept" and get_world_size() > 1:
+            print_log(
+                "each process keeps its own map of the samples that it tests: test in one process, "
+                "or set model.prior.test_memory='none'.",
+                logger="current",
+                level=logging.WARNING,
+            )
         self._pending.clear()
         self._maps = self.new_maps()
         return self
