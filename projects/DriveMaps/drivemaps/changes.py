@@ -29,7 +29,7 @@ from drivemaps.geodetic import MapGrid, MapOrigin
 from drivemaps.geojson import write_features
 from drivemaps.line_changes import line_changes
 from gsmap.structures.classes import AREA_CLASSES
-from gsmap.structures.elements import MOST_M, MapElements
+from gsmap.structures.elements import MAX_TOTAL_LENGTH_M, MapElements
 from gsmap.structures.polylines import arc_lengths
 from gsmap.utils.errors import InputError
 
@@ -104,10 +104,10 @@ def _near_passes(old: MapElements, passes: Sequence[Pass]) -> MapElements:
             is_near[index] = bool((line[:, :2].max(axis=0) >= low).all())
         if is_near[index]:
             total_m += float(arc_lengths(line[:, :2])[-1])
-    if total_m > MOST_M:
+    if total_m > MAX_TOTAL_LENGTH_M:
         raise InputError(
             f"the old map has {total_m / 1000:.0f} km of lines near the drives: at most "
-            f"{MOST_M / 1000:g} km are compared; cut it to the place."
+            f"{MAX_TOTAL_LENGTH_M / 1000:g} km are compared; cut it to the place."
         )
     return old.select(is_near)
 
