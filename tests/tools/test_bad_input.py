@@ -137,7 +137,7 @@ report: nothing.json --ann VAL | nothing.json: 2 samples have no results
 report: nothing.json --ann VAL --out . | Is a directory
 report: nothing.json --ann VAL --allow-mismatch --data-root . --out r.html | no readable image at
 report: nothing.json --ann VAL --scene a --out r.html | --scene applies to films
-report: nothing.json --ann VAL --by map --out r.mp4 | --by, --allow-mismatch and --image-width are of
+report: nothing.json --ann VAL --by map --out r.mp4 | --by, --allow-mismatch and --image-width apply to
 report: nothing.json --ann VAL --image-width 90 --out r.mp4 | and --image-width apply to pages
 report: nothing.json --ann VAL --scene a --out r.mp4 | no scene 'a': give one of
 build_map: damaged.json --ann VAL --out maps | damaged.json is empty or holds no complete list
