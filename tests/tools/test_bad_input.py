@@ -90,6 +90,8 @@ train: C --work-dir w --cfg-options optim_wrapper.clip_grad.max_norm=abc | --cfg
 train: C --work-dir w --cfg-options optim_wrapper.optimizer=AdamW | --cfg-options optim_wrapper.optimizer must be dict(...)
 train: C --work-dir w --cfg-options param_scheduler=[abc] | param_scheduler must be a list of dict(...), got ['abc']
 train: C --work-dir w --cfg-options train_cfg.max_epochs=0 | train_cfg.max_epochs must be an integer >= 1, got 0
+train: C --work-dir w --cfg-options val_cfg.fp16=abc | val_cfg.fp16 must be True or False, got 'abc'
+train: C --work-dir w --cfg-options val_evaluator.thresholds=abc | thresholds must be > 0 m, at least one, got 'abc'
 train: C --work-dir w --cfg-options train_cfg.val_interval=0 | train_cfg.val_interval must be an integer >= 1, got 0
 train: C --work-dir w --cfg-options env_cfg.dist_cfg.backend=foo | env_cfg.dist_cfg.backend must be one of
 train: C --work-dir w --cfg-options load_from=5 | load_from must be a path, got 5

@@ -263,7 +263,7 @@ def check_config(cfg: Config) -> None:
 
 
 def _check_lengths(cfg: Config) -> None:
-    """Require a training of at least one epoch or iteration, and validation intervals > 0.
+    """Require a training of one epoch or iteration at least, and valid settings of the loops.
 
     mmengine trains nothing, without an error, for fewer epochs.
     """
@@ -273,6 +273,12 @@ def _check_lengths(cfg: Config) -> None:
         if value is not None and (not isinstance(value, int) or value < 1):
             raise InputError(
                 f"{cfg.filename}: train_cfg.{name} must be an integer >= 1, got {value!r:.60}."
+            )
+    for part in ("val_cfg", "test_cfg"):
+        halved = (cfg.get(part) or {}).get("fp16", False)
+        if not isinstance(halved, bool):
+            raise InputError(
+                f"{cfg.filename}: {part}.fp16 must be True or False, got {halved!r:.60}."
             )
 
 

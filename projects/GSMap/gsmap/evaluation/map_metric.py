@@ -13,7 +13,7 @@ from mmengine.evaluator import BaseMetric
 from mmengine.logging import MMLogger, print_log
 
 from gsmap.datasets.elements import elements_of_predictions, elements_of_truth
-from gsmap.evaluation.core.chamfer_ap import CHAMFER_THRESHOLDS
+from gsmap.evaluation.core.chamfer_ap import CHAMFER_THRESHOLDS, checked_thresholds
 from gsmap.evaluation.core.evaluator import METRIC_NAMES, MapEvaluator
 from gsmap.evaluation.core.metric import MetricSettings, metric_class, metric_names
 from gsmap.evaluation.core.report import flat_metrics, format_table
@@ -41,7 +41,8 @@ class MapMetric(BaseMetric):
         **kwargs: ``collect_device``, ``collect_dir`` and ``prefix`` of ``BaseMetric``.
 
     Raises:
-        ValueError: If a metric is unknown, or neither a metric nor ``out_file`` is given.
+        ValueError: If a metric is unknown, a threshold is no number > 0, or neither a metric nor
+            ``out_file`` is given.
     """
 
     default_prefix = ""  # the keys already contain the name of the metric
@@ -59,7 +60,7 @@ class MapMetric(BaseMetric):
         for name in eval:
             metric_class(name)
         self.eval = tuple(eval)
-        self.thresholds = tuple(thresholds)
+        self.thresholds = checked_thresholds(thresholds)
         self.out_file = out_file
 
     def _meta(self, key: str) -> Any:

@@ -11,6 +11,7 @@ With heights, distances are in space; lines are resampled and strips touch in th
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -34,6 +35,27 @@ from gsmap.utils.errors import InputError
 CHAMFER_THRESHOLDS = (0.5, 1.0, 1.5)
 HARD_CHAMFER_THRESHOLDS = (0.2, 0.5, 1.0)
 STRIP_HALF_WIDTH_M = 2.0
+
+
+def checked_thresholds(thresholds: Sequence[float]) -> tuple[float, ...]:
+    """Check the largest Chamfer distances of a match.
+
+    Args:
+        thresholds: Distances in metres, at least one, each > 0.
+
+    Returns:
+        The distances in ascending order, rounded to micrometres.
+
+    Raises:
+        ValueError: If they are no such numbers.
+    """
+    try:
+        rounded = sorted(round(float(value), ndigits=6) for value in thresholds)
+    except (TypeError, ValueError):
+        rounded = []
+    if not (rounded and 0 < rounded[0] <= rounded[-1] < math.inf):
+        raise InputError(f"thresholds must be > 0 m, at least one, got {thresholds!r:.80}.")
+    return tuple(rounded)
 
 
 @register_metric
@@ -65,11 +87,8 @@ class ChamferConfig(Metric):
     dim: int = 2
 
     def __post_init__(self) -> None:
-        thresholds = tuple(sorted(round(float(value), ndigits=6) for value in self.thresholds))
-        object.__setattr__(self, "thresholds", thresholds)
+        object.__setattr__(self, "thresholds", checked_thresholds(self.thresholds))
         object.__setattr__(self, "classes", checked_classes(self.classes))
-        if not (thresholds and 0 < thresholds[0] <= thresholds[-1] < math.inf):
-            raise InputError(f"thresholds must be > 0 m, at least one, got {thresholds}.")
         if self.num_points < 2:
             raise InputError(f"num_points must be >= 2, got {self.num_points}.")
         if self.dim not in (2, 3):
