@@ -1,4 +1,7 @@
-"""Number of parameters of a config's model by module, in the three ways of counting of papers."""
+"""Number of parameters of a config's model, by module.
+
+Papers count in three ways: all parameters, trainable parameters, or entries of the checkpoint.
+"""
 
 import argparse
 
@@ -30,7 +33,7 @@ def run(args: argparse.Namespace) -> None:
     for name, (parameters, trainable, entries) in counts.items():
         label = (name or "model").ljust(width)
         print(f"{label}  {parameters:>12,}  {trainable:>12,}  {entries:>12,}")
-    print("all and trainable: parameters; entries: numbers in a checkpoint, with buffers")
+    print("all and trainable are parameters; entries are numbers in a checkpoint, with buffers")
 
 
 def count_parameters(model: nn.Module, depth: int = 2) -> dict[str, tuple[int, int, int]]:

@@ -46,7 +46,7 @@ DEVICE = f"{NAME}:0"
 ROOT = shipped_path()
 aten = torch.ops.aten
 
-# Tensors per launch of a kernel for lists of tensors, by number of lists.
+# A `torch._foreach_*` kernel takes so many tensors of each list per launch, with 1, 2, .. 5 lists.
 _TENSORS_PER_LAUNCH = (110, 64, 48, 36, 30)
 
 
@@ -118,7 +118,7 @@ class PretendedTensor(Tensor):
         return self.cpu().tolist()
 
     @classmethod
-    def __torch_dispatch__(  # type: ignore[override]  # torch's is no method by its types
+    def __torch_dispatch__(  # type: ignore[override]  # torch declares an attribute
         cls, func: Any, types: Any, args: Any = (), kwargs: dict | None = None
     ) -> Any:
         if PretendedGPU.current is None:
@@ -153,9 +153,9 @@ class PretendedGPU(TorchDispatchMode):
         installed = {**backends.INSTALLED, "triton": True}
         foreach_types = [*foreach_utils._foreach_supported_types, PretendedTensor]
         changes = (
-            # In another thread, backward would leave this mode.
+            # This mode does not reach the threads in which autograd runs backward by default.
             torch.autograd.set_multithreading_enabled(False),
-            # A parameter is replaced by a move to the device, as its memory cannot be.
+            # `Module.to` makes new parameters: it cannot put pretended values into the old ones.
             _flag(torch.__future__.set_overwrite_module_params_on_conversion),
             # torch.tensor(.., device) is an upload.
             _flag(torch._C._set_only_lift_cpu_tensors),
@@ -294,8 +294,7 @@ class PretendedGPU(TorchDispatchMode):
             if is_blocking:
                 self._wait("upload")
             self._launch("upload")
-            copy = aten._to_copy.default(source, **options)
-            return PretendedTensor(copy.clone() if copy is source else copy)
+            return PretendedTensor(aten._to_copy.default(source, **options))
         if device_type == "cpu":
             if is_blocking:
                 self._wait("download")
@@ -343,7 +342,10 @@ class PretendedGPU(TorchDispatchMode):
                 )
             return
         if not isinstance(args[0], PretendedTensor):
-            raise RuntimeError(f"indices should be on the device of what is indexed, cpu ({name})")
+            raise RuntimeError(
+                "indices should be either on cpu or on the same device as the indexed tensor (cpu) "
+                f"({name})"
+            )
         indices = [index for index in args[1] if index is not None]
         for index in indices:
             if not isinstance(index, PretendedTensor):
@@ -468,7 +470,9 @@ def _attention(
     is_causal: bool = False,
     **kwargs: Any,
 ) -> Tensor:
-    """Scaled dot-product attention; on the pretended GPU by the kernel for attention with masks.
+    """Compute scaled dot-product attention.
+
+    On the pretended GPU, all calls launch torch's memory-efficient kernel, which supports masks.
 
     Args:
         query: Queries. (B, heads, N, C)

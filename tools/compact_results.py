@@ -1,7 +1,7 @@
 #!/usr/bin/env python
 """Write a result file with Bezier curves in place of points, within an error in metres.
 
-Every command here reads the new file like the old one:
+All commands of the project read the new file like the original. To write it and to evaluate it:
     python tools/compact_results.py results.json compact.json --max-error 0.1
     python tools/evaluate.py compact.json gsmap_nuscenes_val.arrow
 """

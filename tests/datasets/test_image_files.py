@@ -78,7 +78,7 @@ def test_sixteen_bits_of_colour_are_read_as_those_of_grey_are(channels):
     content = cv2.imencode(".png", colours)[1].tobytes()
     assert decoded(content)[0, -1].tolist() == [255, 255, 255]
     colours[..., :3] >>= 4
-    message = r"a\.png cannot be used: its values end at 4095 of 65535, .* 12 bits"
+    message = r"a\.png cannot be used: its largest value is 4095 of 65535, .* 12 bits"
     with pytest.raises(BrokenSampleError, match=message):
         decoded(cv2.imencode(".png", colours)[1].tobytes())
 
@@ -142,7 +142,7 @@ def test_what_stands_in_place_of_an_image_is_named(content, remedy):
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
-        ("a.jpg", "its folder is there without it: fetch it again"),
+        ("a.jpg", "the folder exists, but not this file: fetch the file again"),
         ("B.jpg", "but 'b.JPG' is there: rename it"),
         ("link.jpg", "it is a link to 'gone.jpg', which is not there"),
         ("none/a.jpg", "there is no folder .*none: paths are relative to data_root"),

@@ -82,7 +82,9 @@ def read_places(paths: Sequence[Path]) -> Places:
         file = AnnotationFile(path)
         file_scenes = file.column("scene")
         file_maps = file.column("map_name")
-        if not file.meta.options.get("poses", True) or file_scenes == file_maps:
+        # Without the names of maps, a conversion writes each scene as a map that has its name.
+        has_common_maps = file_scenes != file_maps
+        if not file.meta.options.get("poses", True) or not has_common_maps:
             raise InputError(
                 f"{path} does not say where its samples are on common maps: make it from the data "
                 "set itself, not from info files or pictures."
@@ -108,8 +110,9 @@ def nearest_by_map(train: _ByMap, val: _ByMap) -> dict[str, tuple[np.ndarray, np
         val: (x, y) of the validation samples in metres, by map name. each (m, 2)
 
     Returns:
-        By the name of each map with validation, distances in metres (m,), infinite without training
-        on the map, and rows of ``train`` (m,).
+        Two arrays for each map with validation samples, by its name. First, the distance of each
+        validation sample in metres, infinite if the map has no training sample. (m,) Second, the
+        row of its nearest training sample among the training samples of the map. (m,)
     """
     nearest = {}
     for name, positions in val.items():

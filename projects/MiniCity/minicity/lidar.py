@@ -67,9 +67,11 @@ def _entry_distances(origin: Array, directions: Array, boxes: Array) -> Array:
     dy = directions[:, 1, None, None]
     cross = dx * edge[None, ..., 1] - dy * edge[None, ..., 0]
     cross = np.where(np.abs(cross) < 1e-12, 1e-12, cross)
+    # A ray meets the line of an edge where reach * direction = start + share * edge. The cross
+    # product of both sides with the edge gives `reach`, with the direction it gives `share`.
     area = start[None, ..., 0] * edge[None, ..., 1] - start[None, ..., 1] * edge[None, ..., 0]
     reach = area / cross
-    share = (start[None, ..., 0] * dy - start[None, ..., 1] * dx) / cross
+    share = (start[None, ..., 0] * dy - start[None, ..., 1] * dx) / cross  # 0 to 1 on the edge
     hit = (reach > 0.3) & (share >= 0) & (share <= 1)
     return np.where(hit, reach, np.inf).min(axis=2)
 
@@ -82,7 +84,8 @@ def scan(
     Args:
         world_from_lidar: Pose of the sensor, in metres. (4, 4)
         texture: The ground, for its reflectivity.
-        boxes: Vehicles and buildings: four corners and a height each, in metres. (n, 9)
+        boxes: Vehicles and buildings: x, y of the four corners in order, then the height, in
+            metres. (n, 9)
         rng: Source of the range noise.
 
     Returns:
@@ -107,6 +110,7 @@ def scan(
     box = box[order]
     distance = entry[column, box]
     height = origin[2] + slope[:, None] * distance
+    # A ray above the ground, z = 0, at the box has not met the ground: the box is nearer.
     rows, hit = np.nonzero((height > 0) & (height < near[box, 8]))
     reach[rows, column[hit]] = distance[hit]
     hit_box[rows, column[hit]] = box[hit]
@@ -117,6 +121,8 @@ def scan(
     world_z = origin[2] + slope[rows] * distance
     world = np.column_stack([world_xy, world_z])
     point_box = hit_box[rows, columns]
+    # Intensity of each box. The additional last entry is read by index -1 of points on the ground,
+    # whose value `np.where` drops.
     tint = 18.0 + 7.0 * (np.arange(len(near) + 1) % 9)
     ground_intensity = texture.sample_reflectivity(world[:, :2]).astype(float)
     intensity = np.where(point_box >= 0, tint[point_box], ground_intensity)

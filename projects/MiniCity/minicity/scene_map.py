@@ -8,6 +8,7 @@ from shapely.geometry import Polygon
 from gsmap.utils.errors import InputError
 from minicity.curves import Array, arc_lengths, strip, subline
 
+# Colours are BGR, 0 to 255, as in OpenCV.
 MATERIALS = {
     "asphalt": (84, 82, 80),
     "carpark": (72, 70, 70),
@@ -25,7 +26,7 @@ class Surface:
 
     Attributes:
         polygon: Outline and holes in the world, in metres.
-        material: Key of ``MATERIALS``.
+        material: Key of ``MATERIALS``, which has the colours.
         tone: Brightness relative to the colour in ``MATERIALS``.
     """
 
@@ -145,11 +146,12 @@ def double_line(line: Array, width_m: float, gap_m: float) -> list[Array]:
     """
     if len(line) < 2:
         return []
-    outer = strip(line, gap_m / 2 + width_m)
-    inner = strip(line, gap_m / 2)
-    n = len(line)
-    left = np.concatenate([outer[:n], inner[:n][::-1]])
-    right = np.concatenate([outer[n:], inner[n:][::-1]])
+    # `strip` returns n points of the left side, then n points of the right side in reverse order.
+    outer_left, outer_right = np.split(strip(line, gap_m / 2 + width_m), 2)
+    inner_left, inner_right = np.split(strip(line, gap_m / 2), 2)
+    # Each outline goes along its outer side and returns along its inner side.
+    left = np.concatenate([outer_left, inner_left[::-1]])
+    right = np.concatenate([outer_right, inner_right[::-1]])
     return [left, right]
 
 
@@ -176,7 +178,7 @@ def zebra(side_a: Array, side_b: Array, stripe_m: float = 0.5, gap_m: float = 0.
         shares = np.array([start, start + stripe_m]) / total
         edge_a = _points_at_shares(side_a, lengths_a, shares)
         edge_b = _points_at_shares(side_b, lengths_b, shares)
-        stripes.append(np.concatenate([edge_a, edge_b[::-1]]))
+        stripes.append(np.concatenate([edge_a, edge_b[::-1]]))  # there on a, back on b
     return stripes
 
 

@@ -127,7 +127,9 @@ def _check_value(value: Any, name: str, known: set[str]) -> Any:
     if name.endswith(".type"):
         return _check_type(value, name=name, known=known)
     if isinstance(value, str) and not (_TEXT.fullmatch(value) or value in known):
-        raise InputError(f"{name} is {value!r:.60}, no plain word and not the config's")
+        raise InputError(
+            f"{name} is {value!r:.60}, which is neither a plain word nor in the config"
+        )
     if isinstance(value, (int, float)) and not abs(value) <= _LARGEST:  # refuses NaN as well
         raise InputError(f"{name} is {value!r:.60}, not within {_LARGEST}")
     return value
@@ -136,7 +138,10 @@ def _check_value(value: Any, name: str, known: set[str]) -> Any:
 def _check_mapping(settings: dict[str, Any], name: str, known: set[str]) -> dict[str, Any]:
     """Check the keys and the values of a dictionary; arguments as for `_check_value`."""
     for key in settings:
-        if not _KEY.fullmatch(key) and (key not in known or key.startswith("_")):
+        is_setting_name = _KEY.fullmatch(key) is not None
+        # mmengine's `_scope_` and similar keys are never allowed.
+        is_config_key = key in known and not key.startswith("_")
+        if not (is_setting_name or is_config_key):
             raise InputError(f"{name} has the key {key!r:.60}, which is no name of a setting")
     result: dict[str, Any] = {}
     for key, value in settings.items():
@@ -159,22 +164,26 @@ def _check_type(kind: Any, name: str, known: set[str]) -> Any:
     module = str(getattr(registered_class, "__module__", ""))
     is_trusted = module.startswith(("gsmap.", "torch.nn.")) or kind in known
     if registered_class is None or not is_trusted:
-        raise InputError(f"{name} is {kind!r:.60}, no part of this project and not of the config")
+        raise InputError(
+            f"{name} is {kind!r:.60}, which is no class of this project or torch.nn, nor in the config"
+        )
     return kind
 
 
 def _find_registered(kind: str) -> Any:
-    """Find a class in the registries by name, with or without scope; None if it is absent.
+    """Find a class in the registries by name; None if it is absent.
 
-    Only modules of the registries' packages are imported.
+    A name with a scope is searched in the registries of that scope, such as ``mmdet`` in
+    ``mmdet.DETRHead``. A name without scope is searched in mmdet3d's registries and in mmengine's,
+    which are their roots. Only modules of the registries' packages are imported.
     """
     scope, _, bare_name = kind.rpartition(".")
     for registry in (MODELS, TASK_UTILS):
-        for holder in (registry, registry.root, *registry.root.children.values()):
-            if scope and scope != holder.scope:
-                continue
-            if not scope and holder not in (registry, registry.root):
-                continue
+        holders = [registry, registry.root]
+        if scope:
+            holders += registry.root.children.values()
+            holders = [holder for holder in holders if holder.scope == scope]
+        for holder in holders:
             holder.import_from_location()  # imports the modules of the holder's package
             if bare_name in holder.module_dict:
                 return holder.module_dict[bare_name]

@@ -64,7 +64,7 @@ def image_size(file: Path, where: str) -> tuple[int, int]:
         except _UnfitError as error:
             raise InputError(f"{where}: {file} cannot be used: {error}.") from error
         except _DAMAGE as error:
-            if getattr(error, "errno", None):
+            if getattr(error, "errno", None):  # the disk failed: pillow's errors have no number
                 raise
             raise InputError(_no_image(where, path=file, content=start)) from error
 
@@ -194,7 +194,7 @@ def _why_missing(file: Path) -> str:
     for name in os.listdir(file.parent):
         if name.lower() == file.name.lower():
             return f"but {name!r} is there: rename it"
-    return "its folder is there without it: fetch it again"
+    return "the folder exists, but not this file: fetch the file again"
 
 
 def _no_image(where: str, path: object, content: bytes) -> str:
@@ -231,7 +231,11 @@ def _decode_other(
         num_frames = getattr(picture, "n_frames", 1)
         if num_frames > 1:
             raise _UnfitError(f"it is an animation of {num_frames} images: save each as a file")
-        has_16_bits = ";16" in str(picture.tile[0][3]) if picture.tile else False
+        has_16_bits = False
+        if picture.tile:
+            # The first block of pixel data; its last field has the raw mode, such as "RGB;16B".
+            _, _, _, decoder_arguments = picture.tile[0]
+            has_16_bits = ";16" in str(decoder_arguments)
         picture.load()  # the orientation of a PNG may follow the pixels
         _require_upright(picture)
         if picture.mode.startswith("I"):
@@ -240,7 +244,7 @@ def _decode_other(
             encoded = np.frombuffer(content, dtype=np.uint8)
             _require_bright(cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED))
         rgb = np.asarray(picture.convert("RGB"))
-        return picture.size, np.ascontiguousarray(rgb[:, :, ::-1])
+        return picture.size, np.ascontiguousarray(rgb[:, :, ::-1])  # RGB to BGR
 
 
 def _check_num_pixels(size: tuple[int, int]) -> None:
@@ -269,9 +273,9 @@ def _require_bright(values: np.ndarray) -> None:
     brightest = int(colours.max())
     if 0 < brightest < _MIN_BRIGHTEST:
         raise _UnfitError(
-            f"its values end at {brightest} of 65535, as those of a camera of "
-            f"{brightest.bit_length()} bits or of depth do, and it would be next to black: spread "
-            "them over 16 bits, or save 8 bits"
+            f"its largest value is {brightest} of 65535, as in a depth map or an image of a camera "
+            f"with {brightest.bit_length()} bits, and in 8 bits it would be almost black: spread "
+            "its values over 16 bits, or save it with 8 bits"
         )
 
 

@@ -55,8 +55,10 @@ class GaussianMetric(BaseMetric):
         """Measure the Gaussians of one sample.
 
         Returns:
-            Whether each Gaussian is at the lower bound of sizes (n,); and by label the soft IoUs of
-            matched pairs and the sizes in metres, along and across the line (n, 2).
+            Tuple of two entries. First, whether each Gaussian of the sample is at the lower bound
+            of sizes. (n,) Second, a dictionary by label. Its values are pairs of arrays: the soft
+            IoU of each matched pair of the class (m,), and the sizes of each Gaussian of the class
+            in metres, along and across the line (k, 2).
         """
         predictions = sample["pred_instances_3d"]
         truth = sample["eval_ann_info"]

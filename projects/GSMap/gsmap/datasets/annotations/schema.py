@@ -118,7 +118,8 @@ def _flatten(value: Any, name: str, dim: int, where: str) -> np.ndarray:
         shape = _SHAPES[name]
         wanted = f"of shape {shape}"
     else:
-        shape = (max(array.size // dim, 2), dim)
+        num_points = array.size // dim
+        shape = (max(num_points, 2), dim)  # fewer than two points differ from this shape
         wanted = f"(n >= 2, {dim})"
     if array.shape != shape or array.dtype.kind not in "iuf":
         raise InputError(

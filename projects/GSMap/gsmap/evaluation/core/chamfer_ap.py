@@ -7,7 +7,8 @@ Rules, equal to MapTR's evaluator:
   within the threshold and no prediction with a higher score has taken the ground truth.
 - Pairs whose 4 m wide strips do not touch never match.
 
-With heights, distances are in space; lines are resampled and strips touch in the plane.
+With heights, distances are in space. The points of a resampled line are still at equal distances in
+the plane, with interpolated heights, and strips are compared in the plane.
 """
 
 import math
@@ -159,7 +160,7 @@ def _line(lines: kernels.Lines, index: int) -> FloatArray:
 
 def _strips_touch(first: FloatArray, second: FloatArray) -> bool:
     """Whether the 4 m wide strips around two lines intersect; ends are flat, corners mitred."""
-    # A point beside a segment is inside the strip of that segment, and on its own line.
+    # Fast check: a point of `first` beside a segment of `second` is in the strips of both lines.
     if kernels.beside_a_segment(first, second, STRIP_HALF_WIDTH_M):
         return True
     import shapely  # only a handful of pairs per thousand frames reach this line
@@ -194,7 +195,8 @@ def nearest_by_chamfer(
     """
     pred = _lines(predictions, config, resample=config.resample_predictions)
     gt = _lines(ground_truth, config, resample=config.resample_ground_truth)
-    distances = kernels.pair_distances(pred, gt=gt, max_distance=max_distance)  # (N, K + 1)
+    # (N, K + 1). The last column is infinite, so that argmin exists without ground truth.
+    distances = kernels.pair_distances(pred, gt=gt, max_distance=max_distance)
     nearest = distances.argmin(axis=1)
     has_candidates = np.isfinite(distances).any(axis=1)
     for row in np.flatnonzero(has_candidates).tolist():
@@ -255,7 +257,8 @@ def _match(sample: Sample, config: ChamferConfig) -> FrameMatches:
     except ValueError as error:
         raise InputError(f"sample {token!r}, AP_chamfer of dim {config.dim}: {error}") from error
     rows = ranked_predictions(predictions, num_classes=num_classes)
-    # Only the nearest ground truth has a quality; without one, index -1 is the last column.
+    # Quality is the negative distance, of the nearest ground truth only. Without a ground truth,
+    # `nearest` is -1 and the infinite distance is written to the additional last column.
     quality = np.full((len(rows), len(ground_truth) + 1), -np.inf)
     quality[np.arange(len(rows)), nearest[rows]] = -distance[rows]
     min_quality = np.tile(np.negative(config.thresholds), reps=(len(rows), 1))
@@ -293,7 +296,7 @@ def chamfer_report(matches: MatchTable, config: ChamferConfig) -> MetricReport:
             metrics[f"{class_name}/{key}"] = value
         if ranked.num_gts:
             present.append(class_name)
-    keys = {"mAP": "AP"}  # class figure of each mean
+    keys = {"mAP": "AP"}  # from the key of a mean to the key of the averaged figure of each class
     for threshold in config.thresholds:
         keys[f"AP@{threshold}"] = f"AP@{threshold}"
     for mean_key, key in keys.items():

@@ -93,9 +93,9 @@ class Topology(Metric):
     def reports(self, table: ValueTable) -> list[MetricReport]:
         """Add up the counts of all samples.
 
-        The keys of figures are ``CLASS/NAME``. ``breaks`` are the pieces of a ground truth beyond
-        the first that predictions cover. ``false_joints`` are the ground truths beyond the first
-        that a prediction follows. ``folds`` are counted as in `count_folds`. ``num_gts`` and
+        The keys of figures are ``CLASS/NAME``. If different predictions cover n
+        pieces of a ground truth, it has n - 1 ``breaks``. If a prediction follows n ground truths,
+        it has n - 1 ``false_joints``. ``folds`` are counted as in `count_folds`. ``num_gts`` and
         ``num_preds`` are the numbers of ground truths and predictions.
 
         Args:
@@ -110,9 +110,10 @@ class Topology(Metric):
 
 
 def count_pieces(covered: BoolArray, step_m: float, min_piece_m: float) -> int:
-    """Count the lines that cover an element, where each line adds a piece of its points.
+    """Count the lines that are needed to cover an element.
 
-    Lines are chosen greedily, the longest new piece first.
+    Lines are chosen greedily: the next line covers most points of the element that no chosen line
+    covers.
 
     Args:
         covered: Whether each of M lines covers each point of the element, at equal distances.
@@ -135,7 +136,7 @@ def count_pieces(covered: BoolArray, step_m: float, min_piece_m: float) -> int:
 def _count_excess_pieces(
     elements: Sequence[FloatArray], lines: Sequence[FloatArray], config: Topology
 ) -> int:
-    """Count the pieces beyond the first of each element that lines cover."""
+    """Sum n - 1 over the elements, for n pieces of an element that different lines cover."""
     if not lines:
         return 0
     curves = shapely.linestrings([_resample_flat(line) for line in lines])
@@ -171,13 +172,13 @@ def count_folds(line: FloatArray, is_area: bool) -> int:
     length = arc_lengths(line)[-1]
     if not 2 * _FOLD_CHORD_M <= length < np.inf:
         return 0
-    span = max(round(_FOLD_CHORD_M / length * (_POINTS - 1)), 1)
+    span = max(round(_FOLD_CHORD_M / length * (_POINTS - 1)), 1)  # points per chord
     chords = points[span:] - points[:-span]
-    before = chords[:-span]
+    before = chords[:-span]  # chords that end where those in `after` start
     after = chords[span:]
     lengths = np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
     is_fold = (before * after).sum(axis=1) < _FOLD_COS * lengths
-    starts_fold = is_fold[1:] & ~is_fold[:-1]
+    starts_fold = is_fold[1:] & ~is_fold[:-1]  # neighbouring points with a fold count once
     return int(is_fold[:1].sum() + starts_fold.sum())
 
 

@@ -46,6 +46,7 @@ def sample_map(value: Tensor, shape: tuple[int, int], locations: Tensor, weights
     """
     if has_kernel(value) or not has_compiled_op(value):
         return deformable_sample(value, shape, locations, weights)
+    # mmcv's op samples several maps (levels). Here it has one level, hence the axes of size 1.
     level_shapes = constant(value, [shape], torch.long)
     level_starts = constant(value, [0], torch.long)
     return MultiScaleDeformableAttnFunction.apply(
@@ -88,13 +89,14 @@ class SamplingAttention(nn.Module):
     Args:
         embed_dims: Channels C of the map and the output, divisible by ``num_heads``.
         num_heads: Number of heads.
-        num_points: Samples per head and query, in each part.
+        num_points: Samples per head and query, in each of ``num_parts`` groups.
         query_dims: Channels of the query. None means ``embed_dims``.
         dropout: Dropout of the output.
-        num_parts: Number of parts of the samples, such as levels, with equal initial offsets.
+        num_parts: Number of groups of samples, for example one group per feature map. All groups
+            have equal initial offsets.
 
     Attributes:
-        num_points: Samples S per head and query, in all parts.
+        num_points: Samples S per head and query, in all groups together.
 
     Raises:
         ValueError: If ``num_heads`` does not divide ``embed_dims``.
@@ -126,7 +128,7 @@ class SamplingAttention(nn.Module):
         self.init_weights()
 
     def init_weights(self) -> None:
-        """Initialise the offsets of each head in another direction, with equal weights."""
+        """Initialise offsets in a different direction for each head, and equal weights."""
         constant_init(self.sampling_offsets, 0.0)
         offsets = directional_offsets(self.num_heads, self.num_points // self.num_parts)
         with torch.no_grad():  # in place, because the weights may be on a GPU
@@ -146,7 +148,7 @@ class SamplingAttention(nn.Module):
         return logits.unflatten(-1, (self.num_heads, self.num_points)).softmax(-1)
 
     def values(self, tokens: Tensor) -> Tensor:
-        """Projected cells of a map, by head. (..., cells, C) -> (..., cells, heads, C')"""
+        """Projected cells of a map, by head. (..., cells, C) -> (..., cells, heads, C / heads)"""
         return at_least_float32(self.value_proj(tokens)).unflatten(-1, (self.num_heads, -1))
 
 
@@ -209,9 +211,9 @@ class BEVDeformableAttention(SamplingAttention):
         cells, cell_weights = bilinear_cells(locations, weights, shape)
         sample = torch.arange(len(tokens), device=tokens.device).view(-1, 1, 1, 1)
         table = at_least_float32(tokens).reshape(-1, tokens.shape[-1])
-        rows = sample * tokens.shape[1] + cells
+        rows = sample * tokens.shape[1] + cells  # `table` has the cells of all samples in turn
         sampled = sum_rows(table, rows, cell_weights)
-        weight = self.value_proj.weight.unflatten(0, (self.num_heads, -1))  # (heads, C', C)
+        weight = self.value_proj.weight.unflatten(0, (self.num_heads, -1))  # (heads, C / heads, C)
         bias = self.value_proj.bias.view(self.num_heads, -1)
         projected = torch.einsum("bqhc,hdc->bqhd", sampled, weight)
         projected_bias = cell_weights.sum(-1, keepdim=True) * bias
@@ -274,4 +276,4 @@ def directional_offsets(num_heads: int, num_points: int) -> Tensor:
     directions = torch.stack([angles.cos(), angles.sin()], dim=-1)
     directions = directions / directions.abs().amax(-1, keepdim=True)
     steps = torch.arange(1, num_points + 1, dtype=torch.float32)
-    return directions[:, None] * steps[:, None]
+    return directions[:, None] * steps[:, None]  # (heads, 1, 2) * (S, 1)

@@ -147,7 +147,8 @@ def plain_class_loss(loss: Any, scores: Tensor, labels: Tensor) -> Tensor:
     Returns:
         Weighted loss of every logit. (B, N, classes)
     """
-    # With one-hot targets, mmdet's focal loss does not need its compiled op.
+    # With one-hot targets, mmdet's focal loss does not need its compiled op. Column 0 is of queries
+    # without a class, label -1, and is cut off.
     one_hot = F.one_hot(labels + 1, scores.shape[-1] + 1)[..., 1:]
     values = loss(scores.flatten(0, 1), one_hot.flatten(0, 1), reduction_override="none")
     return values.view_as(scores)

@@ -96,7 +96,7 @@ class MapCoder:
         """
         keep = torch.ones_like(scores, dtype=torch.bool)
         if self.margin_m is not None:
-            low, high = constant(pts, [self.grid.x_range, self.grid.y_range]).T
+            low, high = constant(pts, [self.grid.x_range, self.grid.y_range]).T  # (x, y) each
             keep = (pts[..., :2].amin(1) >= low - self.margin_m).all(-1)
             keep &= (pts[..., :2].amax(1) <= high + self.margin_m).all(-1)
         if self.score_threshold is not None:
@@ -124,7 +124,7 @@ class MapCoder:
         confidences = scores.float().sigmoid().flatten()
         num = min(self.max_num, len(confidences))
         best_confidences, inds = confidences.topk(num)
-        num_classes = scores.shape[-1]
+        num_classes = scores.shape[-1]  # index i is query i // num_classes, class i % num_classes
         return Detections(
             scores=best_confidences,
             labels=inds % num_classes,

@@ -115,7 +115,7 @@ class MapDecoderLayer(BaseModule):
         dropout: Probability to drop a value in training, in every sublayer.
         self_attn: Config of the self-attention. Default: `PointSelfAttention`.
         cross_attn: Config of the cross-attention. Default: `BEVDeformableAttention`.
-        guidance: Config of a `Guidance`, or None for a layer without.
+        guidance: Config of a `Guidance`, or None for a layer without guidance.
         space: Encoding of Gaussians in references, an argument of the guidance.
     """
 
@@ -226,7 +226,7 @@ class MapDecoder(BaseModule):
 
         Args:
             query: Content of the queries. (B, Q, C)
-            reference: Initial references. (B, Q, D)
+            reference: Initial references. (B, N * P, D)
             bev_feats: BEV features. (B, C, H, W)
 
         Returns:

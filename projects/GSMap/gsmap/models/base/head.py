@@ -46,7 +46,7 @@ _PRIOR_PROBABILITY = 0.01
 class MapHead(LossHead):
     """Head that predicts N map elements of P ordered points from BEV features.
 
-    Methods are combinations of its parts. Point queries are the sums of embeddings of instances and
+    Map models are combinations of its parts: decoder, references, losses and others. Point queries are the sums of embeddings of instances and
     points (MapTR); half of their channels are positional. The decoder refines the queries, and the
     predictions of its layers are matched with the ground truth for the losses.
 
@@ -69,7 +69,7 @@ class MapHead(LossHead):
         embed_dims: Channels C.
         point_queries: Config of the embeddings of points, built with ``num_points`` and
             ``embed_dims``. None means a table for all instances (`PointTable`).
-        settings: Settings that methods add to every head (`head_setting`).
+        settings: Settings that map models add to every head with `head_setting`.
 
     Raises:
         TypeError: If a loss is no `MapLoss`.
@@ -173,7 +173,7 @@ class MapHead(LossHead):
             ValueError: If a setting does not exist.
         """
         kind = self.reference.coder_class or MapCoder
-        valid_names: set[str] = set()
+        valid_names: set[str] = set()  # subclasses pass settings on to the class they derive from
         for base in kind.__mro__:
             valid_names.update(signature(base).parameters)
         unknown = sorted(set(settings) - valid_names)
@@ -229,7 +229,7 @@ class MapHead(LossHead):
         """
         init_matrices(self.decoder)
         for branch in self.cls_branches:
-            *_, bias = branch.parameters()  # of the logits
+            *_, bias = branch.parameters()  # the last one: bias of the logits
             nn.init.constant_(bias, bias_init_with_prob(_PRIOR_PROBABILITY))
         super().init_weights()
 
@@ -295,7 +295,7 @@ class MapHead(LossHead):
 
         Args:
             bev_outputs: Outputs of the BEV encoder, with ``bev_feats`` (B, C, H, W).
-            hooks: Hooks into the flow, for example the memory of earlier frames.
+            hooks: Hooks into the flow, for example to add queries from previous frames.
 
         Returns:
             The predictions of each layer, with scores in at least float32.

@@ -1,4 +1,7 @@
-"""Hooks into the flow of a head, for memory or for further queries with known matches."""
+"""Hooks into the flow of a head.
+
+They add queries from previous frames (temporal memory), or queries with known matches (denoising).
+"""
 
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
@@ -14,8 +17,9 @@ class FlowStart(NamedTuple):
     """Input of the first decoder layer.
 
     Attributes:
-        queries: States, positions and references of all instance queries N, as
-            `MapDecoder.forward` takes them: (B, N * P, ...) for a decoder of point queries.
+        queries: States, positions and references for `MapDecoder.forward`. States and positions are
+            (B, N * P, C) for a decoder of point queries, and (B, N, C) for a decoder of instance
+            queries. References are (B, N * P, D).
         mask: True where an instance (row) may not attend to another (column), or None. (N, N)
     """
 

@@ -95,6 +95,7 @@ class MapLoss(nn.Module, NeedsTargets):
         has_class_weights = isinstance(self.loss_weight, Sequence)
         if has_class_weights:
             weights = class_weights(self.loss_weight, pairs.gt_labels)
+            # The axis of the pairs goes last, where the weights (M,) are broadcast, and back.
             values = (weights * values.movedim(0, -1)).movedim(-1, 0)
         sums = pairs.by_layer(values).flatten(1).sum(1) / pairs.avg_factor
         return sums if has_class_weights else self.loss_weight * sums

@@ -106,7 +106,8 @@ class BEVMaskHead(nn.Sequential, NeedsTargets):
         """
         feats = bev_outputs[self.feats]
         target = stack_targets(self, batch_data_samples, name=self.target, device=feats.device)
-        target = target.flatten(0, -4)  # (B * V, masks, H, W)
+        # All axes before (masks, H, W) become one axis, of B masks or of B * V for V cameras.
+        target = target.flatten(0, -4)
         if self.num_masks == 1:
             target = target.amax(1, keepdim=True)
         elif target.shape[1] != self.num_masks:

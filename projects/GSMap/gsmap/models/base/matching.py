@@ -149,14 +149,15 @@ class MapAssigner:
         samples, query_inds, joined_inds, gt_inds, rows = device_indices.unbind(0)
         orders = truths.pts_shifts[rows]  # (L, M, S, P, 2 or 3)
         pts = predictions.pts[samples, joined_inds]
-        distances = self.between_points(pts[:, :, None].expand_as(orders), orders)
+        repeated_pts = pts[:, :, None].expand_as(orders)  # once for each of S equivalent orders
+        distances = self.between_points(repeated_pts, orders)
         return MapMatches(
             samples=samples,
             query_inds=query_inds,
             joined_inds=joined_inds,
             gt_inds=gt_inds,
             rows=rows,
-            order_inds=distances.sum((-1, -2)).argmin(-1),
+            order_inds=distances.sum((-1, -2)).argmin(-1),  # (L, M)
             host_labels=labels[host_indices[-1]],
             counts=counts,
         )
@@ -244,7 +245,7 @@ def solve_assignment(
     check_finite(costs, names, img_meta=img_meta)
     repeated_costs = np.tile(costs.sum(0).numpy(), repeats)  # (N, repeats * K)
     rows, cols = linear_sum_assignment(repeated_costs)
-    num_truths = max(costs.shape[2], 1)
+    num_truths = max(costs.shape[2], 1)  # columns k, K + k, 2 K + k, .. are of ground truth k
     return torch.from_numpy(rows), torch.from_numpy(cols % num_truths)
 
 

@@ -1,4 +1,4 @@
-"""Embeddings of points, and settings that methods add to all heads."""
+"""Embeddings of points, and settings that a map model such as MGMap adds to all heads."""
 
 from collections.abc import Callable
 from typing import Any
@@ -45,10 +45,13 @@ def head_setting(name: str) -> Callable[[HeadSetting], HeadSetting]:
 
 
 def resolve_added_settings(values: PartConfig) -> PartConfig:
-    """Settings of `MapHead` that stand for added settings.
+    """Convert added settings to the settings of `MapHead` that implement them.
 
     Args:
-        values: Values of added settings, by name.
+        values: Values of the settings added with `head_setting`, by name.
+
+    Returns:
+        Settings of `MapHead`, by name.
 
     Raises:
         TypeError: If a setting does not exist.

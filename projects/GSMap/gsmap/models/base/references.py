@@ -34,7 +34,7 @@ class Reference:
 
 
 class RefinedReference(Reference):
-    """References that decoder layers refine, n per query.
+    """References that decoder layers refine, n per query: 1 of a point, P of an instance.
 
     Attributes:
         coords: Number of coordinates of a point, which are the first entries of a reference: 2 or
@@ -97,7 +97,7 @@ class RefinedReference(Reference):
         raise NotImplementedError
 
     def render(self, references: Tensor, grid: BEVGrid) -> Tensor:
-        """Render the masks of elements whose references have an extent.
+        """Render the masks of elements whose references have an extent, such as Gaussians.
 
         Args:
             references: References. (..., P, D)

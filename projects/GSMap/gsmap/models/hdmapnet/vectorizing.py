@@ -162,10 +162,11 @@ def _check(semantic: Tensor, embedding: Tensor, direction: Tensor, config: Vecto
 
 
 def top_directions(direction: Tensor) -> IntArray:
-    """Return the most probable direction of each pixel, and the most probable one not next to it.
+    """Return the two most probable directions of each pixel that are not next to each other.
 
-    The second direction is more than two steps away from the first. As in the released code, K - 1
-    and 0 do not count as neighbours.
+    The channels of the two differ by more than 2. As in the released code, the channel of no
+    direction counts as the neighbour of direction 0, and directions K - 1 and 0 do not count as
+    neighbours.
 
     Args:
         direction: Logits of no direction and of K directions. (1 + K, ...)
@@ -278,9 +279,10 @@ def sort_along_longer_side(cluster: BoolArray, ridge: BoolArray) -> IntArray:
 def order_by_distance(points: IntArray) -> IntArray:
     """Order points greedily by the distance from their predecessor, starting with the first one.
 
-    A point more than 3 px from the last one, but less than 5 px from an earlier one, is dropped as
-    part of a section that is already covered. After nine tenths of the points, a gap of more than
-    10 px ends the line.
+    A point more than 3 px from its predecessor, but less than 5 px from any of the ordered points,
+    belongs to a section that is already covered and is dropped. The predecessor is one of these
+    points, so a gap of 3 to 5 px always drops the point. After nine tenths of the points, a gap of
+    more than 10 px ends the line.
 
     Args:
         points: Pixels. (n, 2)
@@ -382,7 +384,8 @@ def _walk(
         last = remaining[nearest]
         column, row = last
         back_angle = np.rad2deg(np.arctan2(back[1], back[0])) % 360
-        # A missing direction, -1, takes part with the angle of one step below 0.
+        # As in the released code, a missing direction is a candidate for the way back, too. Its
+        # number -1 becomes the angle -degrees, so `turn` may exceed 360 and 360 - turn be negative.
         turn = np.abs(config.degrees * directions[row, column] - back_angle)
         back_way = np.minimum(turn, 360 - turn).argmin()
         is_used[row, column, back_way] = True

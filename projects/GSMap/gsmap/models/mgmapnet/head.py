@@ -57,6 +57,7 @@ class MGMapHead(MapHead):
         if "line_width_m" not in mask_settings:
             pixel_m = 2 * element_masks.half_pixel_m
             element_masks.line_width_m = LINE_WIDTH_PX * pixel_m
+        # Lists of one config, or of none if the loss is switched off.
         mean_loc = optional_part(SamplingLocationLoss, loss_mean_loc)
         ins_seg = optional_part(InstanceMaskLoss, loss_ins_seg, embed_dims=embed_dims)
         super().__init__(

@@ -21,12 +21,17 @@ from gsmap.ops.polyline_raster.reference import DISTANCE_EPS, LENGTH_EPS
 
 FAR = np.float32(np.inf)
 REACH = -math.log(1e-8)  # in units of softness; farther pixels are 0 or 1
-INTEGER_FRAME = (-0.5, -0.5, 1.0, 1.0)  # the release samples pixel (row, col) at (col, row)
+# Smallest x and y, and size of a pixel along x and y, of a raster in pixels. The centre of pixel
+# (row, col) is at (x, y) = (col, row), where the rasterizer released by Zhang et al. samples it.
+INTEGER_FRAME = (-0.5, -0.5, 1.0, 1.0)
 
 
 @njit(nogil=True, cache=True, fastmath=FASTMATH, error_model="numpy")
-def _visit_edge(start, end, index, frame, reach, eps, steps, distances, edge_indices):
-    """Update the squared distances and nearest edges of pixels (H, W) by one edge."""
+def _visit_edge(start, end, index, frame, reach, eps, columns, distances, edge_indices):
+    """Update the squared distances and nearest edges of pixels (H, W) by one edge.
+
+    ``columns`` contains 0, 1, .. W - 1 as float32.
+    """
     x_min, y_min, step_x, step_y = frame
     height, width = distances.shape
     x0 = float(start[0])
@@ -39,7 +44,7 @@ def _visit_edge(start, end, index, frame, reach, eps, steps, distances, edge_ind
     along_y = np.float32(edge_y / length2)
     ex = np.float32(edge_x)
     ey = np.float32(edge_y)
-    step = np.float32(step_x)
+    pixel_width = np.float32(step_x)
     low_y = min(y0, y0 + edge_y) - reach
     high_y = max(y0, y0 + edge_y) + reach
     low_x = min(x0, x0 + edge_x) - reach
@@ -55,12 +60,13 @@ def _visit_edge(start, end, index, frame, reach, eps, steps, distances, edge_ind
             left_x = max(left_x, crossing - half)
             right_x = min(right_x, crossing + half)
         left, right = pixel_range(left_x, right_x, origin=x_min, step=step_x, size=width)
-        nearest = distances[row, left : max(left, right)]
-        row_indices = edge_indices[row, left:right]
+        stop = max(left, right)  # without a pixel in reach, `right` may be less than `left`
+        nearest = distances[row, left:stop]
+        row_indices = edge_indices[row, left:stop]
         first = np.float32(x_min + (left + 0.5) * step_x - x0)
         fy = np.float32(offset_y)
         for k in range(len(nearest)):
-            fx = first + steps[k] * step
+            fx = first + columns[k] * pixel_width
             t = min(max(fx * along_x + fy * along_y, np.float32(0)), np.float32(1))
             dx = fx - t * ex
             dy = fy - t * ey
@@ -99,11 +105,11 @@ def _fill_inside(ring, frame, inside):
 @njit(nogil=True, cache=True)
 def _buffers(shape):
     """Buffers of a thread: column indices, squared distances, nearest edges, inside."""
-    steps = np.arange(shape[1]).astype(np.float32)
+    columns = np.arange(shape[1]).astype(np.float32)
     distances = np.empty(shape, np.float32)
     edge_indices = np.empty(shape, np.int32)
     inside = np.empty(shape, np.uint8)
-    return steps, distances, edge_indices, inside
+    return columns, distances, edge_indices, inside
 
 
 @njit(nogil=True, cache=True)
@@ -114,7 +120,7 @@ def _nearest_edges(ring, closed, filled, frame, reach, eps, buffers):
     """
     if not np.isfinite(ring).all():
         return False
-    steps, distances, edge_indices, inside = buffers
+    columns, distances, edge_indices, inside = buffers
     distances[:] = FAR
     edge_indices[:] = -1
     for i in range(len(ring) if closed else len(ring) - 1):
@@ -126,7 +132,7 @@ def _nearest_edges(ring, closed, filled, frame, reach, eps, buffers):
             frame=frame,
             reach=reach,
             eps=eps,
-            steps=steps,
+            columns=columns,
             distances=distances,
             edge_indices=edge_indices,
         )
@@ -146,8 +152,9 @@ def soft_forward(rings, polygons, reach, softness, min_distance, masks, first, l
     """Render the rings ``first`` to ``last - 1``: exp(-D / s), or sigmoid(+-D / s) for polygons.
 
     Args:
-        rings: Vertices of closed rings in pixels, float32. (N, V, 2)
-        polygons: Whether a ring is a polygon, bool. (N,)
+        rings: Vertices of closed rings in pixels, float32. The ring of a line goes along the line
+            and back. (N, V, 2)
+        polygons: Whether a ring is a polygon instead of a line, bool. (N,)
         reach: Distance in pixels beyond which a mask is 0 or 1, of lines and of polygons. (2,)
         softness: Softness s of lines and of polygons, in the unit of D. (2,)
         min_distance: 0 if D is the squared distance to the nearest edge. Otherwise D is the
@@ -199,7 +206,11 @@ def _scatter(ring, edge_index, x, y, weight, out):
     t = min(max(along, 0.0), 1.0)
     dx = fx - t * ex
     dy = fy - t * ey
-    # LENGTH_EPS moves t off the nearest point of an edge, so t has a gradient between the ends.
+    # The squared distance is D = d d with d = f - t e, the offset of the pixel from the point at t.
+    # LENGTH_EPS moves t off the nearest point: dD/dt = -2 d e = -2 t LENGTH_EPS is not 0 between
+    # the ends. With dt/de = (f - 2 t e) / length2 and dt/df = e / length2, the derivatives are
+    # dD/de = -2 t d - slip (f - 2 t e) and dD/df = 2 d - slip e. As e = end - start and
+    # f = pixel - start, the gradient is dD/de for the end and -dD/df - dD/de for the start.
     slip = 2 * t * LENGTH_EPS / length2 if 0.0 <= along <= 1.0 else 0.0
     end_x = -2 * t * dx - slip * (fx - 2 * t * ex)
     end_y = -2 * t * dy - slip * (fy - 2 * t * ey)
@@ -293,12 +304,15 @@ def draw(polylines, filled, frame, half_width, pixel, masks, first, last):
         for row in range(masks.shape[1]):
             for col in range(masks.shape[2]):
                 distance = math.sqrt(distances[row, col])
-                if kind:
+                if kind:  # the edge cuts the pixel at the signed distance from its centre
                     signed = distance if inside[row, col] else -distance
                     share = min(0.5 + signed / pixel, 1.0)
                 else:
-                    near = min((distance + half_width) / pixel, 0.5)
-                    share = near - max((distance - half_width) / pixel, -0.5)
+                    # Overlap of two intervals across the line, in pixels: the line, `half_width`
+                    # to both sides of `distance`, and the pixel, -0.5 to 0.5.
+                    high = min((distance + half_width) / pixel, 0.5)
+                    low = max((distance - half_width) / pixel, -0.5)
+                    share = high - low
                 masks[n, row, col] = max(share, 0.0)
 
 
@@ -347,7 +361,7 @@ def soft_rasters_backward(grads, rings, is_polygon, height, width, softness, pla
         plain: Whether D is the distance to the nearest edge instead of its square.
 
     Returns:
-        Gradient of the rings, float32. (n, V, 2)
+        Tuple with one entry, the gradient of the rings, float32. (n, V, 2)
     """
     out = torch.empty(rings.shape, dtype=torch.float64)
     reach = _reach(softness, plain)
