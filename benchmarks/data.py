@@ -100,7 +100,7 @@ def measure_loading(path: Path, reads: int = 5000) -> dict[str, float]:
 class PerItemGroundTruth:
     """Ground truth made for each item by a walk over all records of the map, with the devkit.
 
-    This is the method of code that makes ground truth in the data loader, for comparison with
+    Code that makes ground truth in the data loader works like this. It is compared with
     ``NuScenesLocalMap``.
 
     Args:
@@ -220,7 +220,7 @@ def per_item_orders(instances: Sequence[MapInstance], num_points: int) -> list[n
 def open_maps(
     root: Path, x_range: tuple[float, float], y_range: tuple[float, float]
 ) -> tuple[dict[str, NuScenesLocalMap], dict[str, PerItemGroundTruth]]:
-    """Open all maps of a data root with both methods.
+    """Open all maps of a data root for both ways of making ground truth.
 
     Args:
         root: Data root with the map expansion.
@@ -256,7 +256,7 @@ def measure_ground_truth(root: Path, annotations: Path, repeats: int = 3) -> dic
     Args:
         root: Data root with the map expansion.
         annotations: Annotation file with the poses.
-        repeats: Number of passes of each method over all poses; the fastest counts.
+        repeats: Number of passes of each of the two over all poses; the fastest counts.
 
     Returns:
         CPU time in milliseconds per frame (``prepared_ms``, ``per_item_ms``) and their ratio.
@@ -291,7 +291,7 @@ def measure_pipeline(config: Any, root: Path, count: int = 20) -> dict[str, floa
     """Measure the training pipeline, with ground truth from the file and made per item, in turns.
 
     Made per item means: elements from the map by a walk over its records, and their point orders
-    by one call per point, as in MapTR's data set. Both methods share the transforms of images.
+    by one call per point, as in MapTR's data set. Both share the transforms of images.
 
     Args:
         config: Config of a ``VectorizedMapDataset``.

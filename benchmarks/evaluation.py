@@ -90,7 +90,7 @@ def generated_frames(
     for number in range(count):
         truths = []
         preds = []
-        for label, max_count in ((0, 12), (1, 4), (2, 7)):
+        for label, max_count in ((0, 12), (1, 4), (2, 7)):  # most elements of each class
             for _ in range(rng.integers(max_count + 1)):
                 line = _random_element(rng, label) * stretch
                 truths.append({"label": label, "pts": np.round(line, 3).tolist()})
@@ -267,7 +267,7 @@ def _reference_table(frames: list[Record], count: int, grid: BEVGrid) -> str:
         reference_map = evaluate_by_reference()
         reference_ms = (time.process_time() - start) / count * 1e3
         if name == "raster" and not reference.FILLS_AS_RELEASED:
-            # This OpenCV's pixels differ from the released figures'.
+            # This version of OpenCV fills other pixels than the version of the published figures.
             reference_map = reference.raster_map(samples, raster, by_opencv=False)
         start = time.process_time()
         matches = []

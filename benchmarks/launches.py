@@ -24,7 +24,8 @@ from gsmap.engine.figures import keep_figures
 from gsmap.engine.launch import read_config
 from gsmap.utils.errors import WorkError
 
-# Attribute of the detector, method of the attribute, and name of the part.
+# Parts of the program that are counted separately: attribute of the detector (empty for the
+# detector itself), name of the attribute's method, and name of the part.
 PARTS = (
     ("data_preprocessor", "forward", "preprocessor"),
     ("", "extract_img_feats", "backbone, neck"),

@@ -209,7 +209,7 @@ def model_and_batch(
 
 
 def advance_samples(samples: Sequence[Det3DDataSample]) -> None:
-    """Advance samples by half a second and 4 m, in place, for models with memory."""
+    """Advance samples by half a second and 4 m, in place, for models with temporal memory."""
     step = rigid(np.eye(3), [0.0, 4.0, 0.0])
     for sample in samples:
         sample.set_metainfo(

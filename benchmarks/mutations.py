@@ -1,9 +1,10 @@
 """Share of small changes of the code that the tests detect (mutation testing).
 
 Each mutant changes one place of one module: a comparison, a sign, a number, a truth value, `min` or
-`max`, `and` or `or`, a `not`. The test files of the room that import the module run on the mutant,
-and if none of them fails, all other test files of the room. A mutant exists in the memory of a
-child process alone: no file changes.
+`max`, `and` or `or`, a `not`. A room is a package, or a folder of the package ``gsmap``, that has a
+folder of tests. The test files of the room that import the module run on the mutant, and if none of
+them fails, all other test files of the room. A mutant exists in the memory of a child process
+alone: no file changes.
 """
 
 import argparse

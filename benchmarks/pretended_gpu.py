@@ -132,7 +132,8 @@ class PretendedGPU(TorchDispatchMode):
     """Context in which the device can be used, with counts of its work.
 
     Attributes:
-        launches: Number of kernels and copies, by part and operation.
+        launches: Number of kernels and copies, by part (a section that the caller names with
+            `part`) and operation.
         waits: Number of waits of the host, by part, reason and line.
     """
 
@@ -470,9 +471,7 @@ def _attention(
     is_causal: bool = False,
     **kwargs: Any,
 ) -> Tensor:
-    """Compute scaled dot-product attention.
-
-    On the pretended GPU, all calls launch torch's memory-efficient kernel, which supports masks.
+    """Compute attention; on the pretended GPU by torch's memory-efficient kernel, for any mask.
 
     Args:
         query: Queries. (B, heads, N, C)

@@ -28,7 +28,8 @@ NOISE_M = 0.25  # standard deviation of a predicted line across its direction
 MISSED = 0.15  # share of the lines that a frame does not predict
 FALSE = 0.3  # lines that a frame predicts in addition, on average
 WIDTH_M = 0.6  # of lines in rasters and in the truth
-_LINES = ((-7.0, 1), (-3.5, 0), (0.0, 0), (3.5, 0), (7.0, 1))  # beside the road, and class
+# Offset of each line in metres, positive to the right of the road, and its class.
+_LINES = ((-7.0, 1), (-3.5, 0), (0.0, 0), (3.5, 0), (7.0, 1))
 _NUM_POINTS = 20  # of a predicted line
 Frame = tuple[NDArray[np.float64], MapElements]
 """Pose (4, 4) and elements in the frame."""
@@ -73,7 +74,7 @@ def elements_in_range(
     labels = []
     for line, label in lines:
         is_near = np.abs(line - pose[:2, 3]).max(axis=1) < 60
-        local = (line[is_near] - pose[:2, 3]) @ pose[:2, :2]
+        local = (line[is_near] - pose[:2, 3]) @ pose[:2, :2]  # rows @ R: the inverse rotation
         for piece in clip_to_box(local, GRID.x_range, GRID.y_range):
             pieces.append(piece)
             labels.append(label)

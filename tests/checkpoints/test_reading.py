@@ -271,9 +271,9 @@ def test_a_checkpoint_with_packed_parts_is_refused(tmp_path):
     ):
         for name in source.namelist():
             target.writestr(name, source.read(name))
-    with pytest.raises(ValueError, match=r"b.pth .*is packed, as torch packs nothing"):
+    with pytest.raises(ValueError, match=r"b.pth .*is compressed, which torch never does"):
         read_checked(packed)
-    with pytest.raises(ValueError, match=r"b.pth .*is packed, as torch packs nothing"):
+    with pytest.raises(ValueError, match=r"b.pth .*is compressed, which torch never does"):
         load_from_file(str(packed))
 
 

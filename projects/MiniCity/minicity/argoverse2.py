@@ -167,6 +167,7 @@ def height_grid(
     known = np.isfinite(part) & shapely.contains_xy(trusted, grid_x, y=grid_y)
     if not known.any():
         raise InputError(f"no ground height is known on the road inside {bounds}.")
+    # Indices (row, column) of the nearest known cell of each cell. (2, rows, columns)
     nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
     filled = ndimage.gaussian_filter(part[tuple(nearest)], sigma=HEIGHT_SMOOTHING_M / cell_m)
     return HeightGrid(origin, cell_m, height_m=filled)

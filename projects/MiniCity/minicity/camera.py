@@ -83,6 +83,6 @@ def clip_near(polygon: Array, near_m: float = NEAR_M) -> Array:
     for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
         if a[2] >= near_m:
             corners.append(a)
-        if (a[2] >= near_m) != (b[2] >= near_m):
+        if (a[2] >= near_m) != (b[2] >= near_m):  # the edge from a to b crosses the plane
             corners.append(a + (near_m - a[2]) / (b[2] - a[2]) * (b - a))
     return np.array(corners).reshape(-1, 3)

@@ -31,14 +31,15 @@ def pose_messages(
     before = np.array([world_from_ego(float(t - STEP_S)) for t in times])
     now = np.array([world_from_ego(float(t)) for t in times])
     after = np.array([world_from_ego(float(t + STEP_S)) for t in times])
-    car_from_world = np.swapaxes(now[:, :3, :3], 1, 2)
+    car_from_world = np.swapaxes(now[:, :3, :3], 1, 2)  # the inverse of a rotation: its transpose
     velocity = (after[:, :3, 3] - before[:, :3, 3]) / (2 * STEP_S)
     motion = (after[:, :3, 3] - 2 * now[:, :3, 3] + before[:, :3, 3]) / STEP_S**2
     acceleration = motion + np.array([0.0, 0.0, GRAVITY])
     rotation = Rotation.from_matrix(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
+    quaternions = Rotation.from_matrix(now[:, :3, :3]).as_quat()  # x, y, z, w
     fields = {
         "pos": now[:, :3, 3],
-        "orientation": Rotation.from_matrix(now[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]],
+        "orientation": quaternions[:, [3, 0, 1, 2]],  # w, x, y, z
         "vel": np.einsum("nij,nj->ni", car_from_world, velocity),
         "accel": np.einsum("nij,nj->ni", car_from_world, acceleration),
         "rotation_rate": rotation.as_rotvec() / (2 * STEP_S),

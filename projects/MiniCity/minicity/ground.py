@@ -51,6 +51,8 @@ def ground_from_pixel(camera: Camera, ground_z_m: float) -> Array:
     ray = camera.world_from_pixel
     x, y, z = camera.center
     height = z - ground_z_m
+    # A ray (rx, ry, rz) meets the plane at x - height * rx / rz and y - height * ry / rz. In
+    # homogeneous coordinates, the point is multiplied by rz.
     return np.stack([x * ray[2] - height * ray[0], y * ray[2] - height * ray[1], ray[2]])
 
 
@@ -97,7 +99,7 @@ def make_bands(footprints: Footprints, resolution_m: float, num_levels: int) -> 
     fit = np.floor(np.log2(np.maximum(target / resolution_m, 1.0) * 1.2))
     levels = np.clip(fit, 0, num_levels - 1).astype(int)
     counts = np.clip(np.ceil(footprints.along / (resolution_m * 2.0**levels)), 1, MAX_SAMPLES)
-    samples = (2 ** np.ceil(np.log2(counts))).astype(int)
+    samples = (2 ** np.ceil(np.log2(counts))).astype(int)  # rounded up to a power of two
     bands: list[Band] = []
     for row in np.flatnonzero(footprints.visible).tolist():
         level = int(levels[row])
@@ -113,7 +115,7 @@ def make_bands(footprints: Footprints, resolution_m: float, num_levels: int) -> 
 def _texture_from_world(texture: GroundTexture, level: int) -> Array:
     """Transform from world x, y in metres to pixels of a texture level. (3, 3)"""
     scale = 1.0 / (texture.resolution_m * 2**level)
-    x, y = -texture.origin * scale - 0.5
+    x, y = -texture.origin * scale - 0.5  # the centre of pixel (0, 0) is at (0, 0)
     return np.array([[scale, 0, x], [0, scale, y], [0, 0, 1.0]])
 
 

@@ -91,7 +91,7 @@ def make_junction(node: int, arms: list[tuple[int, bool]], roads: list[Road]) ->
             pull=1.0 + 0.25 * turn_rad,
         )
         corners.append(corner)
-        ring += [mouths[i], corner[1:-1]]
+        ring += [mouths[i], corner[1:-1]]  # a corner starts and ends with points of the mouths
     return Junction(node, np.concatenate(ring), corners=corners, arms=arms)
 
 
@@ -135,6 +135,7 @@ def make_connectors(junction: Junction, lanes_by_road: dict[int, list[Lane]]) ->
     outgoing: dict[int, list[Lane]] = {}
     for r, at_start in junction.arms:
         for lane in lanes_by_road[r]:
+            # Forward lanes lead away from a junction at the start of the road.
             is_incoming = lane.forward != at_start
             lanes = incoming if is_incoming else outgoing
             lanes.setdefault(r, []).append(lane)

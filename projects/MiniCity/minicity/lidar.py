@@ -127,6 +127,6 @@ def scan(
     ground_intensity = texture.sample_reflectivity(world[:, :2]).astype(float)
     intensity = np.where(point_box >= 0, tint[point_box], ground_intensity)
     intensity = intensity + rng.normal(loc=0, scale=2.0, size=len(rows))
-    local_points = (world - origin) @ world_from_lidar[:3, :3]
+    local_points = (world - origin) @ world_from_lidar[:3, :3]  # rows @ R: the inverse rotation
     cloud = np.column_stack([local_points, np.clip(np.round(intensity), 0, 255), rows])
     return cloud.astype(np.float32)

@@ -165,7 +165,7 @@ def finish(image: Image, lighting: Lighting, rng: np.random.Generator) -> Image:
         The finished picture, BGR. (H, W, 3)
     """
     table = np.clip(np.arange(256)[:, None] * np.array(lighting.gain), 0, 255).astype(np.uint8)
-    image = cv2.LUT(image, np.ascontiguousarray(table[:, None]))
+    image = cv2.LUT(image, np.ascontiguousarray(table[:, None]))  # table as (256, 1, 3)
     if lighting.streaks:
         _draw_streaks(image, lighting, rng=rng)
     rows, columns = image.shape[:2]
@@ -175,7 +175,7 @@ def finish(image: Image, lighting: Lighting, rng: np.random.Generator) -> Image:
     bottom = top + rows
     right = left + columns
     if bottom > NOISE_PX or right > NOISE_PX:
-        repeats = (-(-bottom // NOISE_PX), -(-right // NOISE_PX), 1)
+        repeats = (-(-bottom // NOISE_PX), -(-right // NOISE_PX), 1)  # quotients rounded up
         tile = np.tile(tile, repeats)
     return cv2.add(image, tile[top:bottom, left:right], dtype=cv2.CV_8U)
 

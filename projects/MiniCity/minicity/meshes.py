@@ -12,7 +12,7 @@ WINDOW_PITCH_M = 3.4
 STOREY_M = 3.0
 TRUNK_M = 0.28
 POLE_M = 0.16
-BARK = (48.0, 62.0, 78.0)
+BARK = (48.0, 62.0, 78.0)  # BGR
 # Discs of a crown: x, y, z offsets in crown radii, then brightness.
 CROWN = (
     (0.0, 0.0, 0.0, 0.8),
@@ -20,7 +20,7 @@ CROWN = (
     (-0.5, 0.5, 0.1, 1.0),
     (0.1, -0.6, 0.3, 1.1),
 )
-Color = tuple[float, float, float]
+Color = tuple[float, float, float]  # BGR in [0, 255]
 
 
 @dataclass
@@ -167,7 +167,7 @@ def prism_faces(base: Array, low_m: float, high_m: float, top_scale: float = 1.0
     middle = base.mean(axis=0)
     low = np.column_stack([base, np.full(4, low_m)])
     high = np.column_stack([middle + top_scale * (base - middle), np.full(4, high_m)])
-    following = [1, 2, 3, 0]
+    following = [1, 2, 3, 0]  # the next corner of each corner
     sides = np.stack([low, low[following], high[following], high], axis=1)
     return np.concatenate([sides, high[None]])
 
@@ -231,7 +231,7 @@ def add_building(mesh: Mesh, building: Building, lit_windows: bool = False) -> N
     for wall in walls:
         mesh.add_quad(wall, building.color)
         columns = max(1, int(np.linalg.norm(wall[1] - wall[0]) / WINDOW_PITCH_M))
-        storey, column = np.mgrid[:storeys, :columns].reshape(2, -1)
+        storey, column = np.mgrid[:storeys, :columns].reshape(2, -1)  # of each window
         windows = patches(
             wall,
             left=(column + 0.25) / columns,

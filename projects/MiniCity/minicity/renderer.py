@@ -145,7 +145,7 @@ def _shade_under(image: Image, camera: Camera, vehicles: list[Vehicle], lighting
     mask: Image | None = None
     light = LIGHT_IN_SHADOW if lighting.shadow > 0 else LIGHT_UNDER_VEHICLES
     shade = 255 * light
-    forward = camera.cam_from_world[2, :3]
+    forward = camera.cam_from_world[2, :3]  # optical axis in the world
     for vehicle in vehicles:
         sight = vehicle.center - camera.center
         if np.hypot(sight[0], sight[1]) > SHADOW_FAR_M or sight @ forward < -SMALL_RADIUS_M:
@@ -183,13 +183,13 @@ def vehicle_shadow(vehicle: Vehicle, lighting: Lighting) -> Array:
     c = np.cos(vehicle.yaw_rad)
     s = np.sin(vehicle.yaw_rad)
     half = 0.5 * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * vehicle.size[:2]
-    base = half @ np.array([[c, s], [-s, c]]) + vehicle.center[:2]
+    base = half @ np.array([[c, s], [-s, c]]) + vehicle.center[:2]  # corners (4, 2), turned by yaw
     if lighting.shadow <= 0:
         return base
     height = vehicle.size[2]
     shadow_shift = -lighting.sun[:2] / max(float(lighting.sun[2]), LOWEST_SUN) * height
     hull = cv2.convexHull(np.concatenate([base, base + shadow_shift]).astype(np.float32))
-    return hull[:, 0].astype(float)
+    return hull[:, 0].astype(float)  # OpenCV returns (n, 1, 2)
 
 
 def _fixed_point(px: Array) -> NDArray[np.int32]:
@@ -276,6 +276,7 @@ def _visible_quads(
         return
     corners = camera.to_camera(mesh.quads[index])
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0])
+    # Camera coordinates start at the camera, so `corners` are directions of sight.
     facing = np.einsum("ij,ij->i", normals, corners[:, 0]) < 0
     in_front = (corners[..., 2] > NEAR_M).any(axis=1)
     candidates = facing & in_front
@@ -283,6 +284,7 @@ def _visible_quads(
     corners = corners[candidates]
     normals = normals[candidates]
     whole = (corners[..., 2] > NEAR_M).all(axis=1)  # no corner behind the near plane
+    # Other quads get an arbitrary point in front of the camera here, and are clipped below.
     px = camera.to_pixels(np.where(whole[:, None, None], corners, [0.0, 0.0, 1.0]))
     low = px.min(axis=1)
     high = px.max(axis=1)
@@ -334,7 +336,7 @@ def _shade_faces(
         Shaded colours, BGR. (F, 3)
     """
     unit = normals_cam / np.maximum(np.linalg.norm(normals_cam, axis=1, keepdims=True), 1e-9)
-    up = camera.cam_from_world[:3, 2]
+    up = camera.cam_from_world[:3, 2]  # z axis of the world in the camera frame
     sun = camera.cam_from_world[:3, :3] @ lighting.sun
     from_sky = lighting.ambient * (1 - TOP_LIGHT + TOP_LIGHT * unit @ up)
     from_sun = lighting.direct * np.maximum(unit @ sun, 0)
@@ -371,7 +373,7 @@ def _visible_discs(
         group = int(mesh.disc_groups[index[k]])
         depth = float(np.linalg.norm(centers[k]))
         yield _Drawable(
-            order=(1, -float(distance[group]), 9, -depth),
+            order=(1, -float(distance[group]), 9, -depth),  # above all layers of quads
             group=group,
             polygon=None,
             disc=(round(x * scale), round(y * scale), round(radius * scale)),
@@ -419,6 +421,8 @@ def occlusion_mask(
     end = mesh.quads[walls, 1, :2]
     wall = end - start
     sight = mesh.anchors[small, :2] - eye
+    # Sight and wall cross where along_sight * sight = gap + along_wall * wall. The cross product of
+    # both sides with the wall gives `along_sight`, with the sight it gives `along_wall`.
     cross = sight[:, None, 0] * wall[None, :, 1] - sight[:, None, 1] * wall[None, :, 0]
     cross = np.where(np.abs(cross) < 1e-9, 1e-9, cross)
     gap = start - eye

@@ -275,7 +275,7 @@ class Road:
                 road=self.index,
                 forward=False,
                 index=i,
-                center=self.line(0.5 * (inner + outer))[::-1],
+                center=self.line(0.5 * (inner + outer))[::-1],  # against the centre line
                 start_node=self.end_node,
                 end_node=self.start_node,
             )

@@ -56,8 +56,8 @@ class SceneTask:
         index_in_town: Number of the street within the town; scenes of one street share it.
         route: Name of the first scene on this street, whose random numbers choose the drive.
         pass_index: Number of earlier passes of the street.
-        expansion: Name of the map file: the location or, before streets are repainted, a name of
-            its own.
+        expansion: Name of the map file: the location or, before streets are repainted, a name that
+            differs from the location.
     """
 
     name: str

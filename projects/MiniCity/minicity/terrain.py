@@ -31,7 +31,7 @@ def sample_height(grid: HeightGrid, points: Array) -> Array:
     cells = ((points - grid.origin) / grid.cell_m).reshape(-1, 2).astype(np.float32)
     count = len(cells)
     # cv2.remap takes no side longer than 32767, so the list is folded into rows.
-    rows = -(-count // _ROW)
+    rows = -(-count // _ROW)  # rounded up
     folded = np.zeros((rows, _ROW, 2), dtype=np.float32)
     folded.reshape(-1, 2)[:count] = cells
     heights = cv2.remap(
@@ -76,16 +76,18 @@ class Terrain:
             Distances in metres; about ``FARTHEST_M`` for rays above the skyline. (h, c)
         """
         reach = np.empty((len(rows), len(self.columns)))
+        # Rows descend with the distance. np.interp needs ascending ones, hence both are reversed.
         for i, profile in enumerate(self.lowest_row.T):
             reach[:, i] = np.interp(rows, profile[::-1], self.distances_m[::-1])
         direction, fall = self._rays(rows)
         eye = self.camera.center
+        # Newton's method for the distance at which the ray is 0 m above the ground.
         for _ in range(NEWTON_STEPS):
             step = 0.02 * reach + 0.02
             here = sample_height(self.grid, eye[:2] + reach[..., None] * direction)
             ahead = sample_height(self.grid, eye[:2] + (reach + step)[..., None] * direction)
             above = eye[2] + reach * fall - here
-            closing = fall - (ahead - here) / step
+            closing = fall - (ahead - here) / step  # derivative of `above` by the distance
             move = -above / np.where(np.abs(closing) < 1e-3, -1e-3, closing)
             reach = np.clip(reach + np.clip(move, -0.1 * reach, 0.1 * reach), 0.1, FARTHEST_M)
         return reach
@@ -149,6 +151,8 @@ def make_terrain(camera: Camera, grid: HeightGrid) -> Terrain:
     points_cam = camera.to_camera(world)
     in_front = points_cam[..., 2] > NEAR_M
     rows = camera.to_pixels(np.where(in_front[..., None], points_cam, [0.0, 0.0, 1.0]))[..., 1]
+    # Rows of ground that is behind the camera or far below the image: they still descend with the
+    # distance.
     below_image = 10.0 * camera.height + 10.0 * np.geomspace(1.0, 0.1, num=RINGS)[:, None]
     rows = np.where(in_front, np.minimum(rows, below_image), below_image)
     return Terrain(

@@ -74,13 +74,13 @@ def _noise_tiles() -> tuple[Image, Image]:
 def _tile_noise(tile: Image, shape: tuple[int, int], start: list[int]) -> Image:
     """Repeat a periodic tile to (rows, columns) pixels, from an offset (row, column). (H, W)"""
     shifted = np.roll(tile, (start[0], start[1]), axis=(0, 1))
-    repeats = [-(-n // TILE_PX) for n in shape]
+    repeats = [-(-n // TILE_PX) for n in shape]  # rounded up
     return np.tile(shifted, repeats)[: shape[0], : shape[1]]
 
 
 def _fixed_point_pixels(points: Array, origin: Array, resolution_m: float) -> NDArray[np.int32]:
     """Pixels of world points in OpenCV's fixed-point format. (n, 2) or (n, 3) -> (n, 2)"""
-    px = (np.asarray(points)[:, :2] - origin) / resolution_m - 0.5
+    px = (np.asarray(points)[:, :2] - origin) / resolution_m - 0.5  # 0 at a pixel's centre
     return np.round(px * (1 << SHIFT)).astype(np.int32)
 
 
@@ -164,7 +164,7 @@ def _paint_kerbs(color: Image, scene: SceneMap, origin: Array, resolution_m: flo
     """Draw the kerbs of a scene in an image (H, W, 3): a light band with a dark gutter in it."""
     for line in scene.kerbs:
         px = _fixed_point_pixels(line, origin, resolution_m)
-        for width_m, shade in ((0.34, (172, 178, 180)), (0.1, (58, 58, 58))):
+        for width_m, shade in ((0.34, (172, 178, 180)), (0.1, (58, 58, 58))):  # BGR
             cv2.polylines(
                 color,
                 [px],
@@ -196,9 +196,9 @@ def _paint_coat(
         return None
     # Drawn twice as fine and averaged: OpenCV rounds level edges to whole pixels.
     px = [_fixed_point_pixels(outline, origin, resolution_m / 2) for outline in outlines]
-    all_px = np.concatenate(px) >> (SHIFT + 1)
+    all_px = np.concatenate(px) >> (SHIFT + 1)  # whole pixels of the texture
     low = np.maximum(all_px.min(axis=0) - 2, 0)
-    high = np.minimum(all_px.max(axis=0) + 3, blotches.shape[::-1])
+    high = np.minimum(all_px.max(axis=0) + 3, blotches.shape[::-1])  # columns, rows
     if (high <= low).any():
         return None
     left, top = low.tolist()
@@ -252,7 +252,8 @@ def darken(texture: GroundTexture, outlines: list[Array], strength: float) -> Gr
     light = cv2.blur(light, (size, size))
     levels = []
     for level in texture.levels:
-        small = cv2.resize(light, level.shape[1::-1], interpolation=cv2.INTER_AREA)
+        level_size = level.shape[1::-1]  # (columns, rows)
+        small = cv2.resize(light, level_size, interpolation=cv2.INTER_AREA)
         levels.append(cv2.multiply(level, cv2.merge([small] * 3), scale=1 / 255))
     return GroundTexture(
         origin=texture.origin,

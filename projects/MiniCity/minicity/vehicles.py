@@ -9,6 +9,7 @@ from minicity.curves import Array, rectangle
 from minicity.meshes import Color, FrozenMesh, Mesh, patch, prism_faces
 
 Size = tuple[float, float, float]  # length, width, height in metres
+# Colours are BGR.
 TYRES: Color = (34.0, 34.0, 34.0)
 GLASS: Color = (74.0, 62.0, 53.0)
 TROUSERS: Color = (70.0, 58.0, 52.0)
@@ -135,7 +136,8 @@ def vehicle_mesh(vehicles: list[Vehicle]) -> FrozenMesh:
     quads = np.concatenate([t.quads for t in templates])
     discs = np.concatenate([t.discs for t in templates])
     discs[:, :3] += floor[disc_groups]
-    turned_quads = np.einsum("fij,fkj->fki", turn[quad_groups], quads)  # (F, 4, 3)
+    # Rotation of each of the four corners of a quad. (F, 4, 3)
+    turned_quads = np.einsum("fij,fkj->fki", turn[quad_groups], quads)
     world_quads = turned_quads + floor[quad_groups][:, None]
     return FrozenMesh(
         quads=world_quads,

@@ -106,7 +106,9 @@ def test_channels_that_hold_no_code_are_refused():
 
 
 def test_embeddings_of_points_from_their_instance_are_refused():
-    with pytest.raises(ValueError, match="MapQRDecoder has queries of instances, no embeddings"):
+    with pytest.raises(
+        ValueError, match="MapQRDecoder has instance queries, which need no embeddings"
+    ):
         mapqr({**HEAD, "points_from_instances": True})
     with pytest.raises(ValueError, match="leave out point_queries"):
         mapqr({**HEAD, "point_queries": {"type": "PointsOfInstances"}})

@@ -28,7 +28,7 @@ _ABSENT_TYPE = re.compile(r"(\S+) is not in the .+? registry")
 
 
 class _Part(NamedTuple):
-    """Part of a config under construction.
+    """Part of a config under construction: settings with a ``type``, or an object of the runner.
 
     Attributes:
         registry: Registry that builds the part; None for a part that the runner builds itself.

@@ -1,4 +1,4 @@
-"""Key maps of all methods, between the state keys of releases and of this project."""
+"""Key maps of all map models, between the state keys of their authors' code and of this project."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -13,16 +13,16 @@ from gsmap.utils.errors import InputError
 
 @cache
 def key_maps() -> tuple[KeyMap, ...]:
-    """Key maps of all methods, the most special first; maps without markers are last.
+    """Key maps of all map models in `METHODS`, the most special first; maps without markers last.
 
-    ``gsmap/models/<method>/keys.py`` has the maps of a method in ``KEY_MAPS``. A method without
-    such a file has no release.
+    ``gsmap/models/<method>/keys.py`` has the maps of a model in ``KEY_MAPS``. A model without such
+    a file has no published checkpoints.
     """
     num_users: Counter[str] = Counter()
     for method in METHODS:
         num_users.update(method.built_on)
-    # A method comes after the methods that build on it. Between unrelated methods, the later one
-    # in METHODS is more special; sorting keeps the reversed order of equal counts.
+    # A model comes after the models that build on it. Between unrelated models, the later one in
+    # METHODS is more special; sorting keeps the reversed order of equal counts.
     methods = sorted(reversed(METHODS), key=lambda method: num_users[method.name])
     maps: list[KeyMap] = []
     for method in methods:

@@ -23,7 +23,7 @@ class KeyMap:
             upstream's format writes; None for a key that only some upstream models have. They take
             precedence over ``rules``.
         markers: Key prefixes in pairs (upstream, here). If all of them are present, the keys
-            belong to this architecture, not to a method that it is built on. The empty prefix of
+            belong to this architecture, not to one that it is built on. The empty prefix of
             the default is present in every key.
         ignored_pattern: Regular expression of further upstream keys without a counterpart, which
             conversion back leaves out. The default matches nothing.

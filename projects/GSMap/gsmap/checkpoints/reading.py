@@ -147,7 +147,7 @@ def load_tensors(path: str | Path, map_location: Any = "cpu") -> Any:
             for part in archive.infolist():
                 if part.compress_type != zipfile.ZIP_STORED:
                     name = f"{part.filename!r:.60}"
-                    raise InputError(f"{name} in it is packed, as torch packs nothing")
+                    raise InputError(f"{name} in it is compressed, which torch never does")
                 total += part.file_size
             if total > Path(path).stat().st_size:
                 raise InputError(f"its parts overlap: they have {total} bytes in all")
@@ -353,7 +353,7 @@ def _build_settings(
 
 
 def _with_elements_of(settings: dict[str, Any], config: dict[str, Any]) -> dict[str, Any]:
-    """Take the memory of elements from the config, since it is not trained.
+    """Take ``temporal.elements``, the memory of map elements, from the config: it has no weights.
 
     Args:
         settings: Settings of the model in a checkpoint.

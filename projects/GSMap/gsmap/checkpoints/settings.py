@@ -59,7 +59,7 @@ def scale_steps(cfg: Config, *parts: str) -> list[ConfigDict]:
 
     Args:
         cfg: The config.
-        parts: ``"train"``, ``"val"`` or ``"test"``.
+        parts: Splits of the pipelines, ``"train"``, ``"val"`` or ``"test"``.
     """
     return [step for step in pipeline_steps(cfg, *parts) if step.get("type") == "ScaleImages"]
 
@@ -69,7 +69,7 @@ def pipeline_steps(cfg: Config, *parts: str) -> list[ConfigDict]:
 
     Args:
         cfg: The config.
-        parts: ``"train"``, ``"val"`` or ``"test"``.
+        parts: Splits of the pipelines, ``"train"``, ``"val"`` or ``"test"``.
     """
     steps: list[ConfigDict] = []
     for part in parts:
@@ -86,7 +86,7 @@ def check_settings(settings: Any, config: dict[str, Any]) -> dict[str, Any]:
 
     mmengine imports the module of a type that is not registered. Some registered classes of other
     packages run a string as code, or read the file that it names. Therefore a type must be
-    registered, and must be a part of this project, a layer of torch or a type of the config. Other
+    registered, and must be a class of this project, a layer of torch or a type of the config. Other
     strings must be plain words or strings of the config.
 
     Args:
@@ -165,7 +165,8 @@ def _check_type(kind: Any, name: str, known: set[str]) -> Any:
     is_trusted = module.startswith(("gsmap.", "torch.nn.")) or kind in known
     if registered_class is None or not is_trusted:
         raise InputError(
-            f"{name} is {kind!r:.60}, which is no class of this project or torch.nn, nor in the config"
+            f"{name} is {kind!r:.60}, which is neither a class of this project or of torch.nn nor "
+            "in the config"
         )
     return kind
 

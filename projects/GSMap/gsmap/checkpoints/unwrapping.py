@@ -108,8 +108,8 @@ def _describe_contents(content: Any) -> str:
         names = [key for key in content if isinstance(key, str)]
         keys = f"has the keys {names[:_MAX_KEYS_SHOWN]!r:.300}" if names else "has no key"
     return (
-        f"holds no state dict of tensors: it {keys}, and weights lie in it as they are, or "
-        f"under {', '.join(WRAPPERS)}: give a training checkpoint"
+        f"holds no state dict of tensors: it {keys}, and weights must be its entries or "
+        f"be under {', '.join(WRAPPERS)}: give a training checkpoint"
     )
 
 

@@ -64,7 +64,7 @@ def elements_of_predictions(instances: Any) -> MapElements:
     Args:
         instances: ``pts`` in metres in the annotation frame (N, P, 2), ``labels_3d`` (N,) and
             ``scores_3d`` (N,). If the elements have different numbers of points, also ``num_pts``
-            (N,). If the method predicts Gaussians, also ``scales`` in metres (N, P, 2) and
+            (N,). If the model predicts Gaussians, also ``scales`` in metres (N, P, 2) and
             ``rotations`` in radians (N, P).
 
     Raises:

@@ -46,9 +46,10 @@ _PRIOR_PROBABILITY = 0.01
 class MapHead(LossHead):
     """Head that predicts N map elements of P ordered points from BEV features.
 
-    Map models are combinations of its parts: decoder, references, losses and others. Point queries are the sums of embeddings of instances and
-    points (MapTR); half of their channels are positional. The decoder refines the queries, and the
-    predictions of its layers are matched with the ground truth for the losses.
+    Map models are combinations of its parts: decoder, references, losses and others. Point queries
+    are the sums of embeddings of instances and points (MapTR); half of their channels are
+    positional. The decoder refines the queries, and the predictions of its layers are matched with
+    the ground truth for the losses.
 
     Args:
         grid: Extent of the map.
@@ -129,8 +130,8 @@ class MapHead(LossHead):
         )
         if point_queries is not None and not self.decoder.point_queries:
             raise InputError(
-                f"{type(self.decoder).__name__} has queries of instances, no embeddings of points: "
-                f"leave out {', '.join(settings) or 'point_queries'}."
+                f"{type(self.decoder).__name__} has instance queries, which need no embeddings of "
+                f"points: leave out {', '.join(settings) or 'point_queries'}."
             )
         self.instance_embedding = nn.Embedding(num_instances, 2 * embed_dims)
         self.pts_embedding: nn.Module | None = None
@@ -282,8 +283,8 @@ class MapHead(LossHead):
         state[key] = torch.cat([common, missing])
         print_log(
             f"{key}: the checkpoint has {len(loaded)} instance queries, the model "
-            f"{len(initial)}; the {num_predicting} that predict are taken, the further ones cut "
-            "off or left as new.",
+            f"{len(initial)}; the {num_predicting} that predict are loaded, the others are "
+            "cut off or keep their initial values.",
             logger="current",
             level=logging.WARNING,
         )

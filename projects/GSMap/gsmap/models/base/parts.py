@@ -1,4 +1,7 @@
-"""Configs of the parts of a head, and checks of the built parts."""
+"""Configs of the parts of a head, and checks of the built parts.
+
+A part is an object that a head is composed of, such as its decoder, a loss or a matching cost.
+"""
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType

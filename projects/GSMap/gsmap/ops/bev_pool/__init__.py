@@ -18,8 +18,8 @@ from gsmap.utils.errors import InputError
 def cell_indices(points_m: Tensor, grid: BEVGrid, z_range: tuple[float, float]) -> Tensor:
     """Find the grid cell of each point.
 
-    Indices are truncated towards zero, as released: points up to one cell below the lower edge
-    count into index 0.
+    Indices are truncated towards zero, as in the released code of Lift-Splat-Shoot: points up to
+    one cell below the lower edge count into index 0.
 
     Args:
         points_m: Points (x, y, z) in metres, in the frame of ``grid``. (..., 3)
@@ -113,7 +113,9 @@ def bev_pool_conv3x3(
     table = context.permute(0, 1, 3, 4, 2).flatten(0, 3) @ taps  # (B V h w, 9 O)
     table = table.view(-1, weight.shape[0])  # row = pixel * 9 + tap
     starts = counts.flatten().cumsum(0).view_as(counts) - counts  # (B, H, W)
-    # The nine neighbours of each cell, in the order of the filter, as ranges of the sorted points.
+    # The points of the nine neighbours of each cell, in the order of the filter, as ranges of the
+    # sorted points. `order` lists the points of all ranges: the number of a point among the listed
+    # ones, minus the number of the first one of its range, plus the start of the range.
     lengths = _neighbours(counts)
     firsts = _neighbours(starts)
     total = int(lengths.sum())

@@ -3,7 +3,7 @@
 """Weighted sums of table rows on a CPU: torch's forward pass with a fused backward pass (numba).
 
 The backward pass of torch sorts all indices and walks the table twice. This one adds the gradient
-of each bag to its rows in order, in one thread, so repeated runs are equal to the bit.
+of each sum to its rows in order, in one thread, so repeated runs are equal to the bit.
 """
 
 import torch
@@ -25,14 +25,14 @@ def scatter_rows(grads, table, weights, rows, grad_table, grad_weights):
         grad_table: Output, to which the gradient of the table is added. (R, C)
         grad_weights: Output for the gradient of the weights. (n, S)
     """
-    for bag in range(rows.shape[0]):
+    for bag in range(rows.shape[0]):  # a bag is one sum, as in torch's embedding_bag
         grad = grads[bag]
         for s in range(rows.shape[1]):
             row = rows[bag, s]
             weight = weights[bag, s]
             source = table[row]
             target = grad_table[row]
-            total = grad[0] * 0
+            total = grad[0] * 0  # zero in the type of the gradient
             for c in range(len(grad)):
                 total += grad[c] * source[c]
             for c in range(len(grad)):

@@ -53,6 +53,7 @@ def exp2_float32(x):
     whole = np.int32(x - HALF)  # rounded to the nearest, as x <= 0
     part = x - np.float32(whole)
     power = ((((C5 * part + C4) * part + C3) * part + C2) * part + C1) * part + C0
+    # The bits of a float32 with exponent field whole + BIAS and mantissa 0 are those of 2^whole.
     return power * np.int32((whole + BIAS) << MANTISSA_BITS).view(np.float32)
 
 
@@ -109,7 +110,10 @@ def _row_geometry(gaussian, frame, size, spans, parabolas):
 
 @njit(nogil=True, cache=True, fastmath=FASTMATH, error_model="numpy")
 def _accumulate(gaussian, frame, steps, mask, spans, parabolas, through):
-    """Add one Gaussian to a mask R or, if ``through``, multiply it into a transmittance T."""
+    """Add one Gaussian to a mask R or, if ``through``, multiply it into a transmittance T.
+
+    The mask (H, W + LANES) has a margin, so that the last block of a row may exceed W.
+    """
     size = mask.shape[0], mask.shape[1] - LANES
     top, bottom, curvature, _, _ = _row_geometry(
         gaussian, frame, size=size, spans=spans, parabolas=parabolas
@@ -304,7 +308,7 @@ def render_gaussians_backward(grads, gaussians, frame, height, width):
         width: Columns W of the raster.
 
     Returns:
-        Gradient of the Gaussians, float32. (N, P, 5)
+        Tuple with one entry, the gradient of the Gaussians, float32. (N, P, 5)
     """
     gradients = torch.empty(gaussians.shape, dtype=torch.float64)
     pixels = height * width

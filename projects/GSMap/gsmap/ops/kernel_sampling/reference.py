@@ -91,6 +91,7 @@ def sample_kernels_reference(
     sample = torch.arange(batch, device=value.device).view(-1, 1, 1, 1, 1)
     view = torch.arange(views, device=value.device).view(1, 1, -1, 1, 1)
     head = torch.arange(heads, device=value.device).view(1, 1, 1, -1, 1)
+    # Rows of `value` as a table of channels, (B * V * h * w * heads, C).
     rows = ((sample * views + view) * num_pixels + pixels) * heads + head
     # (B, Q, heads, V * S), with ``bilinear`` (B, Q, heads, V * 4 S)
     rows = rows.transpose(2, 3).flatten(3)

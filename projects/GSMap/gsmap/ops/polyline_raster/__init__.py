@@ -9,7 +9,8 @@ from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32
 from gsmap.utils.errors import InputError
 
-LANE_GAP_PX = 0.01  # shift of a line's way back as released, which closes the line to a polygon
+# Shift of a line's way back, which closes the line to a polygon, as in the code of Zhang et al.
+LANE_GAP_PX = 0.01
 DISTANCES = ("squared", "plain")
 _draw = fused_operator(
     "polyline_raster.draw_polylines",

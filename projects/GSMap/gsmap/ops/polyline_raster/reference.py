@@ -9,7 +9,8 @@ from torch import Tensor
 BLOCK_VALUES = 1 << 22  # number of distances in memory at a time
 GPU_BLOCK_VALUES = 1 << 25  # with fewer, launches take longer than arithmetic
 DISTANCE_EPS = 1e-6  # smallest distance of a pixel from an edge, in pixels
-LENGTH_EPS = 1e-5  # added to the squared length of an edge, as released; an edge may be a point
+# Added to the squared length of an edge, which may be a point, as in Zhang et al.'s released code.
+LENGTH_EPS = 1e-5
 
 
 def _edge_distances(pixels: Tensor, starts: Tensor, ends: Tensor, eps: float = 0.0) -> Tensor:
@@ -120,9 +121,11 @@ def draw_reference(
     to_line = _edge_distances(pixels, polylines[:, :-1], ends=polylines[:, 1:]).sqrt()
     to_closing = _edge_distances(pixels, polylines[:, -1:], ends=polylines[:, :1]).sqrt()
     inside = _inside_polygon(pixels, polylines)
-    near = (to_line + half_width) / pixel
-    far = (to_line - half_width) / pixel
-    lines = (near.clamp(max=0.5) - far.clamp(min=-0.5)).clamp(min=0)
+    # Overlap of two intervals across the line, in pixels: the line, `half_width` to both sides of
+    # `to_line`, and the pixel, -0.5 to 0.5.
+    high = (to_line + half_width) / pixel
+    low = (to_line - half_width) / pixel
+    lines = (high.clamp(max=0.5) - low.clamp(min=-0.5)).clamp(min=0)
     to_edge = torch.minimum(to_line, to_closing) / pixel
     areas = (0.5 + torch.where(inside, to_edge, -to_edge)).clamp(0, 1)
     return torch.where(filled[:, None, None], areas, lines)

@@ -257,8 +257,11 @@ def draw_kernel(
     )
     distance = tl.sqrt(squared)
     area = tl.minimum(0.5 + tl.where(inside, distance, -distance) / pixel, 1.0)
-    near = tl.minimum((distance + half_width) / pixel, 0.5)
-    line = near - tl.maximum((distance - half_width) / pixel, -0.5)
+    # Overlap of two intervals across the line, in pixels: the line, `half_width` to both sides of
+    # `distance`, and the pixel, -0.5 to 0.5.
+    high = tl.minimum((distance + half_width) / pixel, 0.5)
+    low = tl.maximum((distance - half_width) / pixel, -0.5)
+    line = high - low
     share = tl.maximum(tl.where(closed != 0, area, line), 0.0)
     tl.store(masks + n * height * width + index, share + poison, mask=valid)
 

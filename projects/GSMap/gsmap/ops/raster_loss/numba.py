@@ -26,7 +26,7 @@ TWO = np.float32(2)
 C1 = np.float32(SSIM_C1)
 C2 = np.float32(SSIM_C2)
 COVERAGE = np.float32(MIN_COVERAGE)
-TAPS = 6  # taps of the window that are added at a time, without a detour through memory
+TAPS = 6  # taps of the window that are added at a time, before the sum is stored
 
 
 @njit(nogil=True, cache=True, fastmath=FASTMATH)
@@ -50,7 +50,7 @@ def _find_spans(preds, targets, radius, spans):
             left = min(left, np.int32(col) if nonzero else np.int32(width))
             right = max(right, np.int32(col + 1) if nonzero else np.int32(0))
         spans[0, row, 0] = left
-        spans[0, row, 1] = max(left, right)
+        spans[0, row, 1] = max(left, right)  # an empty row has the span (width, width)
     for step in range(2):
         for row in range(height):
             left = np.int32(width)
@@ -126,7 +126,10 @@ def _ssim_terms(p, t, squares, product):
 
 @njit(nogil=True, cache=True)
 def _dissimilarity(maps, pixels):
-    """Sum 1 - SSIM over a row, and count the pixels near the target and near either mask."""
+    """Sum 1 - SSIM over a row, and count the pixels near the target and near either mask.
+
+    ``maps`` contains the blurred p, t, p^2 + t^2 and p t of one pixel after another.
+    """
     total = 0.0
     near_target = 0.0
     near_either = 0.0
@@ -144,7 +147,11 @@ def _dissimilarity(maps, pixels):
 
 @njit(nogil=True, cache=True)
 def _derivatives(maps, pixels, out):
-    """Compute the derivatives of SSIM with respect to the blurred p, p^2 and p t of a row."""
+    """Compute the derivatives of SSIM with respect to the blurred p, p^2 and p t of a row.
+
+    ``maps`` contains the blurred p, t, p^2 + t^2 and p t of one pixel after another, and ``out``
+    receives three derivatives per pixel.
+    """
     for k in range(pixels):
         p = maps[4 * k]
         t = maps[4 * k + 1]
@@ -192,7 +199,7 @@ def _prepare_instance(preds, targets, weight, radius, products, spans, sums):
         right = spans[0, row, 1]
         pred = preds[row, left:right]
         target = targets[row, left:right]
-        out = products[row + radius, 4 * (left + radius) :]
+        out = products[row + radius, 4 * (left + radius) :]  # behind the margin, 4 channels
         l1, predicted, foreground, excess = _fill_products(pred, target, weight=weight, out=out)
         sums[0] += l1
         sums[1] += predicted
@@ -293,6 +300,7 @@ def loss_backward(preds, targets, window, radius, weight, factors, grads, first,
             pixels = _blur_row(
                 products, 4, row=row, span=spans[1, row], window=window, line=line, out=maps
             )
+            # Behind the margin, 3 channels.
             out = slopes[row + radius, 3 * (spans[1, row, 0] + radius) :]
             _derivatives(maps, pixels, out=out)
         for row in range(preds.shape[1]):
@@ -313,7 +321,8 @@ def loss_backward(preds, targets, window, radius, weight, factors, grads, first,
 
 def _pad_window(window):
     """Append zeros to a window (size,) up to a multiple of ``TAPS``."""
-    return torch.nn.functional.pad(window, (0, -len(window) % TAPS))
+    num_missing = -len(window) % TAPS
+    return torch.nn.functional.pad(window, (0, num_missing))
 
 
 def raster_loss_sums(preds, targets, window, weight):
@@ -348,7 +357,7 @@ def raster_loss_sums_backward(grads, preds, targets, window, weight):
         weight: Weight of a foreground pixel, relative to a background pixel.
 
     Returns:
-        Gradient of the predicted masks, float32. (n, H, W)
+        Tuple with one entry, the gradient of the predicted masks, float32. (n, H, W)
     """
     gradient = torch.empty(preds.shape, dtype=torch.float32)
     pixels = preds.shape[1:].numel()

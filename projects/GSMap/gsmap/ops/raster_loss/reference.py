@@ -77,6 +77,7 @@ def raster_loss_sums_reference(
     weights = 1 + excess
     window = gaussian_window(window_size, window_sigma, like=preds)
     dissimilarity, mean_p, mean_t = dssim_map(preds, targets, window=window)
+    # Largest value of the target in the window of each pixel: > 0 if the window covers part of it.
     largest_targets = F.max_pool2d(
         targets[:, None], window_size, stride=1, padding=window_size // 2
     )[:, 0]
