@@ -66,7 +66,8 @@ def test_sixteen_bits_of_grey_become_eight_from_dark_to_bright():
 
 @pytest.mark.parametrize("bits", [10, 12, 14])
 def test_grey_of_fewer_bits_in_sixteen_is_named_in_place_of_a_black_image(bits):
-    message = f"a.png cannot be used: its largest value is {(1 << bits) - 1} of 65535, .* {bits} bits"
+    largest = (1 << bits) - 1
+    message = f"a.png cannot be used: its largest value is {largest} of 65535, .* {bits} bits"
     with pytest.raises(BrokenSampleError, match=message):
         decoded(saved(RAMP >> (16 - bits), "PNG"))
 
