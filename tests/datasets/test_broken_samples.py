@@ -36,7 +36,9 @@ def test_missing_truncated_and_foreign_images_are_named(build, copied_root):
     with pytest.raises(BrokenSampleError, match=f"{token}.*{name}.*not an image"):
         dataset[0]
     path.unlink()
-    with pytest.raises(BrokenSampleError, match=f"{token}.*{name}.*no image at .*fetch it again"):
+    with pytest.raises(
+        BrokenSampleError, match=f"{token}.*{name}.*no image at .*fetch the file again"
+    ):
         dataset[0]
 
 
