@@ -100,7 +100,7 @@ train: C --work-dir w --cfg-options model.data_preprocessor.pad_size_divisor=0 |
 train: C --work-dir w --cfg-options model.map_head.loss_cls.loss_weight=[1] | in code that uses --cfg-options model.map_head.loss_cls.loss_weight=[1]: check this value
 train: C --work-dir w --cfg-options model.map_head.embed_dims=-16 | cannot be made from these settings (model.map_head.embed_dims=-16):
 train: C --work-dir w --cfg-options optim_wrapper.optimizer.betas=0.9 | AdamW cannot be made from these settings (optim_wrapper.optimizer.betas=0.9):
-test: C K --work-dir w --cfg-options test_evaluator.thresholds=[a] | ValueError: could not convert string to float: 'a', in code that uses --cfg-options test_evaluator.thresholds=['a']
+test: C K --work-dir w --cfg-options test_evaluator.thresholds=[a] | thresholds must be > 0 m, at least one, got ['a']
 test: nowhere.py K | There is no config file nowhere.py
 test: C nowhere.pth | There is no checkpoint nowhere.pth
 test: C foreign.pth --work-dir w | the checkpoint does not fit the model
