@@ -67,14 +67,19 @@ def check_interrupted(done: subprocess.CompletedProcess) -> None:
 
 @pytest.mark.faults
 def test_ctrl_c_while_workers_render_leaves_nothing_half_written(tmp_path):
-    """The rendered picture of either log is there when the signal comes, and gone afterwards."""
+    """A picture is there when the signal comes; afterwards a log is there as a whole or not at all.
+
+    On a busy machine, a log may be complete before the signal arrives.
+    """
     out = tmp_path / "out"
-    for name in ("log-a", "log-b"):
-        write_log(tmp_path / "val" / name, seconds=20.0)
+    names = {"log-a", "log-b"}
+    for name in names:
+        write_log(tmp_path / "val" / name, seconds=60.0)
     command = ["av2-render", "--root", str(tmp_path), "--out", str(out), "--workers", "2"]
     done = interrupt([*command, "--rate", "all"], lambda _: bool(list(out.rglob("*.jpg"))))
     check_interrupted(done)
-    assert list((out / "val").iterdir()) == []
+    # The folder of an unfinished log has another name.
+    assert {folder.name for folder in (out / "val").iterdir()} < names
 
 
 def has_starting_worker(pid: int) -> bool:
