@@ -30,10 +30,11 @@ def test_every_part_runs_and_is_written_down(tmp_path):
         "Frames per second, kernels, half precision",
         "A training step, kernels",
         "A training step, kernels, bfloat16",
+        "A training step, kernels, bfloat16, replayed",
         "Tests",
     ]
     assert " passed" in text
-    assert text.count("| maptr_r18_minicity | ") == 5
+    assert text.count("| maptr_r18_minicity | ") == 6
     assert "kernels that are right here: GSMAP_TRITON_KERNELS=deformable_sample" in text
     assert "failed" not in text
 
