@@ -185,7 +185,7 @@ def _figures(
     read: Callable[[NDArray[np.float64]], Tensor],
     save: Callable[[Path], None],
 ) -> list[str]:
-    """Write all frames, and read those of the last drive.
+    """Write all frames, and read the frames of the last drive.
 
     Args:
         frames: Poses and predictions.

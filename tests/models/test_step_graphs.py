@@ -2,7 +2,14 @@
 
 import pytest
 import torch
-from model_cases import build_small, make_images, make_samples, small_config, straight_elements
+from model_cases import (
+    build_small,
+    disable_dropout,
+    make_images,
+    make_samples,
+    small_config,
+    straight_elements,
+)
 
 from gsmap.models.step_graphs import reason_against_recording
 
@@ -14,12 +21,7 @@ HEAD = {**small_config()["map_head"], "type": "GSMapHead", "masks": {"pixel_m": 
 def build(**settings):
     """A small GSMap in training mode, without dropout."""
     model = build_small(map_head=HEAD, **settings)
-    for part in model.modules():
-        if isinstance(part, torch.nn.Dropout):
-            part.p = 0.0
-        elif isinstance(part, torch.nn.MultiheadAttention):
-            part.dropout = 0.0
-    return model.train()
+    return disable_dropout(model).train()
 
 
 def losses_and_gradients(model, count=2, device="cpu"):
@@ -78,6 +80,16 @@ def test_models_whose_steps_cannot_be_recorded_are_named():
         build(cuda_graphs=True, compiled=True)
     with pytest.raises(ValueError, match=r"cuda_graphs=True .* remembers earlier frames"):
         build(cuda_graphs=True, temporal={"bev": {}})
+
+
+def test_autocast_around_the_model_is_refused():
+    """A recorded step would read weights that were cast once, at its recording."""
+    model = build(cuda_graphs=True)
+    with (
+        torch.autocast("cpu", torch.bfloat16),
+        pytest.raises(ValueError, match=r"--amp: leave it out, and set model.autocast=bfloat16"),
+    ):
+        model.loss(make_images(1), make_samples(TWO))
 
 
 @needs_gpu

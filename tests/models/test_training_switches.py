@@ -2,7 +2,14 @@
 
 import pytest
 import torch
-from model_cases import build_small, make_images, make_samples, small_config, straight_elements
+from model_cases import (
+    build_small,
+    disable_dropout,
+    make_images,
+    make_samples,
+    small_config,
+    straight_elements,
+)
 
 from gsmap.models.detector import MapDetector
 
@@ -13,12 +20,7 @@ def build(**settings) -> MapDetector:
     """Build a small GSMap without chance in training."""
     head = {**small_config()["map_head"], "type": "GSMapHead", "masks": {"pixel_m": 1.5}}
     model = build_small(map_head=head, img_augment=None, **settings)
-    for part in model.modules():
-        if isinstance(part, torch.nn.Dropout):
-            part.p = 0.0
-        elif isinstance(part, torch.nn.MultiheadAttention):
-            part.dropout = 0.0
-    return model.train()
+    return disable_dropout(model).train()
 
 
 def first_linear(part: torch.nn.Module) -> torch.nn.Linear:

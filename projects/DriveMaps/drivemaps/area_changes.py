@@ -1,6 +1,6 @@
 """Changes of the areas of one class."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import shapely
@@ -68,12 +68,13 @@ def area_changes(
     for area, known in _scored_areas(old, label):
         outline = _outline(area)
         in_view = _passes_in_view(outline, passes)
-        is_seen = np.array([_overlaps(area, areas) for areas in new_areas])
+        is_seen = _passes_that_have(area, new_areas)
         num_in_view = int(in_view.sum())
         num_missing = int((in_view & ~is_seen).sum())
-        views, found = _views_of(outline, area=area, detections=detections)
+        views, matches = _views_of(outline, area=area, detections=detections)
+        score_sum = sum(matches.scores)
         if 2 * num_missing > num_in_view:
-            num_without = views - sum(score for _, score, _ in found)
+            num_without = views - score_sum
             change = Change(
                 REMOVED,
                 label,
@@ -83,12 +84,12 @@ def area_changes(
                 num_passes=num_missing,
             )
             changes.append(change)
-        elif num_in_view and len(found) >= _MIN_FRAMES:
+        elif num_in_view and len(matches.scores) >= _MIN_FRAMES:
             new_area = _largest_overlap(area, new_areas)
-            shift = _shift_of(area, found)
+            shift = _shift_of(area, matches)
             if new_area is None or not shift.exceeds(_MIN_MOVE_M):
                 continue
-            share = smooth_share(sum(score for _, score, _ in found), views)
+            share = smooth_share(score_sum, views)
             change = Change(
                 MOVED,
                 label,
@@ -124,7 +125,7 @@ def _added(
                 if _overlaps(area, known_areas) or not on_known_ground(outline, old).any():
                     continue
                 in_view = _passes_in_view(outline, passes)
-                is_seen = np.array([_overlaps(area, areas) for areas in new_areas])
+                is_seen = _passes_that_have(area, new_areas)
                 num_seen = int((in_view & is_seen).sum())
                 if 2 * num_seen <= in_view.sum():
                     continue
@@ -173,6 +174,13 @@ def _outline(area: shapely.Polygon) -> FloatArray:
 def _overlaps(area: shapely.Polygon, others: list[shapely.Polygon]) -> bool:
     """Whether an area and any other one are one object."""
     return bool(_shared_shares(area, others).max(initial=0.0) >= _MIN_OVERLAP)
+
+
+def _passes_that_have(
+    area: shapely.Polygon, areas_of_passes: list[list[shapely.Polygon]]
+) -> BoolArray:
+    """Whether the map of each pass has an area. (passes,)"""
+    return np.array([_overlaps(area, areas) for areas in areas_of_passes])
 
 
 def _shared_shares(area: shapely.Polygon, others: list[shapely.Polygon]) -> FloatArray:
@@ -228,13 +236,24 @@ def _detections(passes: list[Pass], label: int, config: MergeConfig) -> list[_De
     return detections
 
 
-Found = tuple[FloatArray, float, float]
-"""Centre of a detection, its score and its variance."""
+@dataclass
+class _Matches:
+    """Detections of one area, at most one for each frame.
+
+    Attributes:
+        centres: Centre of each detection in metres. (2,)
+        scores: Score of each detection, in [0, 1].
+        variances: Variance of each detection in square metres.
+    """
+
+    centres: list[FloatArray] = field(default_factory=list)
+    scores: list[float] = field(default_factory=list)
+    variances: list[float] = field(default_factory=list)
 
 
 def _views_of(
     outline: FloatArray, area: shapely.Polygon, detections: list[_Detections]
-) -> tuple[int, list[Found]]:
+) -> tuple[int, _Matches]:
     """Count the frames that have a whole area in range, and find their detections of it.
 
     Args:
@@ -246,7 +265,7 @@ def _views_of(
         Number of frames, and the best detection of each frame with one.
     """
     views = 0
-    found = []
+    matches = _Matches()
     for entry in detections:
         if not entry.drive.in_range(entry.frame, outline).all():
             continue
@@ -254,17 +273,18 @@ def _views_of(
         shares = _shared_shares(area, entry.areas)
         if shares.max(initial=0.0) >= _MIN_OVERLAP:
             best = int(shares.argmax())
-            centre = shapely.get_coordinates(entry.areas[best].centroid)[0]
-            found.append((centre, entry.scores[best], entry.variances[best]))
-    return views, found
+            matches.centres.append(shapely.get_coordinates(entry.areas[best].centroid)[0])
+            matches.scores.append(entry.scores[best])
+            matches.variances.append(entry.variances[best])
+    return views, matches
 
 
-def _shift_of(area: shapely.Polygon, found: list[Found]) -> Shift:
+def _shift_of(area: shapely.Polygon, matches: _Matches) -> Shift:
     """Mean shift of the centres of detections from the centre of an area."""
     centre = shapely.get_coordinates(area.centroid)[0]
-    shifts = np.array([position for position, _, _ in found]) - centre  # (F, 2)
-    variances = np.array([variance for _, _, variance in found])
-    weights = np.array([score for _, score, _ in found]) / variances
+    shifts = np.array(matches.centres) - centre  # (F, 2)
+    variances = np.array(matches.variances)
+    weights = np.array(matches.scores) / variances
     mean = weights @ shifts / weights.sum()
     direction = mean / max(float(np.linalg.norm(mean)), 1e-9)
     return Shift.of_frames(shifts @ direction, variances=variances, weights=weights)

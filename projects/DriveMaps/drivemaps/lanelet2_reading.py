@@ -60,7 +60,7 @@ class _Way(NamedTuple):
 
     @property
     def ring_or_line(self) -> list[str]:
-        """IDs of its nodes; those of an area end with the first one."""
+        """IDs of its nodes. The last node of an area is its first one."""
         is_area = self.tags.get("area") == "yes"
         if is_area and self.nodes[:1] != self.nodes[-1:]:
             return [*self.nodes, self.nodes[0]]
