@@ -160,8 +160,8 @@ class StepGraphs:
 
         Raises:
             RuntimeError: If a step of this size cannot be recorded.
-            ValueError: If gradients of an earlier step are still there, or autocast is enabled around
-                the model.
+            ValueError: If gradients of an earlier step are still there, or autocast is enabled
+                around the model.
         """
         if torch.is_autocast_enabled(images.device.type):
             # Its cache would hand the weights of the recorded step to all later ones.
