@@ -252,3 +252,33 @@ def test_published_settings_are_the_defaults():
     assert prior.queries.attention.num_heads == 8
     assert prior.num_channels == 3
     assert model.prior.num_channels == 3 * 16
+
+
+def test_a_neutral_prior_starts_from_the_checkpoint_of_a_model_without_one():
+    plain = build_small(0).eval()
+    model = prior_model(1, neutral_start=True).eval()
+    with pytest.raises(ValueError, match="missing: prior"):
+        prior_model(1).load_state_dict(plain.state_dict())
+    model.load_state_dict(plain.state_dict())
+    samples = frames(("town", "a", 0.0))
+    (expected,) = predict(plain, samples)
+    for _ in range(2):  # with an empty map, and with a written one
+        (found,) = predict(model, samples)
+        torch.testing.assert_close(found.pred_instances_3d.pts, expected.pred_instances_3d.pts)
+        torch.testing.assert_close(
+            found.pred_instances_3d.scores_3d, expected.pred_instances_3d.scores_3d
+        )
+    assert window_of(model).any()
+
+
+def test_a_neutral_prior_learns():
+    model = prior_model(neutral_start=True).train()
+    samples = frames(("town", "a", 0.0), ("town", "b", 3.0))
+    prior = model.prior
+    for step in range(3):
+        train_step(model, samples, seed=step)
+        assert prior.bev.output_conv.weight.grad.any()
+        # the first output is 0; cells that are read need a map and a step that has moved the output
+        assert prior.queries.attention.out_proj.weight.grad.any() == (step > 0)
+        assert bool(prior.bev.conv[0].weight.grad.any()) == (step > 0)
+        assert bool(prior.queries.label_encoder.weight.grad.any()) == (step > 1)

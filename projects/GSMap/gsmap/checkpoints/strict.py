@@ -73,12 +73,12 @@ def adapt_state(
     if fit is not None:
         fit(state)
     absent = expected.keys() - state.keys()
-    missing = {key for key in absent if not key.endswith("num_batches_tracked")}
     untrained: list[str] = []
     for keys in neutral:
-        if keys <= missing:
+        if keys <= absent:
             untrained += keys
     untrained.sort()
+    missing = {key for key in absent if not key.endswith("num_batches_tracked")}
     missing -= set(untrained)
     for key in untrained:
         state[key] = expected[key]  # keeps the value of the model

@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 from mmdet3d.registry import MODELS
-from mmengine.model import BaseModule
+from mmengine.model import BaseModule, constant_init
 from torch import Tensor, nn
 
 from gsmap.models.base.layers import init_matrices
@@ -36,6 +36,9 @@ class PriorBEVFusion(BaseModule):
         threshold: Smallest value of a channel from which a cell counts as known.
         layer: Settings of the BEV layer, a `BEVQueryEncoder`; None to leave it out.
         z_range: Lowest and highest z of the pillars of the layer, in metres.
+        residual: Add the result to the features through a 1 x 1 convolution, whose weights start
+            at 0. A model that was trained without a map then keeps its features. False replaces
+            the features, as published.
     """
 
     def __init__(
@@ -46,6 +49,7 @@ class PriorBEVFusion(BaseModule):
         threshold: float = 0.8,
         layer: Mapping[str, Any] | None = DEFAULTS,
         z_range: Sequence[float] = (-10.0, 10.0),
+        residual: bool = False,
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(init_cfg)
@@ -59,6 +63,7 @@ class PriorBEVFusion(BaseModule):
             nn.BatchNorm2d(embed_dims),
             nn.ReLU(inplace=True),
         )
+        self.output_conv = nn.Conv2d(embed_dims, embed_dims, kernel_size=1) if residual else None
 
     @property
     def calibration(self) -> tuple[str, ...]:
@@ -66,9 +71,14 @@ class PriorBEVFusion(BaseModule):
         return () if self.layer is None else self.layer.calibration
 
     def init_weights(self) -> None:
-        """Initialise kernels from Xavier's uniform distribution, and the BEV layer."""
+        """Initialise kernels from Xavier's uniform distribution, and the BEV layer.
+
+        The weights of the residual are set to 0.
+        """
         super().init_weights()
         init_matrices(self.conv)
+        if self.output_conv is not None:
+            constant_init(self.output_conv, 0.0)
 
     def forward(
         self,
@@ -90,8 +100,12 @@ class PriorBEVFusion(BaseModule):
         Returns:
             Fused features. (B, C, H, W)
         """
+        known_feats = feats
         if self.layer is not None:
             extra = self.layer.encode(img_feats, calibration, img_shape=img_shape)["bev_feats"]
             is_known = cells.amax(1, keepdim=True) >= self.threshold
-            feats = feats + torch.where(is_known, extra, 0.0)
-        return self.conv(torch.cat([feats, cells.to(feats.dtype)], dim=1))
+            known_feats = feats + torch.where(is_known, extra, 0.0)
+        fused = self.conv(torch.cat([known_feats, cells.to(feats.dtype)], dim=1))
+        if self.output_conv is None:
+            return fused
+        return feats + self.output_conv(fused)

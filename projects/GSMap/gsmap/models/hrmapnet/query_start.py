@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import torch
 from mmdet3d.registry import MODELS
-from mmengine.model import BaseModule, xavier_init
+from mmengine.model import BaseModule, constant_init, xavier_init
 from torch import Tensor, nn
 
 from gsmap.models.base.decoder import Queries
@@ -38,6 +38,8 @@ class PriorQueries(BaseModule):
         stride: Every ``stride``-th row and column of the cells is used, from the first on.
         threshold: Value that a channel of a cell must exceed for the cell to be used.
         dropout: Probability to drop an attention weight in training.
+        zero_init: Initialise the output projection with 0, so that a model that was trained without
+            a map keeps its queries. False initialises random weights, as published.
     """
 
     def __init__(
@@ -48,9 +50,11 @@ class PriorQueries(BaseModule):
         stride: int = 2,
         threshold: float = 0.8,
         dropout: float = 0.0,
+        zero_init: bool = False,
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(init_cfg)
+        self.zero_init = zero_init
         self.stride = stride
         self.threshold = threshold
         self.label_encoder = nn.Linear(num_channels, embed_dims)
@@ -62,6 +66,8 @@ class PriorQueries(BaseModule):
         """Initialise the encoder of map values from Xavier's uniform distribution."""
         super().init_weights()
         xavier_init(self.label_encoder, distribution="uniform", bias=0.0)
+        if self.zero_init:
+            constant_init(self.attention.out_proj, 0.0)
 
     def forward(self, query: Tensor, keys: MapKeys) -> Tensor:
         """Attend to the map, without the residual.

@@ -14,6 +14,7 @@ from mmengine.logging import print_log
 from mmengine.model import BaseModule
 from torch import Tensor
 
+from gsmap.checkpoints.strict import AddsWeights
 from gsmap.models.base.head import MapHead
 from gsmap.models.base.parts import DEFAULTS, build_part
 from gsmap.models.encoders.camera_encoder import stack_calibration
@@ -51,7 +52,7 @@ class _Pending(NamedTuple):
 
 
 @MODELS.register_module()
-class RasterPrior(BaseModule):
+class RasterPrior(BaseModule, AddsWeights):
     """Raster of earlier predictions at a place, as an input of a `MapDetector` (HRMapNet).
 
     Before a frame, a window of the map is read at its pose. The BEV features are fused with it, and
@@ -72,6 +73,8 @@ class RasterPrior(BaseModule):
         test_rule: Rule of writing in tests.
         test_memory: Frames of a test that share a map: those of a place (``"kept"``), of a scene
             (``"scene"``), or none (``"none"``).
+        neutral_start: Start parts that have no effect, so that the prior can be trained from the
+            checkpoint of a model without one. False starts random parts, as published.
 
     Attributes:
         num_channels: Channels M of the map in each BEV cell.
@@ -93,9 +96,11 @@ class RasterPrior(BaseModule):
         train_rule: Mapping[str, Any] | None = None,
         test_rule: Mapping[str, Any] | None = None,
         test_memory: str = "kept",
+        neutral_start: bool = False,
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(init_cfg)
+        self.neutral_keys = ("",) if neutral_start else ()  # "" is the prefix of all keys
         if not isinstance(head, MapHead):
             raise InputError(f"{type(head).__name__} can have no prior, which needs a MapHead.")
         cells = getattr(encoder, "grid", None)
@@ -129,11 +134,20 @@ class RasterPrior(BaseModule):
         self.bev: PriorBEVFusion | None = None
         if bev is not None:
             heights = {"z_range": encoder.z_range} if hasattr(encoder, "z_range") else {}
-            self.bev = build_part(bev, type="PriorBEVFusion", grid=cells, **heights, **shared)
+            self.bev = build_part(
+                bev,
+                type="PriorBEVFusion",
+                grid=cells,
+                residual=neutral_start,
+                **heights,
+                **shared,
+            )
         self.queries: PriorQueries | None = None
         self.positions: LearnedPositionalEncoding | None = None
         if queries is not None:
-            self.queries = build_part(queries, type="PriorQueries", **shared)
+            self.queries = build_part(
+                queries, type="PriorQueries", zero_init=neutral_start, **shared
+            )
             if self.bev is None or self.bev.layer is None:
                 self.positions = LearnedPositionalEncoding(
                     embed_dims // 2, cells.height, cells.width
