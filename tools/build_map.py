@@ -16,7 +16,7 @@ import argparse
 import json
 import math
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -73,6 +73,9 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--out", type=Path, help="folder for the maps")
     parser.add_argument("--formats", nargs="+", default=["geojson"], choices=FORMATS)
     parser.add_argument("--scene", nargs="+", help="drives to merge; all by default")
+    parser.add_argument(
+        "--join", action="store_true", help="merge all drives of a place into one map"
+    )
     parser.add_argument("--score-thr", type=float, default=0.3, help="smallest score that counts")
     parser.add_argument(
         "--min-confidence",
@@ -146,6 +149,8 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         parser.error("--out or --prior must name the output")
     if args.changes and not args.out:
         parser.error("--changes goes to the folder --out: give it, too")
+    if args.changes and args.join:
+        parser.error("--changes compares each drive with the old map: leave --join out")
     if args.map and not args.prior:
         parser.error("--map is for a prior: give --prior, too")
     if args.map_classes and not (args.map or args.changes):
@@ -303,7 +308,7 @@ def draw(
     """
     maps = {"suppressed (baseline)": suppress(drive), "merged": merged}
     if has_truth(ann):
-        maps["true"] = true_map(read_drive(ann, drive.scene, read_truth(ann)))
+        maps["true"] = true_map(read_drive(ann, drive.scenes, read_truth(ann)))
     track = np.array([frame.sample.global_from_frame[:2, 3] for frame in drive.frames])
     save_figure(plot_maps(maps, track, style), path)
 
@@ -335,7 +340,7 @@ def score(passes: list[Pass], ann: AnnotationFile, out: Path) -> None:
         drive = one_pass.drive
         drives.append(drive)
         merged.append(one_pass.elements)
-        truths.append(true_map(read_drive(ann, drive.scene, instances)))
+        truths.append(true_map(read_drive(ann, drive.scenes, instances)))
         baseline.append(suppress(drive))
     figures = {
         "merged": map_figures(merged, truths, drives),
@@ -433,15 +438,39 @@ def merge_config(args: argparse.Namespace) -> MergeConfig:
     )
 
 
-def merge_drives(
+def group_scenes(
     args: argparse.Namespace, ann: AnnotationFile, scenes: Sequence[str]
+) -> dict[str, list[str]]:
+    """Scenes of each map that is written: one scene, or all scenes of a place with ``--join``.
+
+    Args:
+        args: The options of the command.
+        ann: The samples.
+        scenes: Names of the scenes.
+
+    Returns:
+        Scenes by the name of the scene or of the place.
+    """
+    if not args.join:
+        return {scene: [scene] for scene in scenes}
+    place_of_scene = dict(zip(ann.column("scene"), ann.column("map_name"), strict=True))
+    groups: dict[str, list[str]] = {}
+    for scene in scenes:
+        # read_drive refuses a scene that the file lacks
+        place = place_of_scene.get(scene, "")
+        groups.setdefault(place or scene, []).append(scene)
+    return groups
+
+
+def merge_drives(
+    args: argparse.Namespace, ann: AnnotationFile, groups: Mapping[str, Sequence[str]]
 ) -> tuple[list[Pass], float]:
     """Merge drives, and write and print their maps.
 
     Args:
         args: The options of the command.
         ann: The samples.
-        scenes: Names of the drives.
+        groups: Scenes of each map, by its name.
 
     Returns:
         Drives with their merged maps, and the processor time of merging in seconds.
@@ -451,16 +480,17 @@ def merge_drives(
     if has_truth(ann) and not args.allow_other_split:  # maps are scored
         require_results_of(ann.meta.split_list, file.about, args.results)
     has_poses = ann.meta.options.get("poses", True)
-    names = file_names(sorted(set(ann.column("scene"))), ("", _LON_LAT))
+    all_names = ann.column("map_name" if args.join else "scene")
+    names = file_names(sorted({*all_names, *groups}), ("", _LON_LAT))
     if args.out:
-        own_names = [names[scene] for scene in scenes if scene in names]
+        own_names = [names[name] for name in groups]
         if args.changes and _CHANGES in own_names:
             raise InputError(f"drive {_CHANGES!r} has the name of the file of --changes.")
         require_own_files(args, names=own_names, scored=has_truth(ann))
     passes = []
     processor_s = 0.0
-    for scene in scenes:
-        drive = confident(read_drive(ann, scene, results), args.score_thr)
+    for name, scenes in groups.items():
+        drive = confident(read_drive(ann, scenes, results, name), args.score_thr)
         start_s = time.process_time()
         elements = merge(drive, merge_config(args)) if has_poses else MapElements.from_polylines()
         processor_s += time.process_time() - start_s
@@ -468,7 +498,7 @@ def merge_drives(
         if args.out:
             elements_text = format_count(len(elements), "element")
             summary = f"{elements_text} of {format_count(len(drive.frames), 'frame')}"
-            for path in write_map(args.out / names[scene], args, ann, drive, elements):
+            for path in write_map(args.out / names[name], args, ann, drive, elements):
                 print(f"{summary}: {path}")
     return passes, processor_s
 
@@ -484,9 +514,10 @@ def main(argv: list[str] | None = None) -> str:
     passes: list[Pass] = []
     summary = f"a prior of {place}"
     if args.results:
-        passes, processor_s = merge_drives(args, ann, scenes)
+        passes, processor_s = merge_drives(args, ann, group_scenes(args, ann, scenes))
         frames = sum(len(one_pass.drive.frames) for one_pass in passes)
-        numbers = f"{format_count(len(passes), 'drive')}, {format_count(frames, 'frame')}"
+        num_drives = sum(len(one_pass.drive.scenes) for one_pass in passes)
+        numbers = f"{format_count(num_drives, 'drive')}, {format_count(frames, 'frame')}"
         summary = f"{numbers}, merged in {processor_s:.1f} s of processor time"
         maps += [one_pass.elements for one_pass in passes]
     if old is not None:

@@ -146,7 +146,7 @@ def minicity_drive(minicity_root, tmp_path_factory) -> Drive:
     convert_nuscenes(options)
     file = AnnotationFile(folder / "gsmap_minicity_train.arrow")
     maps = {sample.token: elements_of_instances(sample.instances or []) for sample in file}
-    return read_drive(file, file.column("scene")[0], maps)
+    return read_drive(file, file.column("scene")[:1], maps)
 
 
 def lanelets_at(centres: list, point: np.ndarray, heading: np.ndarray) -> set[int]:

@@ -56,6 +56,29 @@ def test_ground_truth_as_predictions_scores_1(files, tmp_path, capsys):
     assert orange.mean() > 1e-3  # the dividers, in the colour of all pictures
 
 
+def test_drives_of_a_place_are_joined_into_one_map(files, tmp_path, capsys):
+    results, ann = files
+    file = AnnotationFile(ann)
+    samples = list(file)
+    half = len(samples) // 2
+    samples[half:] = [replace(sample, scene="later") for sample in samples[half:]]
+    samples[-1] = replace(samples[-1], scene="away", map_name="other")
+    two_drives = tmp_path / "two.arrow"
+    write_annotations(two_drives, file.meta, samples)
+    command = [str(results), "--ann", str(two_drives), "--out", str(tmp_path / "maps"), "--join"]
+    report = main(command)
+    assert report.startswith(f"3 drives, {len(samples)} frames")
+    names = sorted(path.name for path in (tmp_path / "maps").glob("*.geojson"))
+    assert names == sorted(f"{samples[row].map_name}.geojson" for row in (0, -1))
+    joined = json.loads((tmp_path / "maps" / f"{samples[0].map_name}.geojson").read_text())
+    assert len(joined["features"]) == 6  # one drive alone sees a part of them
+    scores = json.loads((tmp_path / "maps" / "scores.json").read_text())
+    assert scores["merged"]["AP"]["mean"] > 0.95
+    with pytest.raises(SystemExit):
+        main([*command, "--changes", str(tmp_path / "old.geojson")])
+    assert "leave --join out" in capsys.readouterr().err
+
+
 def test_maps_of_a_model_of_another_split_are_not_scored_unless_allowed(files, tmp_path):
     results, ann = files
     here, other = ("near@" + digit * 16 for digit in "01")

@@ -74,17 +74,17 @@ class DriveFrame:
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """Frames of one scene.
+    """Frames of one scene, or of several scenes that lie in one place.
 
     Args:
-        scene: Name of the scene.
+        name: Name of the scene or of the place.
         classes: Class names in label order.
         x_range: Smallest and largest x of the range of a frame, in metres in its annotation frame.
         y_range: Smallest and largest y of the range of a frame, in metres in its annotation frame.
         frames: Frames in the order of time.
     """
 
-    scene: str
+    name: str
     classes: tuple[str, ...]
     x_range: tuple[float, float]
     y_range: tuple[float, float]
@@ -103,6 +103,11 @@ class Drive:
         low, high = np.array([self.x_range, self.y_range]).T
         local = frame.to_frame(points)
         return ((local >= low) & (local <= high)).all(axis=1)
+
+    @property
+    def scenes(self) -> list[str]:
+        """Names of the scenes of the frames, sorted."""
+        return sorted({frame.sample.scene for frame in self.frames})
 
     @property
     def reach_m(self) -> float:
@@ -157,43 +162,59 @@ class Drive:
         return shapely.Polygon(frame.to_global(corners))
 
 
-def read_drive(annotations: AnnotationFile, scene: str, maps: Mapping[str, MapElements]) -> Drive:
-    """Create the drive of a scene.
+def read_drive(
+    annotations: AnnotationFile,
+    scenes: Sequence[str],
+    maps: Mapping[str, MapElements],
+    name: str = "",
+) -> Drive:
+    """Create the drive of a scene, or join the drives of several scenes.
 
     Args:
-        annotations: Annotation file with the samples of the scene.
-        scene: Name of the scene.
+        annotations: Annotation file with the samples of the scenes.
+        scenes: Names of the scenes, which have one global frame.
         maps: Map of each sample in its annotation frame, by token. Samples without one are left
             out.
+        name: Name of the drive; empty for the name of the first scene.
 
     Returns:
         Frames with their maps in the global frame.
 
     Raises:
-        ValueError: If the file has no such scene, or no sample of the scene has a map.
+        ValueError: If the file lacks a scene, or no sample of a scene has a map.
     """
-    scenes = annotations.column("scene")
-    if scene not in scenes:
-        raise InputError(
-            f"{annotations.path} has no scene {scene!r}, but {sorted(set(scenes))[:5]} ..."
-        )
-    samples = []
-    for row, name in enumerate(scenes):
-        if name == scene:
+    samples_of_scene: dict[str, list[MapSample]] = {scene: [] for scene in scenes}
+    names = annotations.column("scene")
+    for scene in scenes:
+        if scene not in names:
+            raise InputError(
+                f"{annotations.path} has no scene {scene!r}, but {sorted(set(names))[:5]} ..."
+            )
+    for row, scene in enumerate(names):
+        if scene in samples_of_scene:
             sample = annotations[row]
             if sample.token in maps:
-                samples.append(sample)
-    if not samples:
-        raise InputError(
-            f"no sample of scene {scene!r} has results: give the results of {annotations.path}."
-        )
+                samples_of_scene[scene].append(sample)
+    samples = []
+    for scene, samples_of_one in samples_of_scene.items():
+        if not samples_of_one:
+            raise InputError(
+                f"no sample of scene {scene!r} has results: give the results of {annotations.path}."
+            )
+        samples += samples_of_one
     samples.sort(key=lambda sample: sample.timestamp_ns)
     frames = []
     for sample in samples:
         elements = maps[sample.token].with_coordinates(2)
         frames.append(DriveFrame(sample, elements.to_frame(sample.global_from_frame)))
     meta = annotations.meta
-    return Drive(scene, meta.classes, x_range=meta.x_range, y_range=meta.y_range, frames=frames)
+    return Drive(
+        name or scenes[0],
+        classes=meta.classes,
+        x_range=meta.x_range,
+        y_range=meta.y_range,
+        frames=frames,
+    )
 
 
 def drive_map(rows: Iterable[tuple[int, FloatArray, float]], scored: bool = True) -> MapElements:

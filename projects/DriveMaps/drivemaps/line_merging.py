@@ -83,7 +83,7 @@ def _check_total_length(drive: Drive, label: int) -> None:
     most_m = _MOST_M + _MOST_PER_FRAME_M * len(drive.frames)
     if total_m > most_m:
         raise InputError(
-            f"drive {drive.scene!r} has {total_m / 1000:.0f} km of {drive.classes[label]!r} in "
+            f"drive {drive.name!r} has {total_m / 1000:.0f} km of {drive.classes[label]!r} in "
             f"{len(drive.frames)} frames: at most {_MOST_M / 1000:g} km and "
             f"{_MOST_PER_FRAME_M / 1000:g} km a frame are merged; raise --score-thr."
         )

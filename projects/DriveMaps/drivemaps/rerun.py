@@ -36,7 +36,7 @@ def write_rerun(path: str | Path, replay: Replay) -> None:
         RuntimeError: If ``rerun-sdk`` is missing.
     """
     rr = import_extra("rerun", "viz")
-    recording = rr.RecordingStream("gsmap", recording_id=replay.drive.scene)
+    recording = rr.RecordingStream("gsmap", recording_id=replay.drive.name)
     stream = recording.binary_stream()
     cameras = replay.drive.frames[0].sample.cameras
     recording.send_blueprint(_blueprint(cameras))

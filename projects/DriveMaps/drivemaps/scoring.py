@@ -130,7 +130,7 @@ def map_figures(
     whole_pairs = []
     sample_pairs = []
     for drive, predicted, true in zip(drives, maps, truths, strict=True):
-        whole_pairs.append((drive.scene, predicted, true))
+        whole_pairs.append((drive.name, predicted, true))
         for frame in drive.frames:
             predicted_part = cut_to_frame(predicted, drive, frame)
             true_part = cut_to_frame(true, drive, frame)

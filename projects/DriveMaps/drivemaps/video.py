@@ -64,7 +64,7 @@ def _draw_moment(moment: Moment, replay: Replay, width_px: int) -> np.ndarray:
         view=replay.view.with_mounting(sample.ego_from_frame),
         style=MapStyle(classes=drive.classes),
         camera_elements=predictions,
-        title=drive.scene,
+        title=drive.name,
         width_px=width_px,
     )
     return figure_to_rgb(figure)
