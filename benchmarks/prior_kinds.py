@@ -162,7 +162,7 @@ def compare(length_km: float) -> str:
         frames,
         lines,
         write=lambda pose, elements: prior.write(pose, GRID, elements),
-        read=lambda pose: prior.read(pose, GRID).mean,
+        read=lambda pose: prior.read(pose, GRID),
         save=prior.save,
     )
     rows.append(["Gaussians", *figures, f"{_share_within_2_sigma(prior, length_m):.0%}"])

@@ -43,6 +43,7 @@ from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.elements import elements_of_instances
 from gsmap.evaluation.core.results_json import RESULTS_KEY, SampleFile
 from gsmap.structures.elements import MapElements
+from gsmap.structures.grid import BEVGrid
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.errors import InputError
 from gsmap.utils.extras import import_extra
@@ -132,6 +133,11 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         "--prior", type=output_file, metavar="OUT", help="write the maps as a MapPrior to this file"
     )
     group.add_argument(
+        "--gaussians",
+        action="store_true",
+        help="write a GaussianPrior of the predictions of all frames in place of a MapPrior",
+    )
+    group.add_argument(
         "--map", type=Path, metavar="FILE", help="add this map (GeoJSON, Lanelet2) to the --prior"
     )
     group.add_argument(
@@ -151,6 +157,10 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         parser.error("--changes goes to the folder --out: give it, too")
     if args.changes and args.join:
         parser.error("--changes compares each drive with the old map: leave --join out")
+    if args.gaussians and not (args.prior and args.results):
+        parser.error("--gaussians is for a --prior of results: give both, too")
+    if args.gaussians and args.map:
+        parser.error("a map of --map has no Gaussians: leave --gaussians out, or --map")
     if args.map and not args.prior:
         parser.error("--map is for a prior: give --prior, too")
     if args.map_classes and not (args.map or args.changes):
@@ -429,6 +439,33 @@ def write_prior(path: Path, place: str, classes: Sequence[str], maps: list[MapEl
         print(f"prior of {place}, {format_count(prior.num_tiles, 'tile')}: {path}")
 
 
+def write_gaussian_prior(
+    path: Path, place: str, passes: Sequence[Pass], results: Mapping[str, MapElements], thr: float
+) -> None:
+    """Write the predictions of all frames of a place as a Gaussian prior.
+
+    Args:
+        path: File to create or replace.
+        place: Name of the map.
+        passes: Drives, whose frames are written in the order of time.
+        results: Predictions in the annotation frames of the samples, by token.
+        thr: Smallest score of a prediction that is written.
+    """
+    from gsmap.prior import GaussianPrior, PriorSettings
+
+    drive = passes[0].drive
+    prior = GaussianPrior(PriorSettings(drive.classes, place))
+    extent = BEVGrid(drive.x_range, drive.y_range, height=1, width=1)
+    samples = [frame.sample for one_pass in passes for frame in one_pass.drive.frames]
+    samples.sort(key=lambda sample: sample.timestamp_ns)
+    for sample in samples:
+        elements = results[sample.token].with_coordinates(2)
+        confident_elements = elements.select(elements.confidence >= thr)
+        prior.write(sample.global_from_frame, extent, elements=confident_elements)
+    prior.save(path)
+    print(f"prior of {place}, {format_count(prior.num_gaussians, 'Gaussian')}: {path}")
+
+
 def merge_config(args: argparse.Namespace) -> MergeConfig:
     """Parameters of merging by the options of the command."""
     return MergeConfig(
@@ -462,23 +499,36 @@ def group_scenes(
     return groups
 
 
+def read_results(args: argparse.Namespace, ann: AnnotationFile) -> dict[str, MapElements]:
+    """Read the predictions in the annotation frames of the samples, by token.
+
+    Raises:
+        ValueError: If maps are scored, and the model was trained on another split.
+    """
+    file = SampleFile(args.results, RESULTS_KEY, ann.meta.classes, gaussians=True)
+    results = {token: elements for token, elements, _ in file}
+    if has_truth(ann) and not args.allow_other_split:  # maps are scored
+        require_results_of(ann.meta.split_list, file.about, args.results)
+    return results
+
+
 def merge_drives(
-    args: argparse.Namespace, ann: AnnotationFile, groups: Mapping[str, Sequence[str]]
+    args: argparse.Namespace,
+    ann: AnnotationFile,
+    results: Mapping[str, MapElements],
+    groups: Mapping[str, Sequence[str]],
 ) -> tuple[list[Pass], float]:
     """Merge drives, and write and print their maps.
 
     Args:
         args: The options of the command.
         ann: The samples.
+        results: Predictions in the annotation frames of the samples, by token.
         groups: Scenes of each map, by its name.
 
     Returns:
         Drives with their merged maps, and the processor time of merging in seconds.
     """
-    file = SampleFile(args.results, RESULTS_KEY, ann.meta.classes, gaussians=True)
-    results = {token: elements for token, elements, _ in file}
-    if has_truth(ann) and not args.allow_other_split:  # maps are scored
-        require_results_of(ann.meta.split_list, file.about, args.results)
     has_poses = ann.meta.options.get("poses", True)
     all_names = ann.column("map_name" if args.join else "scene")
     names = file_names(sorted({*all_names, *groups}), ("", _LON_LAT))
@@ -512,9 +562,12 @@ def main(argv: list[str] | None = None) -> str:
     old = open_map(args.changes, args, ann, place) if args.changes else None
     maps = [open_map(args.map, args, ann, place)] if args.map else []
     passes: list[Pass] = []
+    results: dict[str, MapElements] = {}
     summary = f"a prior of {place}"
     if args.results:
-        passes, processor_s = merge_drives(args, ann, group_scenes(args, ann, scenes))
+        results = read_results(args, ann)
+        groups = group_scenes(args, ann, scenes)
+        passes, processor_s = merge_drives(args, ann, results, groups)
         frames = sum(len(one_pass.drive.frames) for one_pass in passes)
         num_drives = sum(len(one_pass.drive.scenes) for one_pass in passes)
         numbers = f"{format_count(num_drives, 'drive')}, {format_count(frames, 'frame')}"
@@ -522,7 +575,9 @@ def main(argv: list[str] | None = None) -> str:
         maps += [one_pass.elements for one_pass in passes]
     if old is not None:
         compare(args, ann, old, passes)
-    if args.prior:
+    if args.gaussians:
+        write_gaussian_prior(args.prior, place, passes, results, args.score_thr)
+    elif args.prior:
         write_prior(args.prior, place, ann.meta.classes, maps)
     if args.out and has_truth(ann):
         score(passes, ann, args.out)

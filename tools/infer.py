@@ -47,7 +47,7 @@ if TYPE_CHECKING:  # slow to import
     from gsmap import MapInferencer
     from gsmap.apis.frame_loader import BrokenFrame
     from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
-    from gsmap.prior.map_prior import MapPrior
+    from gsmap.prior.opening import AnyPrior
 
 _ONE_SAMPLE_HZ = 1e-4  # rate at which a drive has one sample
 _SAMPLES = ".arrow"  # suffix of the file with the samples, in place of the one of --out
@@ -321,7 +321,7 @@ def predict(
     dataset: "VectorizedMapDataset",
     chosen: list[int],
     results: ResultLog | None,
-    priors: Sequence["MapPrior"],
+    priors: Sequence["AnyPrior"],
 ) -> dict[str, str]:
     """Predict samples, draw them and log the predictions.
 
@@ -390,7 +390,7 @@ def read_priors(
     dataset: "VectorizedMapDataset",
     chosen: Sequence[int],
     stack: ExitStack,
-) -> list["MapPrior"]:
+) -> list["AnyPrior"]:
     """Open the files of ``--prior``.
 
     Args:
@@ -413,7 +413,7 @@ def read_priors(
     )
 
 
-def save_priors(args: argparse.Namespace, priors: Sequence["MapPrior"]) -> None:
+def save_priors(args: argparse.Namespace, priors: Sequence["AnyPrior"]) -> None:
     """Write the priors of ``--update-prior`` to their files."""
     if not args.update_prior:
         return

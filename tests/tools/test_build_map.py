@@ -18,7 +18,7 @@ from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta, MapInstance
 from gsmap.datasets.elements import elements_of_instances
 from gsmap.evaluation.core.results_json import vectors_of, write_results
-from gsmap.prior import MapPrior, PriorSettings
+from gsmap.prior import MapPrior, PriorSettings, open_prior
 from gsmap.structures.grid import BEVGrid
 from tools.build_map import main
 
@@ -248,6 +248,27 @@ def test_a_prior_of_drives_and_of_their_map_hold_the_street(files, tmp_path, cap
     of_both = read_prior(other, "town")
     assert (of_both >= of_drive).all()
     assert of_both.max() > of_drive.max()
+
+
+def test_a_gaussian_prior_of_the_frames_holds_the_street(files, tmp_path, capsys):
+    results, ann = files
+    path = tmp_path / "town.gaussians"
+    words = [str(results), "--ann", str(ann), "--prior", str(path)]
+    main([*words, "--gaussians"])
+    pose = drive_of().frames[8].sample.global_from_frame
+    of_gaussians = open_prior(path).read(pose, GRID)
+    main([*words[:-1], str(tmp_path / "town.prior")])
+    of_cells = read_prior(tmp_path / "town.prior", "town")
+    for label in (CLASSES.index("divider"), CLASSES.index("boundary")):
+        cells, lines = of_cells[label] > 0.5, of_gaussians[label] > 0.3
+        assert (cells & lines).sum() > 0.8 * cells.sum()
+    with pytest.raises(SystemExit):
+        main([*words, "--gaussians", "--map", str(tmp_path / "a.geojson")])
+    with pytest.raises(SystemExit):
+        main([str(results), "--ann", str(ann), "--out", str(tmp_path), "--gaussians"])
+    errors = capsys.readouterr().err
+    assert "has no Gaussians" in errors
+    assert "--gaussians is for a --prior of results" in errors
 
 
 def test_a_prior_is_made_of_maps_of_other_programs(files, tmp_path, capsys):

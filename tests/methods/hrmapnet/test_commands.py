@@ -11,9 +11,9 @@ from mmdet3d.registry import MODELS
 from processes import run_tool
 
 from gsmap.engine.launch import read_config
-from gsmap.prior import LastSeen, MapPrior, PriorSettings
+from gsmap.prior import LastSeen, MapPrior, PriorSettings, open_prior
 from gsmap.utils.shards import digest
-from tools import infer
+from tools import build_map, infer
 
 PRIOR = """
 _base_ = {base!r}
@@ -107,6 +107,39 @@ def test_priors_that_do_not_fit_are_refused(model, tiny_config, minicity_annotat
         run(whole, of=[str(tiny_config), str(weights)])
     with pytest.raises(SystemExit):
         infer.parse_args([drive, "--model", *model, "--out", out, "--update-prior"])
+
+
+def test_a_gaussian_prior_of_a_drive_is_read(model, minicity_annotations, tmp_path, capsys):
+    drive = str(minicity_annotations["val"])
+    path = tmp_path / "town.gaussians"
+    found = {}
+    for name, options in (
+        ("empty", ["--cfg-options", "model.prior.test_memory=none"]),
+        ("given", ["--prior", str(path)]),
+    ):
+        out = tmp_path / f"{name}.json"
+        infer.main([drive, "--model", *model, "--out", str(out), *options])
+        found[name] = lines_of(out)
+        if name == "empty":
+            content = json.loads(out.read_text())
+            for record in content["results"]:
+                for line in record["vectors"]:
+                    line["confidence_level"] = 0.9  # the untrained model is sure of nothing
+            out.write_text(json.dumps(content))
+            words = ["--ann", drive, "--score-thr", "0", "--prior", str(path), "--gaussians"]
+            build_map.main([str(out), *words])
+    num_gaussians = open_prior(path).num_gaussians
+    assert num_gaussians > 100
+    assert f"prior of boston-seaport, {num_gaussians} Gaussians: {path}" in capsys.readouterr().out
+    differences = []
+    for token, lines in found["empty"].items():
+        points = [line["pts"] for line in lines]
+        from_prior = [line["pts"] for line in found["given"][token]]
+        differences.append(np.abs(np.subtract(from_prior, points)).max())
+    assert max(differences) > 0.1
+    words = ["--out", str(tmp_path / "no.json"), "--prior", str(path), "--update-prior"]
+    with pytest.raises(ValueError, match="has Gaussians, which a model reads only"):
+        infer.main([drive, "--model", *model, *words])
 
 
 def test_a_test_reads_a_prior(model, minicity_annotations, tmp_path):

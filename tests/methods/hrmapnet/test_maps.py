@@ -6,7 +6,8 @@ import torch
 from methods.hrmapnet.prior_cases import CLASSES, frames, pose_at
 
 from gsmap.models.hrmapnet.maps import GivenMaps, Place, PlaceMaps
-from gsmap.prior import KeepMaximum, LastSeen, MapPrior, PriorSettings
+from gsmap.prior import GaussianPrior, KeepMaximum, LastSeen, MapPrior, PriorSettings
+from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
 
 WINDOW = BEVGrid((-15, 15), (-30, 30), 48, 24)  # cells of 1.25 m
@@ -69,6 +70,22 @@ def test_given_priors_are_read_and_written_only_on_request():
         maps.write(place(), raster())
         assert prior.read(pose_at(0), WINDOW).amax() == float(update)
         assert maps.read(place(town="")).amax() == float(update)  # the only one that there is
+
+
+def test_a_gaussian_prior_is_drawn_in_the_cells_of_a_window_and_not_written():
+    prior = GaussianPrior(PriorSettings(CLASSES, "town"))
+    line = np.array([[3.0, -20.0], [3.0, 20.0]])
+    elements = MapElements.from_polylines([line], [2])
+    for _ in range(3):
+        prior.write(pose_at(0), WINDOW, elements=elements)
+    window = GivenMaps([prior], CLASSES, grid=WINDOW).read(place())
+    assert window.shape == raster().shape
+    rows, columns = (window[2] > 0.5).nonzero().unbind(-1)
+    assert len(rows) >= 24  # 40 m, cells of 1.25 m
+    assert (columns == 14).all()  # x of 2.5 to 3.75 m
+    assert not window[:2].any()
+    with pytest.raises(ValueError, match="has Gaussians, which a model reads only"):
+        GivenMaps([prior], CLASSES, grid=WINDOW, update=True)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,6 @@ from gsmap.apis.map_priors import maps_for
 from gsmap.datasets.memory import VEHICLE, Cameras, bgr_by_name, source_in_memory
 from gsmap.datasets.plausibility import calibration_warnings
 from gsmap.datasets.source import Source, ground_from_frame
-from gsmap.prior.map_prior import MapPrior
 from gsmap.structures.elements import MapElements
 from gsmap.structures.rigid import invert_rigid
 from gsmap.structures.streams import Frame, MapStream
@@ -26,6 +25,7 @@ if TYPE_CHECKING:
     from mmdet3d.structures import Det3DDataSample
 
     from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
+    from gsmap.prior.opening import AnyPrior
 
 
 class Predictor(Protocol):
@@ -43,7 +43,7 @@ class Predictor(Protocol):
         *,
         allow_missing_cameras: bool,
         stream: Any,
-        priors: "Sequence[MapPrior]",
+        priors: "Sequence[AnyPrior]",
         update_priors: bool,
     ) -> "Iterator[Det3DDataSample]":
         """Predict the samples of a data set.
@@ -92,7 +92,7 @@ class LiveMap:
         cam_from_frame: Cameras,
         frame: str | None = None,
         allow_missing_cameras: bool = False,
-        prior: MapPrior | None = None,
+        prior: "AnyPrior | None" = None,
         update_prior: bool = False,
     ):
         self._priors = () if prior is None else (prior,)

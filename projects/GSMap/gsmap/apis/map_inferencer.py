@@ -34,7 +34,6 @@ from gsmap.datasets.elements import elements_of_predictions
 from gsmap.datasets.memory import Cameras
 from gsmap.datasets.source import Source, open_annotations
 from gsmap.evaluation.core.results_json import vectors_of
-from gsmap.prior.map_prior import MapPrior
 from gsmap.structures.elements import MapElements
 from gsmap.utils.errors import InputError
 from gsmap.utils.parallel import delay_signals, result_of
@@ -44,6 +43,7 @@ if TYPE_CHECKING:  # slow to import
     from mmdet3d.structures import Det3DDataSample
 
     from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
+    from gsmap.prior.opening import AnyPrior
     from gsmap.visualization.map_visualizer import MapVisualizer
 
 _GENERATED = "minicity"
@@ -304,7 +304,7 @@ class MapInferencer:
         allow_missing_cameras: bool = False,
         on_broken: Callable[[BrokenFrame], object] | None = None,
         stream: Any = None,
-        priors: Sequence[MapPrior] = (),
+        priors: "Sequence[AnyPrior]" = (),
         update_priors: bool = False,
     ) -> "Iterator[Det3DDataSample]":
         """Predict samples of a data set. Several devices take batches in turn.
@@ -383,7 +383,7 @@ class MapInferencer:
             raise InputError("a model with memory runs on one device: name a single one.")
         return self.model.temporal
 
-    def _maps(self, priors: Sequence[MapPrior], update: bool) -> Any:
+    def _maps(self, priors: "Sequence[AnyPrior]", update: bool) -> Any:
         """Maps that the samples of a call read; None for a model without a prior.
 
         Args:
@@ -470,7 +470,7 @@ class MapInferencer:
         cam_from_frame: Cameras,
         frame: str | None = None,
         allow_missing_cameras: bool = False,
-        prior: MapPrior | None = None,
+        prior: "AnyPrior | None" = None,
         update_prior: bool = False,
     ) -> LiveMap:
         """Create a function from the images of each frame to its map.

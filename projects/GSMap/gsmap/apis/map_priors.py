@@ -3,10 +3,13 @@
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gsmap.prior.map_prior import MapPrior
 from gsmap.utils.errors import InputError
+
+if TYPE_CHECKING:  # slow to import
+    from gsmap.prior.opening import AnyPrior
 
 
 def require_prior(model: Any) -> None:
@@ -15,7 +18,7 @@ def require_prior(model: Any) -> None:
         raise InputError("the model takes no prior (model.prior): leave the prior out.")
 
 
-def maps_for(model: Any, priors: Sequence[MapPrior], update: bool = False) -> Any:
+def maps_for(model: Any, priors: "Sequence[AnyPrior]", update: bool = False) -> Any:
     """Maps of a user in the form that a model reads.
 
     Args:
@@ -48,7 +51,7 @@ def use_priors(model: Any, paths: Sequence[Path], stack: ExitStack) -> None:
 
 def open_priors(
     model: Any, paths: Sequence[Path], stack: ExitStack, update: bool = False, new_place: str = ""
-) -> list[MapPrior]:
+) -> "list[AnyPrior]":
     """Open files of priors until the end of a context.
 
     Args:
@@ -63,12 +66,17 @@ def open_priors(
         ValueError: If a file is no valid prior.
         RuntimeError: If a file is reserved by another process.
     """
+    from gsmap.prior.opening import open_prior
+
     require_prior(model)
-    priors = []
+    priors: list[AnyPrior] = []
     for path in paths:
         if update and not path.exists():
             settings = model.prior.maps.settings_of(new_place)
             with MapPrior(settings, rule=model.prior.test_rule) as empty:
                 empty.save(path)
-        priors.append(stack.enter_context(MapPrior.load(path, update=update)))
+        prior = open_prior(path, update=update)
+        if isinstance(prior, MapPrior):
+            stack.enter_context(prior)
+        priors.append(prior)
     return priors

@@ -12,5 +12,6 @@ __getattr__, __dir__, __all__ = lazy_names(
         "LastSeen": "rules",
         "MapPrior": "map_prior",
         "PriorSettings": "settings",
+        "open_prior": "opening",
     },
 )

@@ -210,7 +210,23 @@ class GaussianPrior:
                 self._tiles.pop(key, None)
             _Active.join(parts).scatter(self._tiles, self.settings.tile_m)
 
-    def read(self, pose: Pose, grid: BEVGrid) -> GaussianMasks:
+    def read(self, pose: Pose, grid: BEVGrid) -> Tensor:
+        """Draw the lines at their mean positions in the cells of a frame, as `MapPrior.read` does.
+
+        Args:
+            pose: Transform from the frame of ``grid`` to the global frame, in metres. Far from the
+                origin it must be float64. (4, 4)
+            grid: Extent and cells of the frame, H rows and W columns.
+
+        Returns:
+            Values in [0, 1], float32 on the device of ``pose``. (C, H, W)
+
+        Raises:
+            ValueError: If ``pose`` is no rigid transform or too far from the origin.
+        """
+        return self.read_masks(pose, grid).mean
+
+    def read_masks(self, pose: Pose, grid: BEVGrid) -> GaussianMasks:
         """Draw the prior in the cells of a frame (GSMap Eq. 6).
 
         Args:

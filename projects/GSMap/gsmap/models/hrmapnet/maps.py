@@ -2,6 +2,7 @@
 
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -9,7 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from gsmap.prior.gaussian_prior import GaussianPrior
 from gsmap.prior.map_prior import MapPrior
+from gsmap.prior.opening import AnyPrior
 from gsmap.prior.rules import WriteRule
 from gsmap.prior.settings import PriorSettings
 from gsmap.structures.grid import BEVGrid
@@ -90,23 +93,24 @@ class PlaceMaps:
         self.memory = memory
         self.writes = memory != "none"
         self.cell_m = round(width_m, 6)
-        self._priors: OrderedDict[str, MapPrior] = OrderedDict()
+        self._priors: OrderedDict[str, AnyPrior] = OrderedDict()
 
     def settings_of(self, name: str) -> PriorSettings:
         """Settings of the map of a place."""
         return PriorSettings(self.classes, place=name, cell_m=self.cell_m)
 
-    def find(self, place: Place) -> MapPrior | None:
+    def find(self, place: Place) -> AnyPrior | None:
         """Map at a place, or None if nothing has been written there."""
         return self._priors.get(self._key(place))
 
-    def find_or_create(self, place: Place) -> MapPrior:
+    def find_or_create(self, place: Place) -> AnyPrior:
         """Map at a place, which is created if there is none."""
         key = self._key(place)
         if key not in self._priors:
             if self.memory == "scene" and len(self._priors) >= _MOST_SCENES:
                 _, oldest = self._priors.popitem(last=False)
-                oldest.close()
+                if isinstance(oldest, MapPrior):
+                    oldest.close()
             self._priors[key] = MapPrior(self.settings_of(key), rule=self.rule)
         return self._priors[key]
 
@@ -138,7 +142,9 @@ class PlaceMaps:
             raster: Values in [0, 1]. (classes, H, W)
         """
         if place is not None and self.writes:
-            self.find_or_create(place).write(place.pose, self.grid, values=raster)
+            prior = self.find_or_create(place)
+            assert isinstance(prior, MapPrior)  # GivenMaps refuses to write others
+            prior.write(place.pose, self.grid, values=raster)
 
 
 class GivenMaps(PlaceMaps):
@@ -151,12 +157,13 @@ class GivenMaps(PlaceMaps):
         update: Write each frame after it is predicted.
 
     Raises:
-        ValueError: If a prior has other classes or cells, or two are of one place.
+        ValueError: If a prior has other classes or cells, two are of one place, or a Gaussian prior
+            is to be written.
     """
 
     def __init__(
         self,
-        priors: Sequence[MapPrior],
+        priors: Sequence[AnyPrior],
         classes: Sequence[str],
         grid: BEVGrid,
         update: bool = False,
@@ -167,7 +174,17 @@ class GivenMaps(PlaceMaps):
         self.writes = update
         for prior in priors:
             name = prior.settings.place
-            self.settings_of(name).require_equal(prior.settings, f"the prior of {name!r}")
+            expected = self.settings_of(name)
+            found = prior.settings
+            if isinstance(prior, GaussianPrior):
+                if update:
+                    raise InputError(
+                        f"the prior of {name!r} has Gaussians, which a model reads only: leave the "
+                        "update out; tools/build_map.py --prior --gaussians makes it anew."
+                    )
+                # it has no cells: it is drawn in those of a window
+                found = replace(found, cell_m=expected.cell_m, tile_m=expected.tile_m)
+            expected.require_equal(found, f"the prior of {name!r}")
             if name in self._priors:
                 raise InputError(f"two priors are of {name!r}: give one for each place.")
             self._priors[name] = prior
@@ -176,7 +193,7 @@ class GivenMaps(PlaceMaps):
         """The maps themselves: they belong to the user and are not copied."""
         return self
 
-    def find(self, place: Place) -> MapPrior:
+    def find(self, place: Place) -> AnyPrior:
         """Map at a place. A frame without the name of a place is taken to be at the only one.
 
         Raises:
@@ -192,7 +209,7 @@ class GivenMaps(PlaceMaps):
             )
         return self._priors[place.name]
 
-    def find_or_create(self, place: Place) -> MapPrior:
+    def find_or_create(self, place: Place) -> AnyPrior:
         """Map at a place (`find`)."""
         return self.find(place)
 

@@ -22,7 +22,7 @@ from gsmap.models.hrmapnet.bev_fusion import PriorBEVFusion
 from gsmap.models.hrmapnet.drawing import draw_elements
 from gsmap.models.hrmapnet.maps import GivenMaps, Place, PlaceMaps
 from gsmap.models.hrmapnet.query_start import MapKeys, PriorHook, PriorQueries
-from gsmap.prior.map_prior import MapPrior
+from gsmap.prior.opening import AnyPrior
 from gsmap.prior.rules import RULES, WriteRule
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.grid import BEVGrid
@@ -176,7 +176,7 @@ class RasterPrior(BaseModule, AddsWeights):
         memory = "kept" if self.training else self.test_memory
         return PlaceMaps(self.classes, self.window, rule=rule, memory=memory)
 
-    def maps_of(self, priors: Sequence[MapPrior], update: bool = False) -> GivenMaps:
+    def maps_of(self, priors: Sequence[AnyPrior], update: bool = False) -> GivenMaps:
         """Maps of a user, for `use` and `using`.
 
         Args:
