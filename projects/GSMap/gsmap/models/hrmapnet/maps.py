@@ -66,7 +66,7 @@ class PlaceMaps:
     Args:
         classes: Names of the classes.
         grid: Extent and cells of the windows that are read and written.
-        rule: Rule of writing.
+        rule: Rule of writing of the maps; that of `MapPrior` by default.
         memory: ``"kept"``: one map for all frames of a place. ``"scene"``: one map for each scene.
             ``"none"``: nothing is written.
 
@@ -80,7 +80,11 @@ class PlaceMaps:
     memories: ClassVar[tuple[str, ...]] = ("kept", "scene", "none")
 
     def __init__(
-        self, classes: Sequence[str], grid: BEVGrid, rule: WriteRule, memory: str = "kept"
+        self,
+        classes: Sequence[str],
+        grid: BEVGrid,
+        rule: WriteRule | None = None,
+        memory: str = "kept",
     ) -> None:
         if memory not in self.memories:
             raise InputError(f"the memory of a prior must be one of {self.memories}: {memory!r}.")
@@ -170,7 +174,7 @@ class GivenMaps(PlaceMaps):
     ) -> None:
         if not priors:
             raise InputError("give at least one prior, or none at all.")
-        super().__init__(classes, grid, rule=priors[0].rule)
+        super().__init__(classes, grid)  # no map is created
         self.writes = update
         for prior in priors:
             name = prior.settings.place
