@@ -179,7 +179,7 @@ def test_what_is_not_known_is_said_and_what_cannot_be_is_refused(tmp_path, caplo
         {MOUNT: [[10**400] * 4] * 4},
         {MOUNT: rigid(np.eye(3), [1e4, 0, 0]).tolist()},
     ):
-        with pytest.raises(ValueError, match="where its frame lies in the vehicle makes no sense"):
+        with pytest.raises(ValueError, match="the place of its frame in the vehicle is impossible"):
             opened(**wrong)
 
 

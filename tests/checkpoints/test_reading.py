@@ -236,7 +236,7 @@ def test_settings_that_make_no_model_are_the_checkpoints_fault(
     with pytest.raises(ValueError, match=message) as raised:
         adopt_settings(small, path, None)
     text = str(raised.value)
-    assert text.startswith(f"{path} was not loaded: of the settings in it, ")
+    assert text.startswith(f"{path} was not loaded, because its model settings are refused: ")
     assert "maptr_r18_minicity.py" not in text
 
 

@@ -36,7 +36,7 @@ def test_a_transform_that_names_another_value_is_refused_in_training_alone():
     targets_of(cfg).num_points = 12
     again = read_config(cfg)  # as inference reads it
     assert targets_of(again).num_points == 12
-    message = rf"num_points of FormatMapTargets is 12.* makes it {points}"
+    message = rf"num_points of FormatMapTargets is 12.* require {points}"
     with pytest.raises(ValueError, match=message):
         check_config(again)
     again.model.map_head.num_points = 12

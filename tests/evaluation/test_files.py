@@ -209,7 +209,7 @@ def test_heights_count_in_chamfer_if_asked_and_never_in_raster(tmp_path):
         (
             '{"results": [{"sample_token": "t0", "vectors": [{"pts": [[0, 0], [1e9, 1]],'
             '"cls_name": "divider", "confidence_level": 1}]}]}',
-            "t0.*a line of 1e\\+09 m, or that far from the vehicle",
+            "t0.*a line is 1e\\+09 m long, or a point is that far from the vehicle",
         ),
         (  # each point is near, the line is long
             '{"results": [{"sample_token": "t0", "vectors": [{"pts": ['
@@ -223,7 +223,7 @@ def test_heights_count_in_chamfer_if_asked_and_never_in_raster(tmp_path):
                 ['{"pts": [[0, 0], [9e4, 0]], "cls_name": "divider", "confidence_level": 1}'] * 12
             )
             + "]}]}",
-            "t0.*lines of 1.08e\\+06 m in all: at most 1000 km",
+            "t0.*all lines together are 1.08e\\+06 m long: at most 1000 km",
         ),
         (  # names of two kinds could not be sorted in the notes
             '{"results": [{"sample_token": "t0", "vectors": [{"pts": [[0, 0], [1, 1]],'

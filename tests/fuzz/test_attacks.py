@@ -98,7 +98,9 @@ def test_no_settings_of_a_checkpoint_run_anything(checkpoints: set[str], tmp_pat
     assert outcomes.keys() == checkpoints
     for name, outcome in outcomes.items():
         assert outcome.startswith("did not run, InputError: "), f"{name}: {outcome}"
-        assert f"{name}.pkl was not loaded: of the settings in it" in outcome, f"{name}: {outcome}"
+        assert f"{name}.pkl was not loaded, because its model settings are refused" in outcome, (
+            f"{name}: {outcome}"
+        )
 
 
 def test_no_config_of_another_repository_runs_anything_or_hangs(tmp_path: Path):

@@ -16,6 +16,7 @@ def _summary(tool: Path) -> str:
     source = tool.read_text(encoding="utf-8")
     docstring = ast.get_docstring(ast.parse(source)) or ""
     first_line = docstring.split("\n")[0]
+    # The command may follow the summary: "Make annotation files: ``create_data.py ...``."
     return first_line.partition(": ``")[0].rstrip(".")
 
 

@@ -33,15 +33,15 @@ class Method:
         return Path(__file__).parent / "models" / self.name
 
     def paper(self) -> dict[str, Any]:
-        """Read the numbers of the paper and of the released code from ``paper.json``.
+        """Read the numbers of the paper and of the authors' code from ``paper.json``.
 
         Returns:
             Dictionary with ``arxiv``, the number of the paper at arXiv; ``parameters``, the number
             of trainable parameters of each config; ``settings``, the published values by config
             and path of the setting; ``heads``, the published parts of each config's head; and
-            ``tables``, tables in the format of ``configs/tables.json``. A head has the number of
-            queries of each group, the weights of its losses and auxiliary heads by name, and the
-            weights of its matching costs in the order of the config.
+            ``tables``, tables in the format of ``configs/tables.json``. An entry of ``heads`` has
+            the number of queries of each group, the weights of the losses and auxiliary heads by
+            name, and the weights of the matching costs in the order of the config.
         """
         return read_json(self.folder / "paper.json")
 

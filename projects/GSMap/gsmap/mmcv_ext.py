@@ -4,8 +4,7 @@
 imports every operator from that module. GSMap uses two operators, the hard voxelisation of LiDAR
 points and the modulated deformable convolution, which are implemented with torch. All other
 operators are functions that raise an error with the name of the operator and the command that
-installs it.
-``gsmap/__init__.py`` adds `MmcvExtFinder` to ``sys.meta_path``.
+installs it. ``gsmap/__init__.py`` adds `MmcvExtFinder` to ``sys.meta_path``.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ def test_a_setting_that_head_and_transform_share_has_one_value(side):
     steps = cfg.train_dataloader.dataset.pipeline
     (step,) = [step for step in steps if step.type == "MakeLineMaps"]
     (cfg.model.map_head if side == "head" else step).num_directions = 72
-    message = r"num_directions of MakeLineMaps is \d+, but that of HDMapNetHead makes it \d+"
+    message = r"num_directions of MakeLineMaps is \d+, but the settings of HDMapNetHead require \d+"
     with pytest.raises(ValueError, match=message):
         check_config(cfg)
     cfg.model.map_head.num_directions = step.num_directions = 72

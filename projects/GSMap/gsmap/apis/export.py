@@ -89,10 +89,11 @@ class ExportedDetector(nn.Module):
             images: Pixel values of the data pipeline: 0 to 255, neither normalised nor padded.
                 (V, 3, H, W)
             inputs: Tensors of ``input_names[1:]``. The first ones are the calibration of the BEV
-                encoder, (V, 4, 4) or (18,) each. A model with a map prior also takes its window
-                (classes, H, W). A model with memory also takes the transform from
-                the previous to the current frame in metres (4, 4), the seconds between them (1,),
-                1 or 0 for whether the stream continues (1,), and the memory of the previous frame.
+                encoder, (V, 4, 4) or (18,) each. A model with a map prior also takes the window of
+                the prior (classes, H, W). A model with memory also takes the transform from the
+                previous to the current frame in metres (4, 4), the seconds between both frames
+                (1,), 1 or 0 for whether the stream continues (1,), and the memory of the previous
+                frame.
 
         Returns:
             Tensors of ``output_names``, best element first: scores (M,), labels (M,), and points in
@@ -424,9 +425,9 @@ def largest_differences(
             equally short, rounding determines which one ``unfold_classes`` selects.
 
     Returns:
-        The largest difference of a score, and the largest distance of an element to the nearest one
-        of its class: the largest difference of a coordinate, in metres. Both are infinite if the
-        numbers of elements of a class differ.
+        The largest difference of a score, and the largest distance in metres of an element from the
+        nearest element of its class. The distance of two elements is the largest difference of a
+        coordinate. Both values are infinite if the numbers of elements of a class differ.
     """
     if sorted(found.labels) != sorted(expected.labels):
         return float("inf"), float("inf")
@@ -473,6 +474,7 @@ def _operator_translations() -> dict[Any, Any]:
         bags = op.Concat(num_bags, bag_size, axis=0)
         weights = op.Unsqueeze(op.Reshape(weights, bags, allowzero=1), one)
         sums = op.MatMul(weights, op.Gather(table, op.Reshape(rows, bags, allowzero=1)))
+        # The operator has three more outputs, which serve its backward pass alone.
         return op.Squeeze(sums, one), offsets, offsets, offsets
 
     return {torch.ops.aten.embedding_bag.padding_idx: embedding_bag}
@@ -485,6 +487,6 @@ def _describe_export_error(error: BaseException) -> str:
     if isinstance(error, GsmapError):  # raised by the model, for example for a number of cameras
         return str(error)
     return (
-        f"the model cannot be written in ONNX's operators ({error!s:.300}): say how in "
-        "_operator_translations() of gsmap/apis/export.py, or replace that part of the model."
+        f"the model cannot be written in ONNX's operators ({error!s:.300}): add a translation to "
+        "_operator_translations() of gsmap/apis/export.py, or replace this part of the model."
     )

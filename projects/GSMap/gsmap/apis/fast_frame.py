@@ -122,7 +122,7 @@ class StaticFrame(nn.Module):
         columns = []
         for name, value in fields.items():
             layout[name] = (value.shape[1:], value.dtype)
-            columns.append(value.unsqueeze(-1).flatten(1).float())
+            columns.append(value.unsqueeze(-1).flatten(1).float())  # (M, entries of the field)
         self.layout = layout
         return torch.cat(columns, dim=1)
 

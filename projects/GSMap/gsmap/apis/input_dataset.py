@@ -59,7 +59,8 @@ def open_dataset(
     settings["split"] = None
     settings["dim"] = None
     settings["cameras"] = _select_cameras(cfg, samples)
-    settings["serialize_data"] = len(samples) > 1  # slow: collects garbage
+    # For one sample, serialisation would take most of the time, because it collects garbage.
+    settings["serialize_data"] = len(samples) > 1
     if source.data_root is not None:
         settings["data_root"] = str(source.data_root.resolve())
     with building(cfg):

@@ -153,8 +153,8 @@ class LiveMap:
             can_bus: Vehicle signals, as `motion_signals` computes them from poses. Without them, a
                 model that was trained with signals assumes a standing vehicle. (18,)
             at: Name, scene, time and pose of the frame. Required with ``stream`` and with the prior
-                of this map. The pose is the
-                transform from the frame of the calibration to the world, in metres.
+                of this map. The pose is the transform from the frame of the calibration to the
+                world, in metres.
             stream: Memory of the earlier frames of the drive, from ``MapInferencer.new_stream``.
                 For temporal models only.
 
@@ -170,9 +170,11 @@ class LiveMap:
                 later than the last frame of the stream.
         """
         has_stream = stream is not None
-        if self._priors and at is None:
+        has_pose = at is not None
+        if self._priors and not has_pose:
             raise InputError("a frame reads the prior at its pose: give it at=Frame(...).")
-        if has_stream != (at is not None) and not (self._priors and not has_stream):
+        is_pose_of_prior = bool(self._priors) and not has_stream  # then `at` needs no stream
+        if has_stream != has_pose and not is_pose_of_prior:
             raise InputError(
                 "a frame that continues a stream needs both at=Frame(...) and stream=..., got "
                 f"at={at} and stream={stream}."

@@ -157,7 +157,7 @@ def _training_mount(cfg: Config, contents: Checkpoint | None, path: object) -> M
         matrix = None if matrix is None else _check_mount(matrix)
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(
-            f"{path} was not loaded: where its frame lies in the vehicle makes no sense ({error})."
+            f"{path} was not loaded: the place of its frame in the vehicle is impossible ({error})."
         ) from error
     return Mount(frame, ground_z_m=height, ground_from_frame=matrix)
 

@@ -228,7 +228,7 @@ class MapInferencer:
         self._warn_generated = False
         _LOGGER.warning(
             "the model has seen generated streets alone (MiniCity): on real images its maps are a "
-            "trial, not a result; train it on your own (docs/custom_data.md)."
+            "trial, not a result; train it on your own data (docs/custom_data.md)."
         )
 
     def _fit_cameras(

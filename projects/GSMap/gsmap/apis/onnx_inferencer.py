@@ -29,7 +29,8 @@ POSE_ONLY_RULE = (
 NO_SIGNALS = "not needed: the model was trained without vehicle signals; zeros are taken"
 STREAM_INPUTS = ("now_from_then", "seconds", "continues")  # inputs of a model with memory
 PRIOR_INPUT = "prior"  # window of a map prior, an input of a model that reads one
-MEMORY_PREFIX = "memory_"  # of further inputs; the outputs that replace them start with new_memory_
+# Prefix of the inputs with the memory. The outputs with the new memory start with `new_memory_`.
+MEMORY_PREFIX = "memory_"
 _PRECISIONS = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 _REQUIRED_OUTPUTS = {"scores", "labels", "points"}
 
@@ -102,7 +103,7 @@ class OnnxInferencer:
         images, *other_inputs = self.session.get_inputs()
         shape = [len(self.metadata["cameras"]), 3, *self.metadata["image_size"]]
         if images.shape != shape or not _REQUIRED_OUTPUTS.issubset(self._outputs):
-            raise InputError("its graph is not the one that its metadata tell of")
+            raise InputError("its graph does not fit its metadata")
         self._initial_memory: dict[str, NDArray[Any]] = {}
         self._calibration: list[str] = []
         self.prior_shape: tuple[int, ...] | None = None
@@ -304,7 +305,7 @@ class OnnxInferencer:
             if np.shape(image) != (rows, columns, 3):
                 raise InputError(
                     f"{self.path.name} takes images of {rows} x {columns} (rows x columns, three "
-                    f"channels), that of {camera} has shape {np.shape(image)}: scale it and "
+                    f"channels), the image of {camera} has shape {np.shape(image)}: scale it and "
                     f"lidar2img alike, or export with --size."
                 )
 

@@ -36,8 +36,9 @@ AZIMUTHS_DEG = {
     "ring_rear_right": -153,
 }  # fmt: skip
 
-_GENERATOR_LABELS = "map_head.generator.label."  # changed only with weights of its detector
-# Prefixes of weights with a row for each class, and the number of rows before these.
+# Class embeddings of a generator, which are reordered only together with those of its detector.
+_GENERATOR_LABELS = "map_head.generator.label."
+# Prefixes of weights with a row for each class, and the number of rows before the first class.
 _CLASS_ROWS = {
     "map_head.cls_branches.": 0, "map_head.cls_branch.": 0, "map_head.detector.cls_branches.": 0,
     "map_head.detector.cls_branch.": 0, _GENERATOR_LABELS: 0,
@@ -141,7 +142,7 @@ def fit_start(
     notes = {
         "x_range": "the queries of the map are stretched to it",
         "y_range": "the queries of the map are stretched to it",
-        "frame": "training learns anew where ahead is; samples in the old one would save that",
+        "frame": "training must learn which axis points ahead; samples in the old frame avoid this",
     }
     for name, note in notes.items():
         if name in origin and plain(origin[name]) != plain(metainfo[name]):
@@ -224,7 +225,9 @@ def _fit_cells(state: dict[str, Tensor], initial: Mapping[str, Tensor]) -> list[
 def _fit_queries(
     state: dict[str, Tensor], initial: Mapping[str, Tensor], model: nn.Module
 ) -> list[str]:
-    """Append initial queries if the model has one group of queries and the checkpoint fewer.
+    """Append initial queries if the checkpoint has fewer queries than the model.
+
+    This is done only for models with one group of queries.
 
     Args:
         state: Weights of the checkpoint; changed in place.
@@ -335,7 +338,9 @@ class RigFitHook(Hook):
             runner: Runner of the training.
             checkpoint: Contents of the checkpoint; changed in place.
         """
-        if runner._resume or isinstance(runner._train_loop, dict | None):
+        if runner._resume or isinstance(
+            runner._train_loop, dict | None
+        ):  # no loop is built: a test
             return
         dataset = innermost(runner.train_dataloader.dataset)
         state = checkpoint.get("state_dict", checkpoint)

@@ -199,7 +199,7 @@ def _sections(settings: Any, prefix: str) -> Iterator[tuple[str, dict[str, Any]]
     """
     items = enumerate(settings) if isinstance(settings, list | tuple) else settings.items()
     for key, value in items:
-        if str(key).startswith("_"):  # values that other settings have copies of
+        if str(key).startswith("_"):  # a variable of the config: settings have copies of it
             continue
         if isinstance(value, dict) and "type" in value:
             yield f"{prefix}{key}", value
@@ -220,6 +220,7 @@ def _describe_unknown_setting(
     """
     class_name, _, method = owner.rpartition(".")
     target = class_name or owner
+    # The module may also call the class or function directly, without a registry.
     parts = [*parts, _Part(registry=None, kind=scope.get(target))]
     valid_names: list[str] = []
     for part in parts:

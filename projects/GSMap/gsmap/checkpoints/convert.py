@@ -57,7 +57,7 @@ def upstream_from_ours(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
         state: Weights by the keys of this project.
 
     Raises:
-        ValueError: If the key map of the state's architecture does not contain another key.
+        ValueError: If the key map of the state's architecture lacks the key of any other weight.
     """
     key_map = find_key_map(state)
     renamed: dict[str, Tensor] = {}
@@ -71,7 +71,7 @@ def upstream_from_ours(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     if unknown:
         raise InputError(
             f"keys that upstream's {key_map.name} does not have: {summarize_names(unknown)}. "
-            "Without them the model would find something else: it stays in our format."
+            "Without these weights the model would predict other maps, so it is not converted."
         )
     for key, constant in key_map.unused.items():
         if constant is not None:

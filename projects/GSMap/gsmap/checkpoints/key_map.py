@@ -21,8 +21,9 @@ def key_maps() -> tuple[KeyMap, ...]:
     num_users: Counter[str] = Counter()
     for method in METHODS:
         num_users.update(method.built_on)
-    # A model comes after the models that build on it. Between unrelated models, the later one in
-    # METHODS is more special; sorting keeps the reversed order of equal counts.
+    # Models are sorted by the number of models that build on them, so that a model comes after
+    # those. Models of equal numbers stay in the reversed order of METHODS: the later is the more
+    # special one.
     methods = sorted(reversed(METHODS), key=lambda method: num_users[method.name])
     maps: list[KeyMap] = []
     for method in methods:

@@ -237,9 +237,9 @@ def _download_error(address: str, reason: str) -> OSError:
     name = _published_name(address)
     place = os.environ.get(WEIGHTS) or f"a folder and set {WEIGHTS} to it"
     return OSError(
-        f"{address} cannot be fetched ({reason}): put {name} into {place}, or set "
-        "init_cfg.checkpoint (load_from, if that names it) to a path; init_cfg=None of the part "
-        "trains it from scratch."
+        f"{address} cannot be fetched ({reason}): put {name} into {place}, or set the setting with "
+        "this address (init_cfg.checkpoint or load_from) to a path; with init_cfg=None, the part "
+        "is trained from scratch."
     )
 
 

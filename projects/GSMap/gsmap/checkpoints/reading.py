@@ -98,7 +98,8 @@ def refusing(path: object) -> Iterator[None]:
     except _DAMAGE as error:
         if is_machine_error(error) and not _exceeds_file_size(error, path=Path(str(path))):
             raise
-        remedy = _remedy_for(path, default="fetch it again, or use an earlier epoch's")
+        default = "fetch it again, or use the checkpoint of an earlier epoch"
+        remedy = _remedy_for(path, default=default)
         raise InputError(
             f"{path} is not a whole checkpoint ({type(error).__name__}: {error}); {remedy}."
         ) from error
@@ -119,7 +120,7 @@ def _remedy_for(path: object, default: str) -> str:
 
 
 def _exceeds_file_size(error: BaseException, path: Path) -> bool:
-    """Whether a failed allocation was larger than the file, whose sizes are then damaged."""
+    """Whether the failed allocation was larger than the file: then a size in it is damaged."""
     allocation = re.search(r"allocate (\d+) bytes", str(error))
     if allocation is None or not path.is_file():
         return False
@@ -194,7 +195,7 @@ def read_checked(path: str | Path) -> Checkpoint:
     if broken:
         raise InputError(
             f"{path} holds NaN or infinite weights ({summarize_names(broken)}): the training that "
-            "wrote it had failed; use an earlier epoch's."
+            "wrote it had failed; use the checkpoint of an earlier epoch."
         )
     return checkpoint
 
@@ -346,8 +347,8 @@ def _build_settings(
     except Exception as error:  # unchecked settings can raise any class of exception
         reason = (user_message(error) or f"{type(error).__name__}: {error}").rstrip(".")
         raise InputError(
-            f"{path} was not loaded: of the settings in it, {reason}. Give the config that it was "
-            f"trained with, or, {_REMEDY}"
+            f"{path} was not loaded, because its model settings are refused: {reason}. Give the "
+            f"config that it was trained with, or, {_REMEDY}"
         ) from error
     return settings, cfg.model
 

@@ -71,7 +71,7 @@ def unwrap(content: Any) -> Unwrapped:
             del weights[key]
     state = _unwrap_keys(weights)
     averages: set[str] = set()
-    for key in state:
+    for key in state:  # the average of the weight `a.b` is `ema_a_b`
         name_of_average = _AVERAGED + key.replace(".", "_")
         if name_of_average in state:
             averages.add(name_of_average)

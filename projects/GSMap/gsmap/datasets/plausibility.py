@@ -15,7 +15,7 @@ _MAX_HEIGHT_M = 5.0
 _MAX_UP_DEG = 25.0  # slope of the optical axis
 _MAX_DOWN_DEG = 65.0
 _MAX_NAME_DEG = 110.0  # between the optical axis and the direction in the name of the camera
-# from the image centre to the principal point, relative to the width or height of the image
+# Distance of the principal point from the image centre, relative to the width or height.
 _MAX_CENTRE_OFFSET = 0.2
 _MIN_FIELD_OF_VIEW_DEG = 15.0
 _MAX_FIELD_OF_VIEW_DEG = 150.0

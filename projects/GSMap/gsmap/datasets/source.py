@@ -50,7 +50,7 @@ def open_annotations(path: str | Path, data_root: Path | None = None) -> Source:
     if Path(path).suffix != ".arrow":
         raise InputError(
             f"{path} is no annotation file (.arrow): open other recordings with "
-            "mapdata.inputs.open_input and give what it returns."
+            "mapdata.inputs.open_input and pass its result."
         )
     annotations = AnnotationFile(path)
     cameras = annotations[0].cameras if len(annotations) else []

@@ -37,8 +37,8 @@ class _Scene:
         samples: Indices of the samples in temporal order.
         rng: Generator for the order of the frames and pieces and for the cuts between pieces.
         num_pieces: Number of pieces that the scene is cut into at random places.
-        finish_singles: Whether all single frames come before the first piece, as in the released
-            code.
+        finish_singles: Whether all single frames come before the first piece, as in the public code
+            of StreamMapNet.
     """
 
     def __init__(
@@ -84,11 +84,11 @@ class StreamTrainSampler(Sampler[int]):
     """Sampler for streaming training: each place of the batch is a stream of consecutive samples.
 
     There are N = ``slots`` x ranks streams, one for each place of the batch on each rank. Random
-    permutations of the scenes form an endless sequence, and stream j takes its entries j, j + N,
-    j + 2 N and so on. A scene is cut into pieces at random places, and a stream takes one piece of
-    each of its scenes in turn. In the first iterations it takes one random frame of each. The
-    samples depend only on the seed, the ranks and the epoch, so a resumed run continues with the
-    samples of an uninterrupted run.
+    permutations of the scenes form an endless sequence, and stream j takes the entries j, j + N,
+    j + 2 N and so on of this sequence. A scene is cut into pieces at random places, and a stream
+    takes one piece of each of its scenes in turn. In the first iterations, it takes one random
+    frame of each of its scenes instead. The samples depend only on the seed, the ranks and the
+    epoch, so a resumed run continues with the samples of an uninterrupted run.
 
     Args:
         dataset: Data set without a wrapper.
@@ -96,7 +96,7 @@ class StreamTrainSampler(Sampler[int]):
         single_frame_iters: Number of iterations with single frames.
         pieces: Number of pieces that a scene is cut into.
         late_switch: Whether a scene switches to pieces only after all of its single frames, as in
-            the released code. The scenes then switch at different times: after 1.6
+            the public code of StreamMapNet. The scenes then switch at different times: after 1.6
             times ``single_frame_iters`` iterations, half of the samples come from pieces.
         seed: Seed of the random numbers, equal on all ranks; None for 0.
 

@@ -28,7 +28,7 @@ _BROKEN_MODES = ("raise", "skip")
 _METAINFO_OF_FILE = (
     "classes", "x_range", "y_range", "dataset", "split", "frame", "ground_z_m", SPLIT_LIST,
 )  # fmt: skip
-_MAX_POSE_GAP_S = 5.0  # between neighbouring poses that vehicle signals are computed from
+_MAX_POSE_GAP_S = 5.0  # longest time between poses that vehicle signals are computed from
 
 
 @DATASETS.register_module()
@@ -67,8 +67,8 @@ class VectorizedMapDataset(BaseDataset):
         broken_samples: ``raise`` for an error at a sample with a missing or damaged file; ``skip``
             to log and count the sample and use another one instead, in training only.
         max_refetch: Largest number of consecutive samples to skip.
-        indices: First N samples, last -N samples or a list of samples to use, after filtering;
-            None for all samples.
+        indices: Samples to use, after filtering: a list of indices, or a number N for the first N
+            samples (the last -N if N is negative); None for all samples.
         lazy_init: See ``BaseDataset`` of mmengine.
         serialize_data: See ``BaseDataset`` of mmengine.
 
@@ -252,7 +252,8 @@ class VectorizedMapDataset(BaseDataset):
             raise InputError(f"{self.ann_file} has no sample to use (of {len(self.annotations)}).")
         image_rows = rows
         if self._shuffle_images_seed is not None:
-            # A cycle through all samples in random order: no sample keeps its images.
+            # Each sample gets the images of the one before it in a random order, and the first one
+            # those of the last. So no sample keeps its images.
             order = np.random.default_rng(self._shuffle_images_seed).permutation(len(rows))
             image_rows = np.empty_like(rows)
             image_rows[order] = rows[np.roll(order, shift=1)]
@@ -502,9 +503,11 @@ class VectorizedMapDataset(BaseDataset):
                 )
             return None
         except Exception as error:
+            # An error without a message for the user may come from an override of the command. It
+            # is described here, because a worker process sends only the text of an error.
             description = None if user_message(error) else describe_override(error)
             if description is None:
                 raise
-            raise InputError(description) from error  # a worker sends only the text
+            raise InputError(description) from error
         self._broken_in_a_row = 0
         return data

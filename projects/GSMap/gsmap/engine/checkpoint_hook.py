@@ -206,13 +206,13 @@ class AtomicCheckpointHook(CheckpointHook):
         else:
             progress = loop.iter
             end = loop.max_iters
-        is_due = progress >= max(loop.val_begin, 1) and (
-            progress % loop.val_interval == 0 or progress == end
-        )
+        has_begun = progress >= max(loop.val_begin, 1)
+        is_at_interval = progress % loop.val_interval == 0 or progress == end
+        is_due = has_begun and is_at_interval
         marker = Path(runner.work_dir, VALIDATED)
         is_validated = marker.exists() and read_text(marker) == str(runner.iter)
         if is_due and runner.val_loop is not None and not is_validated:
-            runner.logger.info("The run was cut off before its validation, which is made up for.")
+            runner.logger.info("The run was cut off before its validation, which is run now.")
             runner.val_loop.run()
 
     def _forget_foreign_best(self, runner: Runner) -> None:

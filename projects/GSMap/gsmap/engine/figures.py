@@ -61,6 +61,7 @@ class LateHistory(HistoryBuffer):
 
     @property
     def _log_history(self) -> Any:
+        """Values of `HistoryBuffer`, which its methods read; the queue is emptied first."""
         self._waiting.read()
         return self._values
 
@@ -70,6 +71,7 @@ class LateHistory(HistoryBuffer):
 
     @property
     def _count_history(self) -> Any:
+        """Numbers of scalars behind each value of `HistoryBuffer`."""
         self._waiting.read()
         return self._counts
 

@@ -33,7 +33,7 @@ class _LateNorm(OptimWrapper):
         model_indices: list[int] = []
         for indices in self.members:
             model_indices.extend(indices)
-        if model_indices:  # sum the norms in the order of the model
+        if model_indices:  # sum the norms in the order of the model, whatever the groups are
             pairs = sorted(zip(model_indices, params, strict=True), key=itemgetter(0))
             params = [param for _, param in pairs]
         params = [p for p in params if p.requires_grad and p.grad is not None]

@@ -97,7 +97,7 @@ class RankWatch:
         runs the store.
         """
         reports: dict[int, _Report] = {}
-        for rank in (self._rank, *range(self._ranks)):
+        for rank in (self._rank, *range(self._ranks)):  # first this rank, as a test of the store
             try:
                 text = self._store.get(f"{rank}").decode()
             except RuntimeError:  # no answer in time

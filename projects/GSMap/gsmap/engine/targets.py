@@ -42,9 +42,9 @@ def _check_agreement(cfg: Config, steps: list[Any]) -> None:
             for name in head_settings.keys() & step.keys():
                 if _tuples_to_lists(step[name]) != _tuples_to_lists(head_settings[name]):
                     raise InputError(
-                        f"{cfg.filename}: {name} of {step['type']} is {step[name]}, but that of "
-                        f"{head['type']} makes it {head_settings[name]}: leave it out of the "
-                        "transform, which takes it from the head."
+                        f"{cfg.filename}: {name} of {step['type']} is {step[name]}, but the "
+                        f"settings of {head['type']} require {head_settings[name]}: leave it out "
+                        "of the transform, which takes it from the head."
                     )
 
 

@@ -39,6 +39,7 @@ def _cause(error: ChildFailedError) -> tuple[int, ProcessFailure]:
         is_late = failure.timestamp - first_s >= STOP_TIMEOUT_S - 1
         was_killed_late = code == -signal.SIGKILL and is_late
         stopped_by_torchrun = code == -signal.SIGTERM or was_killed_late
+        # False comes before True: ranks that torchrun stopped are last.
         return stopped_by_torchrun, code >= 0, code != INTERRUPTED, failure.timestamp, rank
 
     first_rank = min(error.failures, key=order)

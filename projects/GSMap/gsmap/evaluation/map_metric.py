@@ -118,10 +118,12 @@ class MapMetric(BaseMetric):
     def evaluate(self, size: int) -> dict[str, float]:
         """Collect the records of all ranks and compute the metrics of a data set of ``size``."""
         self._size = size
-        # MMEngine joins ranks up to the shortest: ranks with whole drives have different lengths
+        # `BaseMetric` would cut the records of all ranks to the length of the shortest rank, but
+        # ranks that predict whole drives have different numbers of records.
         parts: list[list[dict[str, Any]]] = all_gather_object(self.results)  # type: ignore[has-type]
         self.results = list(chain.from_iterable(parts))
-        # MMEngine would cut the list at `size`; here tokens identify the repeated samples
+        # `BaseMetric` would also cut the joined list at `size`. Here, tokens identify the repeated
+        # samples, so nothing may be cut.
         return super().evaluate(sys.maxsize)
 
     def compute_metrics(self, results: list[dict[str, Any]]) -> dict[str, float]:
@@ -147,7 +149,7 @@ class MapMetric(BaseMetric):
             reports = self.evaluator.reports(record["matches"] for record in records)
         for report in reports:
             MMLogger.get_current_instance().info("\n%s", format_table(report))
-        if self.out_file is not None:  # after the figures: a disk may be full
+        if self.out_file is not None:  # written last, so that a full disk loses no figures
             samples = ((record["token"], record["vectors"]) for record in records)
             meta = {"classes": list(self._meta("classes"))}
             for key in (SPLIT_LIST, TRAINED_ON, CHECKPOINT, CALIBRATION):

@@ -34,7 +34,8 @@ RASTER_MAGIC = b"\x89GSPRIOR"
 GAUSSIAN_MAGIC = b"\x89GSGAUSS"
 """First bytes of a file of `GaussianPrior`."""
 _START = struct.Struct("<8sII")  # magic, version, length of the header
-_FOOTER = struct.Struct("<QIII8s")  # offset, number and checksum of the index, of the header, magic
+# Offset of the index, number of its rows, its checksum, checksum of the header, and magic.
+_FOOTER = struct.Struct("<QIII8s")
 _INDEX = np.dtype(
     [("column", "<i4"), ("row", "<i4"), ("offset", "<u8"), ("length", "<u4"), ("crc", "<u4")]
 )
@@ -123,6 +124,7 @@ def read_header(
 
 
 def _cut(path: Path) -> InputError:
+    """Error about a file that is too short."""
     return InputError(f"{path} is cut off: its end is missing; copy or build it again.")
 
 
@@ -148,9 +150,11 @@ def _parse_index(index: bytes, path: Path, start: int, end: int) -> dict[TileKey
     """Check the index; tiles lie between the bytes ``start`` and ``end``."""
     rows = np.frombuffer(index, dtype=_INDEX)
     first = rows["offset"]
-    inside = (first >= start) & (first <= end) & (rows["length"] <= end - np.minimum(first, end))
-    columns = np.abs(rows["column"].astype(np.int64))
-    inside &= (columns <= FARTHEST_TILE) & (np.abs(rows["row"].astype(np.int64)) <= FARTHEST_TILE)
+    longest = end - np.minimum(first, end)  # bytes between the start of a tile and the index
+    inside = (first >= start) & (first <= end) & (rows["length"] <= longest)
+    tile_columns = np.abs(rows["column"].astype(np.int64))
+    tile_rows = np.abs(rows["row"].astype(np.int64))
+    inside &= (tile_columns <= FARTHEST_TILE) & (tile_rows <= FARTHEST_TILE)
     places = {}
     for column, row, offset, length, crc in rows.tolist():
         places[column, row] = (offset, length, crc)

@@ -47,9 +47,11 @@ _STORED = np.dtype(
     ]
 )
 _MOST_PER_TILE = 100_000
-_COUNT_BYTES = 4  # before the Gaussians of a tile in a file
-_FORGOTTEN_VALUE = 0.1  # Gaussians below it are removed
-_FORGOTTEN_VIEWS = 3.0  # if their counts are at least this
+_COUNT_BYTES = 4  # a tile in a file begins with the number of its Gaussians, in these bytes
+# A Gaussian is removed if its value is below the first number, and its hits and misses together
+# are at least the second one.
+_FORGOTTEN_VALUE = 0.1
+_FORGOTTEN_VIEWS = 3.0
 _LARGEST_VARIANCE = 1e4  # of a Gaussian in a file, in square metres
 _FAR_M = 1e6  # position of padding, which no raster reaches
 
@@ -71,9 +73,9 @@ class GaussianPrior:
 
     A Gaussian stands for a piece of a line. Its centre and its variance across the line are updated
     by every frame that has it in view: a Kalman filter in information form. Its standard deviation
-    along the line is half of the distance of Gaussians. It also counts hits and misses, as
-    `HitMissCounts` does. Areas are kept by their outlines. All methods may be called from several
-    threads. All Gaussians are in memory.
+    along the line is half of the distance of neighbouring Gaussians. It also counts hits and
+    misses, as `HitMissCounts` does. Areas are stored as their outlines. All methods may be called
+    from several threads. All Gaussians are in memory.
 
     Args:
         settings: Classes, place and tiles; the size of cells is not used.
@@ -154,6 +156,7 @@ class GaussianPrior:
         active = active.select(active.labels == label)
         cos = np.cos(active.angles)
         sin = np.sin(active.angles)
+        # Rotation matrices, whose columns are the directions along and across the line.
         axes = np.stack([np.stack([cos, -sin], axis=-1), np.stack([sin, cos], axis=-1)], axis=-2)
         along = np.full(len(cos), (self.rule.spacing_m / 2) ** 2)
         variances = np.stack([along, active.variances], axis=-1)
@@ -245,11 +248,12 @@ class GaussianPrior:
             keys = self._keys_in_view(frame, grid)
             active = _Active.gather(self._tiles, keys, self.settings.tile_m)
         active = active.select(active.values(self.rule) >= self.rule.least_value)
+        # Gaussians of each class, padded to the number n of the largest class. (C, n, ...)
         num_classes = len(self.settings.classes)
         counts = np.bincount(active.labels, minlength=num_classes)
         shape = (num_classes, max(1, int(counts.max(initial=0))))
         means = np.full((*shape, 2), _FAR_M)
-        scales = np.ones((2, *shape, 2))  # of both masks
+        scales = np.ones((2, *shape, 2))  # for the masks of means and of spreads
         rotations = np.zeros(shape)
         local = frame.to_frame(active.means)
         turns = active.angles - np.arctan2(frame.sin, frame.cos)
@@ -377,7 +381,7 @@ class _Active:
         """Update Gaussians by their measurements, and count hits and misses.
 
         Args:
-            found: Measurements. N
+            found: Measurements. (N,) each
             is_in_view: Whether a Gaussian is in view. (N,)
             rule: Settings.
         """
@@ -443,7 +447,7 @@ def _unpack(content: bytes, crc: int, path: Path) -> Stored:
     count = int.from_bytes(content[:_COUNT_BYTES], "little")
     if zlib.crc32(content) != crc or len(content) < _COUNT_BYTES or count > _MOST_PER_TILE:
         raise InputError(f"{path} is damaged: a tile cannot be read; copy or build it again.")
-    packed = content[_COUNT_BYTES:]
+    packed = content[_COUNT_BYTES:]  # its checksum was checked with the count
     num_bytes = count * _STORED.itemsize
     states = unpack_tile(packed, crc=zlib.crc32(packed), num_bytes=num_bytes, path=path)
     return np.frombuffer(states, dtype=_STORED)

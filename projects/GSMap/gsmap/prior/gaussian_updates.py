@@ -18,7 +18,7 @@ REACH_M = 1.5
 """Largest distance in metres of a line from a Gaussian that it measures, as in ``build_map``."""
 _LEAST_COSINE = np.cos(np.radians(30.0))  # between a Gaussian and a line that measures it
 _SIGMA_PER_M = 0.02  # standard deviation per metre of distance from the vehicle
-_COVERED = 0.75  # of the spacing: distance along a line within which no Gaussian is added
+_COVERED = 0.75  # share of the spacing; so near to a Gaussian, along a line, none is added
 _ROUNDING_M = 1e-3  # covers the rounding of stored positions at the ends of a line
 
 
@@ -153,18 +153,22 @@ def measure(means: FloatArray, angles: FloatArray, lines: LineSamples) -> Measur
     # A segment that crosses a normal within reach has its middle within this radius.
     radius_m = REACH_M + lengths.max() / 2 + _ROUNDING_M
     rows, segments = _near_pairs(means, (start_points + end_points) / 2, radius_m=radius_m)
+    # Ends of each segment, along and across the Gaussian of its pair.
     starts = _offsets(start_points[segments], means[rows], angles=angles[rows])
     ends = _offsets(end_points[segments], means[rows], angles=angles[rows])
     extent, rise = (ends - starts).T
     start_along, start_across = starts.T
+    end_along = ends[:, 0]
+    # The segment crosses the normal, where `along` is 0, at this share of its length.
     fraction = -start_along / np.where(extent == 0, np.inf, extent)
     distances = start_across + fraction * rise
-    crosses = (np.minimum(start_along, ends[:, 0]) <= _ROUNDING_M) & (
-        np.maximum(start_along, ends[:, 0]) >= -_ROUNDING_M
-    )
+    begins_before = np.minimum(start_along, end_along) <= _ROUNDING_M
+    ends_behind = np.maximum(start_along, end_along) >= -_ROUNDING_M
+    crosses = begins_before & ends_behind
     is_match = crosses & (np.abs(distances) <= REACH_M) & (lengths[segments] > 0)
     is_match &= np.abs(extent) >= _LEAST_COSINE * lengths[segments]
     matches = np.flatnonzero(is_match)
+    # Sorted by Gaussian, then by distance, then by segment: the first of a Gaussian is the best.
     order = np.lexsort((segments[matches], np.abs(distances[matches]), rows[matches]))
     matches = matches[order]
     index, first = np.unique(rows[matches], return_index=True)

@@ -1,4 +1,4 @@
-"""Poses, rasters and files that priors take."""
+"""Checks and conversions of the arguments of priors: poses, rasters and files."""
 
 from pathlib import Path
 from typing import IO, Any, NamedTuple

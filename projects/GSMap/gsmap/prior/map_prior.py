@@ -39,8 +39,8 @@ class MapPrior:
 
     Args:
         settings: Classes, place and cells.
-        rule: Rule of writing; `HitMissCounts` by default. `LastSeen` and `KeepMaximum` are those of
-            HRMapNet (arXiv 2409.00620).
+        rule: Rule of writing; `HitMissCounts` by default. `LastSeen` and `KeepMaximum` are the
+            rules of HRMapNet (arXiv 2409.00620).
         memory_bytes: Largest size of the tiles in memory; a tile of three classes has 120 kB, with
             `HitMissCounts` 240 kB.
     """
@@ -240,9 +240,10 @@ class MapPrior:
             self._store_canvas(window, canvas=canvas, touched=touched)
 
     def write_map(self, elements: MapElements, width_m: float = 0.6) -> None:
-        """Write the lines and areas of a vector map, each cell that they cover as a certain hit.
+        """Write the lines and areas of a vector map.
 
-        Other cells do not change. Closed elements of area classes, such as crossings, are filled.
+        Each cell that they cover is updated by a prediction of 1, and other cells do not change.
+        Closed elements of area classes, such as crossings, are filled.
 
         Args:
             elements: Map in the global frame, in metres, with the classes of the prior.
@@ -271,6 +272,8 @@ class MapPrior:
         dx, dy = grid.pixel_size_m
         x = grid.x_range[0] + dx * (np.arange(grid.width) + 0.5)  # (W,)
         y = grid.y_range[0] + dy * (np.arange(grid.height) + 0.5)  # (H,)
+        # The grid lies in a square of num_cells around the origin of the frame. A grid in one
+        # quadrant has a quarter of them.
         corner_m = max(map(abs, (*grid.x_range, *grid.y_range)))
         num_cells = (2 * corner_m / self.settings.cell_m) ** 2
         if not num_cells <= 4 * _MOST_CELLS:
@@ -370,7 +373,16 @@ class _Window:
 
 
 def _cuts(first: int, length: int, side: int) -> list[tuple[int, slice, slice]]:
-    """Cut a range at multiples of ``side``: tile, cells in the range, cells in the tile."""
+    """Cut a range at multiples of ``side``, the borders of tiles.
+
+    Args:
+        first: First cell of the range.
+        length: Number of cells in the range.
+        side: Number of cells of a tile.
+
+    Returns:
+        For each tile its index, the slice of its cells in the range, and their slice in the tile.
+    """
     cuts = []
     end = first + length
     for tile in range(first // side, (end - 1) // side + 1):

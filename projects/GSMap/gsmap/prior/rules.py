@@ -47,7 +47,7 @@ class WriteRule:
 class KeepMaximum(WriteRule):
     """Largest prediction so far, in steps of 1 / 255: the rule of HRMapNet's training.
 
-    Cells never decrease. Predictions are rounded down, as in the release.
+    Cells never decrease. Predictions are rounded down, as in HRMapNet's public code.
     """
 
     def update(self, states: States, values: Floats) -> States:
@@ -65,8 +65,8 @@ class LastSeen(WriteRule):
     """Last prediction with a linear decay by each miss: the rule of HRMapNet's test.
 
     A cell starts at 100. A hit p > 0 raises it to at least 100 + 30 p, so hits do not add up. A
-    miss subtracts 1 from a cell of at least 100. The value of a cell v is (v - 100) / 30 within
-    [0, 1], so a certain prediction lasts for 30 misses.
+    miss subtracts 1 from a cell of at least 100, and sets a lower cell to 99. The value of a cell v
+    is (v - 100) / 30, clipped to [0, 1], so a certain prediction (p = 1) lasts for 30 misses.
 
     Args:
         gain: Rise of a cell by a certain prediction, and number of misses that it lasts.
@@ -95,8 +95,9 @@ class LastSeen(WriteRule):
         """Update cells that are in view. (S, C, n), (C, n) -> (S, C, n)"""
         seen = self.empty + np.float32(self.gain) * values
         new = np.maximum(states, seen[None])
-        # The release compares 100 + 30 p with 100, so a p that rounds to it is a miss.
-        new -= seen[None] <= self.empty
+        # As in HRMapNet's public code, a p so small that 100 + 30 p is rounded to 100 is a miss.
+        is_miss = seen[None] <= self.empty
+        new -= is_miss
         return np.clip(new, self.lowest, self.highest).astype(np.uint8)
 
     def read(self, states: States) -> Floats:
@@ -111,8 +112,9 @@ class HitMissCounts(WriteRule):
 
     A frame with a cell in view multiplies both counts by ``decay`` and adds p to the hits and 1 - p
     to the misses. The value of a cell is hits / (hits + misses + prior_count). Cells that are out
-    of view or occluded keep their counts. Counts are stored in 255ths of 1 / (1 - decay), their
-    upper bound. They are rounded; a count to which nothing is added is rounded down, so it falls.
+    of view or occluded keep their counts. The upper bound of a count, 1 / (1 - decay), is stored as
+    255. Counts are rounded to integers; a count to which nothing is added is rounded down, so that
+    it decreases.
 
     Args:
         decay: Factor of older counts at each view, in [0.5, 0.98].
@@ -143,7 +145,7 @@ class HitMissCounts(WriteRule):
         added = np.stack([values, 1 - values])
         counts = states * np.float32(self.decay)
         counts += self._unit * added
-        counts += np.float32(0.5) * (added > 0)
+        counts += np.float32(0.5) * (added > 0)  # rounds to nearest: `astype` rounds down
         return counts.astype(np.uint8)
 
     def read(self, states: States) -> Floats:

@@ -1,4 +1,4 @@
-"""Tiles of a map prior: a file on disk, a part of it in memory."""
+"""Tiles of a map prior: all of them in files, and the recently used ones in memory."""
 
 import mmap
 import os
@@ -17,14 +17,15 @@ from gsmap.utils.errors import WorkError
 
 Tile = NDArray[np.uint8]
 _LEVEL = 1  # of zlib; higher levels save little on sparse rasters
-_MAPPED_BYTES = 32 << 20  # read from the mapped file before its pages are released
-_WASTED_BYTES = 64 << 20  # of the temporary file before it is written again
+_MAPPED_BYTES = 32 << 20  # after reading this from a mapped file, its pages leave memory
+_WASTED_BYTES = 64 << 20  # of replaced tiles in the temporary file, before it is written again
 
 
 class TileStore:
-    """Tiles by their place, of which the least recently used leave memory.
+    """Tiles by their place, with a limit of memory.
 
-    A changed tile that leaves memory is compressed into a temporary file, so memory is bounded.
+    When the limit is reached, the least recently used tile leaves memory. If it has changed since
+    it was read, it is compressed and written to a temporary file.
 
     Args:
         shape: Shape of a tile.
@@ -133,7 +134,7 @@ class TileStore:
         return np.frombuffer(states, dtype=np.uint8).reshape(self.shape)
 
     def _keep(self, key: TileKey, tile: Tile) -> None:
-        """Add a tile to those in memory, from which the least recently used one leaves."""
+        """Add a tile to the tiles in memory. At the limit, the least recently used one leaves."""
         while len(self._tiles) >= self._most_tiles:
             oldest = next(iter(self._tiles))
             if oldest in self._changed:
@@ -157,7 +158,8 @@ class _SpillFile:
     def write(self, key: TileKey, content: bytes) -> None:
         """Write a tile; a later one replaces it."""
         self._require_process()
-        if self._end - self._used_bytes > max(_WASTED_BYTES, self._used_bytes):
+        replaced_bytes = self._end - self._used_bytes
+        if replaced_bytes > max(_WASTED_BYTES, self._used_bytes):
             self._compact()
         if key in self.places:
             self._used_bytes -= self.places[key][1]

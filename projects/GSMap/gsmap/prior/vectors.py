@@ -29,7 +29,7 @@ def covered_cells(
 ) -> Iterator[tuple[TileKey, NDArray[np.bool_]]]:
     """Iterate over the tiles that a map touches, each with the cells that it covers.
 
-    Closed elements of `AREA_CLASSES` are filled. A cell is covered if half of it is.
+    Closed elements of `AREA_CLASSES` are filled. A cell is covered if half of its area is.
 
     Args:
         elements: Map in the global frame, in metres.
@@ -82,9 +82,14 @@ def _pieces_by_tile(
             continue
         points = line[:, :2]
         is_area = settings.classes[label] in AREA_CLASSES and is_closed(points)
-        length_m = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
-        size = np.ptp(points, axis=0) / settings.tile_m + 2
-        num_pieces += int(size.prod() if is_area else length_m / settings.tile_m * 4) + len(line)
+        # Bound on the number of pieces, before any of them takes memory.
+        if is_area:
+            tiles_along_axes = np.ptp(points, axis=0) / settings.tile_m + 2
+            most_pieces = tiles_along_axes.prod()
+        else:
+            length_m = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
+            most_pieces = length_m / settings.tile_m * 4
+        num_pieces += int(most_pieces) + len(line)
         if num_pieces > _MOST_PIECES:
             raise InputError(
                 f"the map covers more than {_MOST_PIECES} tiles: its coordinates are no metres, or "

@@ -1,4 +1,4 @@
-"""Piecewise Bezier curves: lines as few control points (Qiao et al., CVPR 2023).
+"""Piecewise Bezier curves, which describe lines by few control points (Qiao et al., CVPR 2023).
 
 A curve of k pieces of degree d has ``k * d + 1`` control points: joint, inner points, joint, ...
 """
@@ -16,7 +16,7 @@ from gsmap.utils.errors import InputError
 
 MAX_DEGREE = 5
 SAMPLES = 100  # points of a line and of a piece that a fit compares, both ends included
-_WORK = 2000  # limit of the search for joints: compared points for each vertex of a line
+_WORK = 2000  # limit of the search for joints, in points to compare per vertex of the line
 
 Float = NDArray[np.float64]
 Deviation = Callable[[Float, Float], float]
@@ -95,7 +95,7 @@ def fit_piece(points: Points, degree: int) -> Float:
 
 
 def mean_deviation(line: Float, curve: Float, ignored_m: float = 0.05) -> float:
-    """Compute the mean distance of a line and a curve, as in the released code of BeMapNet.
+    """Compute the mean distance of a line and a curve, as in the public code of BeMapNet.
 
     Args:
         line: Vertices of the line in metres, resampled to 100 points. (n, D)
@@ -239,7 +239,7 @@ def fit_pieces(
     """Fit a line with few pieces, each as long as the error allows.
 
     Joints are vertices of the line (`fit_joints`). A piece between neighbouring vertices is exact,
-    so there is always a fit. The release uses ``deviation=mean_deviation``.
+    so there is always a fit. The public code of BeMapNet uses ``deviation=mean_deviation``.
 
     Args:
         points: Vertices in metres. (n >= 2, D)

@@ -11,8 +11,9 @@ from gsmap.utils.errors import InputError
 NUM_CAN_BUS = 18
 OF_ONE_FRAME = slice(3, 17)  # entries of ``can_bus`` that need no earlier frame
 
-# Camera 1 km ahead of the vehicle with ahead as its direction. The whole range is behind the camera
-# and its frustum out of range, so it contributes to no BEV cell, by projection or by lifting.
+# Camera that is 1 km ahead of the vehicle and looks ahead. The whole range of the map is behind the
+# camera, and its frustum is out of range. So it contributes to no BEV cell, by projection or by
+# lifting.
 OUT_OF_SIGHT = np.array(
     [[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, -1000.0], [0, 0, 0, 1.0]]
 )  # cam_from_frame

@@ -225,7 +225,8 @@ class MapElements:
 def _require(valid: BoolArray, offsets: IntArray, fault: str) -> None:
     """Raise ValueError with the first element that has an invalid vertex. (M,), (N + 1,)"""
     if not valid.all():
-        index = np.searchsorted(offsets, valid.argmin(), side="right") - 1
+        first_invalid = valid.argmin()
+        index = np.searchsorted(offsets, first_invalid, side="right") - 1
         raise InputError(f"element {index} has a {fault}.")
 
 

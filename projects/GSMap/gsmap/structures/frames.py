@@ -37,8 +37,8 @@ class FrameView:
         """
         if ego_from_frame is None:
             return self
-        # Height of a point in the vehicle: a x + b y + c z + height. It is ``ego_ground_z_m`` on
-        # the ground, which gives z.
+        # z of a point in the frame of the vehicle is a x + b y + c z + height. On the ground, it
+        # is ``ego_ground_z_m``; solved for z, this is the ground plane in the annotation frame.
         a, b, c, height = np.asarray(ego_from_frame)[2].tolist()
         return replace(self, ground=(-a / c, -b / c, (self.ego_ground_z_m - height) / c))
 

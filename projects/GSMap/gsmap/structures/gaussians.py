@@ -197,8 +197,10 @@ class GaussianSpace:
             cross = half * sin
             entries = [middle + half * cos, cross * y_per_x, cross * x_per_y, middle - half * cos]
             return torch.cat(entries, dim=-1).unflatten(-1, (2, 2))
-        # Theta is the angle from the direction of travel. The products of both stretches with its
-        # cosine and sine are the entries of R D, and a constant matrix rotates and scales them.
+        # Theta is the angle from the direction of travel, and a and b are the stretches along both
+        # axes. The entries of the result are the products (a cos, a sin, b cos, b sin), each with a
+        # constant factor. Row i of the constant matrix has the factors with which product i enters
+        # the entries (xx, xy, yx, yy).
         turn = _cos_and_sin(theta, factor=1.0, shift_rad=0.0)
         products = (stretch[..., :, None] * turn[..., None, :]).flatten(-2)
         first = [(1, 0, 0, 0), (0, 0, x_per_y, 0)]
@@ -231,7 +233,7 @@ class GaussianSpace:
 
 def _cos_and_sin(angle: Tensor, factor: float, shift_rad: float) -> Tensor:
     """Cosine and sine of ``factor * angle + shift_rad`` by two operations. (..., 1) -> (..., 2)"""
-    shifts = constant(angle, (shift_rad + math.pi / 2, shift_rad))
+    shifts = constant(angle, (shift_rad + math.pi / 2, shift_rad))  # cos x = sin(x + pi / 2)
     return torch.addcmul(shifts, angle, constant(angle, factor)).sin()
 
 
@@ -262,9 +264,12 @@ def with_covariances(means: Tensor, covariances: Tensor, near: Tensor) -> Gaussi
     half = (local[..., 0, 0] - local[..., 1, 1]) / 2
     cross = (local[..., 0, 1] + local[..., 1, 0]) / 2
     is_round = half.square() + cross.square() <= (_ROUND * middle).square()
-    # Neither the root nor the angle has a gradient at zero.
+    # Neither the root nor the angle has a gradient at zero: round Gaussians get other values here.
     half = torch.where(is_round, torch.ones_like(half), half)
     cross = torch.where(is_round, torch.zeros_like(cross), cross)
+    # If half < 0, the axis of the larger eigenvalue is more than an eighth of a turn from `near`.
+    # The axis of the smaller one is then the first axis: with this sign, both angle and radius are
+    # those of the smaller eigenvalue.
     sign = torch.where(half < 0, -1.0, 1.0)
     angle = torch.atan2(sign * cross, half.abs()) / 2
     radius = torch.where(is_round, 0.0, sign * (half.square() + cross.square()).sqrt())
@@ -409,7 +414,8 @@ def stretch_along_line(gaussians: Gaussians, factors: Tensor) -> Gaussians:
     across = factors[..., 1].square() * (first * sin.square() + second * cos.square())
     spread = ((along - across).square() / 4 + both.square()).sqrt()
     longer = ((along + across) / 2 + spread).sqrt()
-    shorter = gaussians.scales.prod(-1) * factors.prod(-1) / longer  # from the area
+    # The factors multiply the area of the ellipse, which is proportional to longer * shorter.
+    shorter = gaussians.scales.prod(-1) * factors.prod(-1) / longer
     turn = torch.atan2(2 * both, along - across) / 2
     scales = torch.stack([longer, shorter], dim=-1)
     return Gaussians(gaussians.means, scales, rotations=angles + turn)
@@ -440,11 +446,11 @@ def line_errors(points: Tensor, targets: Tensor, lines: Tensor | None = None) ->
     lengths = steps.square().sum(-1)
     # Position of the nearest place on each segment: 0 at its start and 1 at its end.
     place = (offsets * steps).sum(-1) / lengths.clamp(min=_TINY)
-    # It is clamped to the segment, but may lie before the first or behind the last segment of an
-    # open line.
+    # It is clamped to [0, 1]. Only on an open line, it may be less than 0 on the first segment and
+    # more than 1 on the last one.
     closed = (lines[..., :1, :] == lines[..., -1:, :]).all(-1, keepdim=True)  # (..., 1, 1)
     beyond = torch.where(closed, 0.0, torch.inf)
-    inner = torch.zeros_like(lengths[..., 1:])
+    inner = torch.zeros_like(lengths[..., 1:])  # (..., 1, S - 2)
     low = torch.cat([-beyond, inner], dim=-1)
     high = torch.cat([inner, beyond], dim=-1) + 1
     nearest = place.clamp(low, high)[..., None] * steps

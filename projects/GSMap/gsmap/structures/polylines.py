@@ -33,8 +33,8 @@ def is_closed(points: Points) -> bool:
 def arc_lengths(points: Points) -> NDArray[np.float64]:
     """Compute the distance along a polyline from its first point to each point, in the plane.
 
-    Heights do not count, as in shapely, with which releases resample lines: a line with z and
-    its projection to the plane are resampled at equal (x, y).
+    Heights do not count, as in shapely, with which the public code of the methods resamples lines.
+    So a line with z and its projection to the plane are resampled at equal (x, y).
 
     Args:
         points: Vertices in metres. (n, D)
@@ -237,9 +237,9 @@ def sampled_orders(points: Points, closed: bool) -> NDArray[np.float64]:
 def shortest_orders(lines: Points, least_gain_m: float = 1e-3) -> NDArray[np.int64]:
     """Reorder the points of lines so that the path through them is short (2-opt, Croes 1958).
 
-    The part of a line whose reversal shortens it most is reversed, until no reversal shortens it.
-    This straightens a line that runs back and forth. A line keeps its ends if they are closer than
-    its mean step.
+    The part of a line whose reversal shortens the line most is reversed, until no reversal shortens
+    the line. This straightens a line that runs back and forth. A line whose ends are closer than
+    its mean step, nearly a ring, keeps its ends.
 
     Args:
         lines: Points of each line in metres; lengths are measured in the plane. (M, P, 2 or 3)
@@ -255,19 +255,20 @@ def shortest_orders(lines: Points, least_gain_m: float = 1e-3) -> NDArray[np.int
     is_ring = apart[:, 0, -1] < steps.mean(1) if size > 1 else np.zeros(count, bool)
     places = np.arange(size)
     orders = np.tile(places, (count, 1))
-    active = np.arange(count if size > 2 else 0)  # lines that a reversal may shorten
+    active = np.arange(count if size > 2 else 0)  # indices of lines that a reversal may shorten
     while len(active):
         rows = orders[active]
         # Distances between the points at all pairs of places in the order, (m, P, P).
         paths = apart[active[:, None, None], rows[:, :, None], rows[:, None]]
         paths = np.pad(paths, ((0, 0), (1, 1), (1, 1)))  # no step before the start, after the end
         step = paths.diagonal(1, 1, 2)  # from the point before to each point, (m, P + 1)
-        # A reversal of the points i to j replaces the steps to point i and from point j.
+        # A reversal of the points i to j replaces the steps to point i and from point j by the
+        # steps from the point before i to j, and from i to the point after j.
         replaced = step[:, :-1, None] + step[:, None, 1:]
         gain = replaced - paths[:, :-2, 1:-1] - paths[:, 1:-1, 2:]
-        gain[is_ring[active], 0] = 0.0
+        gain[is_ring[active], 0] = 0.0  # the ends stay
         gain[is_ring[active], :, -1] = 0.0
-        gain = np.triu(gain, 1).reshape(len(active), -1)
+        gain = np.triu(gain, 1).reshape(len(active), -1)  # pairs with i < j
         best = gain.argmax(1)  # i * P + j
         improves = gain[np.arange(len(active)), best] > least_gain_m
         active = active[improves]
@@ -329,6 +330,7 @@ def clip_to_box(
     edges = np.array([x_range, y_range]).T[:, None]  # lower edges, then upper edges
     with np.errstate(divide="ignore", invalid="ignore"):
         cuts = (edges - start[:, :2]) / step[:, :2]  # (2, n, 2), infinite if parallel to an edge
+    # A segment on the line of an edge gives 0 / 0. Such an edge does not cut it.
     along_edge = (step[:, :2] == 0) & np.isnan(cuts)
     cuts = np.where(along_edge, [[[-np.inf]], [[np.inf]]], cuts)
     # Shares in [0, 1] of a segment at which it enters and leaves; enter > leave if it misses.
@@ -339,7 +341,9 @@ def clip_to_box(
         return []
     first = start[hits] + enter[hits, None] * step[hits]
     last = start[hits] + leave[hits, None] * step[hits]
-    is_joined = (np.diff(hits) == 1) & (leave[hits[:-1]] == 1.0) & (enter[hits[1:]] == 0.0)
+    # A piece continues if the next segment hits, and the vertex between both is inside.
+    is_next = np.diff(hits) == 1
+    is_joined = is_next & (leave[hits[:-1]] == 1.0) & (enter[hits[1:]] == 0.0)
     breaks = np.flatnonzero(~is_joined) + 1
     ends = [0, *breaks.tolist(), len(hits)]
     pieces = []

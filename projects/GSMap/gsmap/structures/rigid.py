@@ -20,7 +20,7 @@ def rigid(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> NDArray[np.flo
 def invert_rigid(transform: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
     """Invert rigid transforms without a linear solver.
 
-    The general inverse of thousands of small matrices takes most of its time to start threads.
+    ``np.linalg.inv`` of thousands of small matrices spends most of its time on starting threads.
 
     Args:
         transform: Rotations with translations. (..., 4, 4)

@@ -134,7 +134,7 @@ class Slots:
 class Scenes:
     """Streams by the name of their scene, for testing; frames of a scene must come in order.
 
-    Copies, also by pickle, continue with a model of equal name.
+    A copy, for example by pickle, continues with any model of equal name (``str(model)``).
 
     Args:
         max_gap_s: Longest time between two frames of a stream in seconds.
@@ -189,8 +189,9 @@ class Scenes:
         for frame in frames:
             if frame.scene in batch:
                 raise InputError(
-                    f"frames {batch[frame.scene]} and {frame} of one scene are in one batch: one "
-                    "needs what the other leaves; set batch_size=1 or use StreamBatches."
+                    f"frames {batch[frame.scene]} and {frame} of one scene are in one batch, but "
+                    "the later one needs the memory of the earlier one: set batch_size=1 or use "
+                    "StreamBatches."
                 )
             batch[frame.scene] = frame
             states.append(self._previous_state(frame))

@@ -75,6 +75,7 @@ def motion_signals(
         velocity = ego_from_global @ (last - first)[:3, 3] / (end - start)
         values[13:16] = velocity
     if end > time > start:
+        # Mean velocities of both intervals, whose centres are half of (end - start) apart.
         velocity_before = (pose - first)[:3, 3] / (time - start)
         velocity_after = (last - pose)[:3, 3] / (end - time)
         acceleration = _GRAVITY + 2 * (velocity_after - velocity_before) / (end - start)

@@ -184,7 +184,8 @@ def _run(command: Callable[[], str | None], clean_up_on_kill: bool) -> None:
             sys.stdout.flush()
         except Exception as error:
             cause = _signal_behind(error)
-            if cause is not None and not isinstance(error, OSError):  # not an error of a clean-up
+            # An OSError after a signal comes from a clean-up that failed: it is reported below.
+            if cause is not None and not isinstance(error, OSError):
                 handler.has_ended = True
                 raise cause from None
             if not _report(error):

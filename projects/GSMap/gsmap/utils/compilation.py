@@ -39,7 +39,7 @@ def make_kernel_folder() -> TemporaryDirectory | None:
         The folder, or None if numba has a cache folder.
     """
     try:
-        caching.CompileResultCacheImpl(make_kernel_folder)
+        caching.CompileResultCacheImpl(make_kernel_folder)  # looks for a cache folder
     except RuntimeError:
         folder = TemporaryDirectory(prefix="gsmap-kernels-")
         os.environ["NUMBA_CACHE_DIR"] = folder.name

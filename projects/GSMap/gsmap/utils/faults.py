@@ -14,8 +14,8 @@ _REDUCE_MEMORY = (
     "--workers) or smaller images"
 )
 _BUS_ERROR_ADVICE = (
-    "a data file was shortened while it was read (end what writes there, make it again), or "
-    "/dev/shm is full (take fewer num_workers)"
+    "a data file was shortened while it was read (stop the program that writes to it, and make the "
+    "file again), or /dev/shm is full (take fewer num_workers)"
 )
 _FEWER_PROCESSES = "use fewer processes (num_workers, --workers)"
 _REMEDIES = {

@@ -183,6 +183,8 @@ def atomic_write(path: str | Path, mode: Literal["w", "wb"] = "w") -> Iterator[I
                 forget_output(path)
                 os.replace(partial_file, path)
     except Exception as raised:
+        # A system error about the temporary file, or without a path, gets the path that the caller
+        # knows. All other errors pass unchanged.
         error = failures[0] if failures else raised
         if not isinstance(error, OSError) or not error.errno:
             raise
@@ -345,8 +347,8 @@ def partial_path(path: Path, make: Callable[[Path], object] = _touch) -> Iterato
     """Context with a temporary file or folder beside ``path``, which the block fills and renames.
 
     Its name is ``PATH.<machine>-<random>.gsmap-partial``. It is locked during the block and removed
-    at its end. Before, temporary files of killed writers in the folder are removed, which their
-    free locks identify.
+    at the end of the block. Before the block, temporary files that no process has locked are
+    removed from the folder: their writers were killed.
 
     Args:
         path: Final path of the file or folder.
@@ -356,7 +358,8 @@ def partial_path(path: Path, make: Callable[[Path], object] = _touch) -> Iterato
     while True:
         temporary = path.with_name(f"{path.name}.{_MACHINE}-{secrets.token_hex(nbytes=4)}{SUFFIX}")
         make(temporary)
-        with suppress(FileNotFoundError):  # removed by another writer that locked it first
+        # Before it is locked, another process may take it for a leftover and remove it.
+        with suppress(FileNotFoundError):
             handle = _open(temporary)
             if try_lock(handle) is not False and temporary.exists():
                 break
@@ -408,7 +411,7 @@ _LOCK_FILES: "weakref.WeakSet[IO[str]]" = weakref.WeakSet()
 
 
 def _close_lock_files() -> None:
-    """Close the lock files in a forked worker, which would hold the locks of a killed parent."""
+    """Close the lock files in a forked worker, which would keep the locks if its parent dies."""
     for file in list(_LOCK_FILES):
         file.close()
 
@@ -480,7 +483,8 @@ def _remove_leftovers(folder: Path) -> None:
             handle = _open(folder / name)
             try:
                 age_s = time.time() - os.fstat(handle).st_mtime
-                if (match[1] == _MACHINE or age_s > _DAY_S) and try_lock(handle):
+                has_reliable_lock = match[1] == _MACHINE or age_s > _DAY_S
+                if has_reliable_lock and try_lock(handle):
                     _remove(folder / name)
             finally:
                 os.close(handle)

@@ -159,7 +159,11 @@ class _Parser:
         self._position = end
 
     def _read_block(self) -> bool:
-        """Read as many bytes as text is left, at least a block; False at the end of the file."""
+        """Append a block of the file to the unread text; False at the end of the file.
+
+        The block is as long as the unread text if that is longer, so that the time for a value of
+        many blocks is linear in its length.
+        """
         rest = self._text[self._position :]
         block = self._file.read(max(_BLOCK, len(rest)))
         self._text = rest + self._decode(block, final=not block)

@@ -76,6 +76,7 @@ class CheckedArray(np.ndarray):
         dtype = checked.dtype
         if size * dtype.itemsize != len(data):
             raise pickle.UnpicklingError(f"an array {shape} of {dtype} has {len(data)} bytes")
+        # Some bytes are no valid boolean (more than 1) or character (beyond Unicode).
         order = ">" if dtype.byteorder == ">" else "<"
         integer_dtype = {"b": "u1", "U": f"{order}u4"}.get(dtype.kind)
         if integer_dtype and data:

@@ -31,10 +31,10 @@ def declare_overrides(overrides: Mapping[str, Any]) -> None:
 def check_kinds(settings: Any, overrides: Mapping[str, Any], source: str) -> None:
     """Refuse overrides whose kind differs from the kind of the value that they replace.
 
-    A number cannot become a text or a dictionary, a truth value cannot become either or a list, a
-    list cannot become a text, and a dictionary or a list of dictionaries can only become a
-    dictionary or such a list. Every value may become None. The value None, or one that the settings
-    do not have, may become anything.
+    A number cannot become a text or a dictionary. A truth value cannot become a text, a dictionary
+    or a list. A list cannot become a text. A dictionary or a list of dictionaries can only become a
+    dictionary or a list of dictionaries. Every value may become None. The value None, and a value
+    that the settings do not have, may become anything.
 
     Args:
         settings: Config before the overrides.
@@ -116,7 +116,8 @@ def find_override(error: BaseException) -> str | None:
     if not suspects:
         return None
     for number, frame in enumerate(_frames(error)):
-        if number == _SEARCHED_FRAMES or (number and _is_of_loop(frame)):
+        reaches_loop = number > 0 and _is_of_loop(frame)
+        if number == _SEARCHED_FRAMES or reaches_loop:
             break
         scopes = list(_scopes(frame))
         for name, (key, value) in suspects.items():

@@ -64,7 +64,7 @@ def die_with_parent(parent: int) -> None:
     """
     if _PRCTL is None:
         return
-    _PRCTL(1, signal.SIGKILL)
+    _PRCTL(1, signal.SIGKILL)  # 1 is PR_SET_PDEATHSIG
     if os.getppid() != parent:  # the parent has died before the call
         os.kill(os.getpid(), signal.SIGKILL)
 
@@ -103,6 +103,7 @@ def _start_worker(setup: Path) -> None:
 
 
 def _end_with_parent() -> None:
+    """Wait for the end of the parent in a thread, and end this process then."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

@@ -146,14 +146,14 @@ class _Run:
         repeated: set[int] = set()
         finished: set[int] = set()
         failures: list[str] = []
-        room_since_s: float | None = None
+        room_since_s: float | None = None  # time since which resources have been free
         while len(finished) < self.count:
             ready, _ = self.ray.wait(list(running), num_returns=1, timeout=_POLL_S)
             for task in ready:
                 index = running.pop(task)
                 failure = self._result(task)
-                is_still_running = index in running.values()
-                if index in finished or (failure and is_still_running):
+                has_second_task = index in running.values()  # which may still succeed
+                if index in finished or (failure and has_second_task):
                     continue
                 finished.add(index)
                 if failure:

@@ -179,7 +179,8 @@ def without_options(words: Sequence[str], *names: str) -> list[str]:
     previous = ""
     for word in words:
         option, _, _ = word.partition("=")
-        if previous not in names and option not in names:
+        follows_option = previous in names  # the word is the value of an option to remove
+        if not follows_option and option not in names:
             rest.append(word)
         previous = word
     return rest

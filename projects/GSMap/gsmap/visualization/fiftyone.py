@@ -172,6 +172,7 @@ def _visible_parts(line: np.ndarray, camera: CameraRecord) -> list[list[list[flo
     if not len(segments):
         return []
     shares = np.clip(segments / size_px, 0.0, 1.0).round(_DECIMALS)  # (m, 2, 2)
+    # A part ends where the next visible segment is not the next segment of the line.
     breaks = [i + 1 for i, (before, after) in enumerate(pairwise(index)) if after != before + 1]
     parts = []
     for run in np.split(shares, breaks):

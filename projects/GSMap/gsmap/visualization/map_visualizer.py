@@ -182,7 +182,8 @@ class MapVisualizer(Visualizer):
                 V x (h, w, 3) uint8
 
         Returns:
-            Cameras without those whose path is None; none if there are neither images nor paths.
+            Cameras with an image: a camera whose path is None is left out, and all cameras if there
+            are neither images nor paths.
 
         Raises:
             ValueError: If the numbers of images and projections disagree, or a file is missing or

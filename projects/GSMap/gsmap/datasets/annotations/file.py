@@ -211,9 +211,9 @@ class AnnotationFile(Sequence[MapSample]):
     """Sequence of the samples in a memory-mapped annotation file.
 
     The whole file is checked when it is opened. A pickled instance has only the path and the
-    checksums of the batches, so that all worker processes share the pages of the file. In an
-    unpickled instance, and after a change of the file, a batch is compared with its checksum before
-    it is read.
+    checksums of the batches: each worker process maps the file, and all of them share its pages in
+    memory. In an unpickled instance, and after a change of the file, a batch is compared with its
+    checksum before it is read.
 
     Args:
         path: Annotation file.
@@ -316,7 +316,8 @@ class AnnotationFile(Sequence[MapSample]):
             return
         size = state[0]
         if size == self._content.size:
-            # The start of the file and the schema come before the first batch.
+            # Entry 0 of the checksums is the start of the file, and entry 1 the end of the schema,
+            # where the first batch starts.
             start, previous_checksum = self._sums[number + 1]
             end, checksum = self._sums[number + 2]
             content = memoryview(self._content)[start:end]
@@ -324,8 +325,8 @@ class AnnotationFile(Sequence[MapSample]):
                 self._intact_batches.add(number)
                 return
         raise InputError(
-            f"{self.path} was changed while it was in use: end what writes there, {self.remedy} "
-            "Then go on from the last checkpoint."
+            f"{self.path} was changed while it was in use: stop the program that writes to it, and "
+            f"{self.remedy} Then go on from the last checkpoint."
         )
 
     @property

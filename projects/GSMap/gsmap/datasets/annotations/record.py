@@ -128,7 +128,7 @@ def _check_classes(classes: Any) -> tuple[str, ...]:
     names = classes if isinstance(classes, (list, tuple)) else ()
     are_texts = all(isinstance(name, str) and name for name in names)
     if not names or not are_texts or len(set(names)) < len(names):
-        raise InputError(f"classes must be names, different ones, got {classes!r}.")
+        raise InputError(f"classes must be different names, got {classes!r}.")
     if len(names) > _MAX_CLASSES:
         raise InputError(f"there are at most {_MAX_CLASSES} classes, not {len(names)}.")
     return tuple(names)

@@ -240,9 +240,11 @@ def distort_images(images: Tensor, numbers: Tensor) -> Tensor:
     angle = torch.where(value == red, hue_near_red, hue_not_near_red)
     angle = torch.where(angle < 0, angle + 360.0, angle) + hue  # degrees
     # Back to BGR:
+    # A channel is value - chroma * max(0, min(k, 4 - k, 1)) with k = (angle / 60 + n) mod 6, where
+    # n is 1 for blue, 3 for green and 5 for red.
     chroma = value * new_saturation
     channels = []
-    for sector in (1.0, 3.0, 5.0):  # blue, green, red
+    for sector in (1.0, 3.0, 5.0):
         turn = (angle / 60.0 + sector) % 6.0
         weight = torch.minimum(turn, 4.0 - turn).clamp(0.0, 1.0)
         channels.append(value - chroma * weight)

@@ -34,7 +34,7 @@ class LoadCameraImages(BaseTransform):
     ``lidar2img``, ``img_aug_matrix`` (lists of (4, 4)) and ``img_path``. Smaller images are padded
     at the bottom and right to the size of the largest; ``raw_shapes`` has (height, width) of each
     image before the padding. Unlike in mmdet3d, images are contiguous arrays and not strided views
-    of a stack, which are as slow to copy as the image is to decode.
+    of a stack: a copy of such a view takes as long as the decoding of the image.
 
     Args:
         to_float32: Whether to convert the images to float32 directly after loading.

@@ -50,7 +50,7 @@ def bev_cells(instance: MapInstance, results: dict[str, Any], size: tuple[int, i
 class MakeBEVMask(BaseTransform):
     """Add ``gt_seg``, the BEV masks of the map elements, float32. (channels, H, W)
 
-    Coordinates of vertices are truncated to integers, as in the release.
+    Coordinates of vertices are truncated to integers, as in the public code of the methods.
 
     Args:
         size: Rows H and columns W over the range of the ground truth.
@@ -97,8 +97,8 @@ class MakeInstanceMasks(BaseTransform):
         size: Rows H and columns W over the range of the ground truth.
         thickness_px: Width of the lines in cells.
         gap_px: Width of the lines around elements with a higher label in which cells are removed.
-        mirrored: Whether to flip the masks left to right, as in the release. Flipped masks do not
-            fit the BEV features.
+        mirrored: Whether to flip the masks left to right, as in the public code of MGMap. Flipped
+            masks do not fit the BEV features.
 
     Raises:
         ValueError: If a number is not positive.
@@ -261,6 +261,6 @@ def _log_flat_ground(ground_z_m: float) -> None:
         print_log(
             f"camera masks of elements lie on flat ground at z = {ground_z_m:g} m: the annotation "
             "file has no heights. Make it with `python tools/create_data.py av2 ... --dim 3` for "
-            "those of the published systems, or set heights=False in MakePVMask.",
+            "masks as in the published systems, or set heights=False in MakePVMask.",
             logger="current",
         )

@@ -110,8 +110,8 @@ def _weighted_ap(
 ) -> float:
     """Compute the AP of predictions with copies.
 
-    The loop over hits starts at the lowest score. The precision envelope at a hit is then the
-    largest precision of the hits so far.
+    The loop over hits starts at the lowest score. The precision envelope at a hit, the largest
+    precision at its recall or above, is then the largest precision of the hits so far.
 
     Args:
         hit_rows: Indices of the predictions that match, in descending order of score. (H,)
@@ -134,15 +134,16 @@ def _weighted_ap(
             continue
         denominator = ranks[i] + _SPACING if interpolated else ranks[i]
         envelope = max(envelope, true_positives / denominator)
-        true_positives -= copies[i]
+        true_positives -= copies[i]  # now the number before this hit
         if interpolated:
+            # This hit raises the recall above these recall points: they have its envelope.
             while _RECALL_POINTS[point] > true_positives / total:
                 ap += envelope
                 point -= 1
         else:
             ap += envelope * copies[i] / total
     if interpolated:
-        return (ap + envelope) / len(_RECALL_POINTS)  # the last envelope is at recall 0
+        return (ap + envelope) / len(_RECALL_POINTS)  # recall point 0 has the last envelope
     return ap
 
 

@@ -25,8 +25,8 @@ _STANDARD = (stats.norm(), stats.laplace(scale=0.5**0.5))
 LAWS = dict(zip(LAW_NAMES, _STANDARD, strict=True))
 """Laws of errors (probability distributions) of variance 1, by name."""
 COVERED = (2 * stats.norm.cdf([1.0, 2.0]) - 1).tolist()  # within one and two sigma of a normal law
-_FEWEST = 100  # vertices of a class to fit its factors
-_COLUMNS = (
+_FEWEST = 100  # smallest number of vertices of a class, to fit factors for the class
+_COLUMNS = (  # keys of figures and titles of the columns of the table
     ("nll", "NLL"), ("coverage@1", "68.3 %"), ("coverage@2", "95.4 %"), ("sigma_m", "sigma m"),
     ("error_m", "error m"), ("reliability_error", "reliab."), ("sparsification_error", "spars."),
     ("rank_correlation", "rank"), ("distance_rank_correlation", "by dist."),
@@ -104,6 +104,8 @@ def _vertices_of_sample(sample: Sample, config: ChamferConfig) -> Iterator[Verti
         span = slice(predictions.offsets[row], predictions.offsets[row + 1])
         points = predictions.points[span, :2]
         line = gt_lines[gt][:, :2]
+        # The line with as many points as the prediction, in each direction and, if closed, from
+        # each start. The order nearest to the prediction pairs their points.
         orders = equivalent_orders(line, num_points=len(points))
         nearest_order = np.abs(orders - points).sum(axis=(1, 2)).argmin()
         means = torch.tensor(points)
@@ -296,9 +298,9 @@ def fit_factors(
     Args:
         vertices: Matched vertices.
         classes: Names of the classes.
-        num_sigmas: Half width of the interval of a normal law with equal coverage, in (0, 3]: 1 for
-            68.3 % of the errors, 2 for 95.4 %. If the tails of the errors differ from the law, the
-            factors fit one interval only.
+        num_sigmas: Coverage of the interval, as the number n of sigmas in (0, 3] for which a normal
+            law lies within +-n sigma: 1 for 68.3 % of the errors, 2 for 95.4 %. If the tails of the
+            errors differ from the law, the factors fit this interval only.
         law: Law of the errors, one of ``LAWS``.
 
     Returns:

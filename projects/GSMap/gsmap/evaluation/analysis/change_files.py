@@ -17,7 +17,7 @@ KINDS = ("removed", "added", "moved")
 STEP_M = 0.5
 """Distance of the points at which changes are compared."""
 _FARTHEST_M = 1e7  # largest coordinate
-_LONGEST_M = 1e6  # of all changes of a file together
+_LONGEST_M = 1e6  # largest length of all changes of a file together
 _LONGEST_NAME = 80  # letters
 _ABSENT = "absent"
 
@@ -30,13 +30,14 @@ class MapChange:
         kind: One of `KINDS`.
         class_name: Class of the element.
         map_name: Name of the map, in whose global frame the points are; empty if unknown.
-        points: Vertices in metres, closed for areas: the old place of a removed element, otherwise
-            the new one. (n, 2)
-        old_points: Old place of a moved element, if it is known. (m, 2)
+        points: Vertices in metres, closed for areas. A removed element is in its old place, an
+            added or moved one in its new place. (n, 2)
+        old_points: Vertices of a moved element in its old place, or None if unknown. (m, 2)
         confidence: Confidence in [0, 1].
-        moved_m: Distance in metres of a moved element, if it is known.
-        moved_std_m: Standard error of the distance in metres, if it is known.
-        passes: Number of drives that agree, and of those with the place in view, if known.
+        moved_m: Distance in metres by which an element has moved, or None if unknown.
+        moved_std_m: Standard error of this distance in metres, or None if unknown.
+        passes: Number of drives that confirm the change, and number of drives that had the place in
+            view; None if unknown.
     """
 
     kind: str
@@ -172,7 +173,7 @@ def _read_points(positions: Any) -> FloatArray:
     points = []
     for position in positions:
         if not isinstance(position, list) or len(position) < 2:
-            raise InputError("a position has no two coordinates")
+            raise InputError("a position has fewer than two coordinates")
         if not _is_coordinate(position[0]) or not _is_coordinate(position[1]):
             raise InputError(
                 f"coordinates must be metres within {_FARTHEST_M:g} m, got {position!r:.60}"

@@ -78,7 +78,7 @@ def views_by_map(annotations: AnnotationFile) -> dict[str, Views]:
 
 
 def _level(pose: FloatArray) -> FloatArray:
-    """Position and yaw of a pose. (4, 4)"""
+    """Pose in the plane: its position and yaw, without height, roll and pitch. (4, 4)"""
     yaw = np.arctan2(pose[1, 0], pose[0, 0])
     level = np.eye(4)
     level[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
@@ -131,7 +131,7 @@ def changed_samples(changes: Sequence[MapChange], annotations: AnnotationFile) -
     group_of = {}
     for map_name, tokens_of_map in tokens.items():
         points = _all_samples([change for change in changes if change.map_name == map_name])
-        for index, token in enumerate(tokens_of_map):
+        for index, token in enumerate(tokens_of_map):  # in the order of the file, as the views
             is_changed = views[map_name].contains(index, points).any()
             group_of[token] = CHANGED if is_changed else UNCHANGED
     return group_of
@@ -167,10 +167,11 @@ def change_figures(
         found_file: File of the found changes, for messages.
 
     Returns:
-        Figures by key: for each kind, for ``all`` and for ``any_kind`` (kinds are not compared) the
-        ``precision`` and ``recall``, and numbers; -1 for the precision or recall of no change.
-        ``precision_at_recall_0.6`` of all is the largest precision at this recall or more over all
-        thresholds of confidence, -1 if there is none.
+        Figures by key. ``precision`` and ``recall`` exist for each kind, for ``all`` kinds, and for
+        ``any_kind``, where kinds are not compared; they are -1 if there is no change to count.
+        ``num_found`` and ``num_true`` are the numbers of changes of each kind and of all.
+        ``all/precision_at_recall_0.6`` is the largest precision over the thresholds of confidence
+        with a recall of at least 0.6, -1 if there is no such threshold.
 
     Raises:
         ValueError: If the map of a found change is unknown.
@@ -212,7 +213,8 @@ class _Comparison:
     Attributes:
         hits: Whether each found change is correct. (F,)
         confidences: Confidence of each found change. (F,)
-        limits: Largest limit of confidence with which each target is found, or -1. (T,)
+        limits: Largest threshold of confidence at which the found changes that reach it still find
+            each target, or -1. (T,)
     """
 
     hits: BoolArray
@@ -264,7 +266,7 @@ def _targets(truth: Sequence[MapChange], views: Mapping[str, Views]) -> dict[Map
             continue
         points = change.samples()
         in_view = points[views[change.map_name].count(points) >= MIN_VIEWS]
-        least = len(points) / 2 if is_closed(change.points) else SHORTEST_M / STEP_M
+        least = len(points) / 2 if is_closed(change.points) else SHORTEST_M / STEP_M  # points
         if len(in_view) >= max(least, 1):
             targets[change] = in_view
     return targets
@@ -276,6 +278,7 @@ def _is_correct(change: MapChange, truth: Sequence[MapChange], same_kind: bool) 
     for other in truth:
         if _may_match(change, other, same_kind):
             lines.append(shapely.LineString(other.points))
+            # A moved element may be found as an element that is removed from its old place.
             if not same_kind and other.old_points is not None:
                 lines.append(shapely.LineString(other.old_points))
     points = shapely.points(change.samples())
@@ -286,7 +289,9 @@ def _is_correct(change: MapChange, truth: Sequence[MapChange], same_kind: bool) 
 def _confidence_limit(
     target: MapChange, in_view: FloatArray, found: Sequence[MapChange], same_kind: bool
 ) -> float:
-    """Largest limit of confidence with which a true change is found; -1 if it is not found.
+    """Largest threshold of confidence at which a true change is found; -1 if it is not found.
+
+    Found changes with a confidence below the threshold do not count.
 
     Args:
         target: The true change.
@@ -300,6 +305,7 @@ def _confidence_limit(
         if _may_match(target, change, same_kind):
             is_near = shapely.dwithin(points, shapely.LineString(change.points), NEAR_M)
             best[is_near] = np.maximum(best[is_near], change.confidence)
+    # Half of the points, rounded up, have at least the confidence of rank `half`.
     half = -(-len(best) // 2)
     return float(np.sort(best)[::-1][half - 1])
 

@@ -18,7 +18,7 @@ from gsmap.structures.elements import FloatArray
 from gsmap.utils.errors import InputError
 
 _DECIMALS = 3  # control points are written in whole millimetres
-_ROUNDING_M = 0.001  # bound on the displacement of a curve by that rounding
+_ROUNDING_M = 0.001  # bound on the displacement of a curve by this rounding
 _POINT_KEYS = ("pts", "pts_num", "gaussian_scales", "gaussian_rotations")
 
 
@@ -43,8 +43,8 @@ def compact_results(
 ) -> Compaction:
     """Write a result file with piecewise Bezier curves, which all readers of GSMap accept.
 
-    A curve replaces the points of a vector and its Gaussians, one of which belongs to each point.
-    Other entries are kept. A vector of one point is not changed.
+    A curve replaces the points of a vector and the Gaussians of the points. Other entries are kept.
+    A vector of one point is not changed.
 
     Args:
         results: Path of the result file.

@@ -1,6 +1,6 @@
 """Consistency over the frames of a drive: tracks, C-mAP of MapTracker, jitter of vertices.
 
-The rules are the rules of MapTracker's released tools. They differ from AP_chamfer in four ways:
+The rules equal MapTracker's public code. They differ from AP_chamfer in four ways:
 predictions with a score of 0.4 or less are left out, a frame without ground truth of a class does
 not count for the class, lines have 200 points, and the 4 m wide strips around a matched pair of
 lines need not touch.
@@ -296,7 +296,8 @@ def tracks_of(frames: Sequence[DriveFrame], config: ConsistencyConfig) -> list[I
 def _chamfer_lines(elements: MapElements, simplify: bool) -> kernels.Lines:
     """Convert elements to lines of 200 points for the Chamfer distance.
 
-    With ``simplify``, lines are simplified and resampled to 20 points first, as for ground truth.
+    With ``simplify``, lines are simplified and resampled to 20 points first, as MapTracker does
+    with ground truth.
     """
     lines = [line[:, :2] for line in elements.polylines]
     if simplify:
@@ -365,7 +366,7 @@ def _number_untracked(tracks: Sequence[IntArray]) -> list[IntArray]:
     last = -1
     for frame_tracks in tracks:
         is_untracked = frame_tracks < 0
-        numbers = last - is_untracked.cumsum()
+        numbers = last - is_untracked.cumsum()  # last - 1, last - 2, ... without a track
         numbered.append(np.where(is_untracked, numbers, frame_tracks))
         last -= int(is_untracked.sum())
     return numbered
@@ -381,7 +382,8 @@ def score_scene(
         config: Rules of the metric.
 
     Returns:
-        Frames with ground truth of each class, and number of ground truths of each class. 2 x (C,)
+        For each class, a list of the hits of each frame that has ground truth of the class; and the
+        number of ground truths of each class (C,).
     """
     truth_frames = [with_lines(frame, frame.truth) for frame in frames]
     truth_tracks = make_tracks(

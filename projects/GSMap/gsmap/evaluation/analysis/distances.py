@@ -12,7 +12,7 @@ from gsmap.evaluation.core.metric import Sample
 from gsmap.structures.elements import FloatArray, MapElements
 from gsmap.structures.polylines import is_closed
 
-SHORTEST_M = 1.0  # shorter pieces of lines, and pieces of areas below its square, are left out
+SHORTEST_M = 1.0  # pieces of lines below this, and pieces of areas below 1 m^2, are left out
 _SEPARATOR = " at "
 _BANDS = [
     *(f"{inner_m:g}-{outer_m:g} m" for inner_m, outer_m in pairwise(DISTANCES_M[:-1])),
@@ -97,11 +97,13 @@ def cut_line(points: FloatArray) -> Iterator[tuple[int, FloatArray]]:
 def _cut_positions(points: FloatArray) -> FloatArray:
     """Find the positions of the vertices of a line and of its crossings with the circles.
 
+    Position i + s is the point at share s, in [0, 1], of the segment from vertex i to i + 1.
+
     Args:
         points: Vertices in metres around the vehicle. (n, 2)
 
     Returns:
-        Positions in segments, in [0, n - 1], sorted.
+        Positions in [0, n - 1], sorted.
     """
     start = points[:-1]
     step = np.diff(points, axis=0)
@@ -120,7 +122,7 @@ def _cut_positions(points: FloatArray) -> FloatArray:
 
 
 def _interpolate(points: FloatArray, positions: FloatArray) -> FloatArray:
-    """Interpolate the points of a line at positions in segments. (k, 2)"""
+    """Interpolate the points of a line at the positions of `_cut_positions`. (k, 2)"""
     x, y = points.T
     indices = np.arange(len(points))
     return np.stack([np.interp(positions, indices, x), np.interp(positions, indices, y)], axis=1)

@@ -43,7 +43,7 @@ def drive_frames(
 
 
 def _read_frames(samples: SampleFile, annotations: AnnotationFile) -> list[DriveFrame]:
-    """Read the frames of all drives, as `drive_frames` does, and the metadata of ``samples``."""
+    """Read the frames of all drives, as `drive_frames` does; ``samples.about`` is read, too."""
     if not annotations.meta.options.get("poses", True):
         raise InputError(f"{annotations.path} knows no poses, which consistency needs.")
     results = samples.path
@@ -51,7 +51,7 @@ def _read_frames(samples: SampleFile, annotations: AnnotationFile) -> list[Drive
     track_ids: dict[str, IntArray | None] = {}
     last_token: dict[bool, str] = {}  # last sample with tracks (True) and without (False)
     items = items_of(results, RESULTS_KEY, "give a result file")
-    # samples come first, because they describe a malformed file
+    # Of both iterables, `samples` reads first, because its errors describe a malformed file.
     for (token, elements, _), (item, _) in zip(samples, items, strict=True):
         values = [vector.get(TRACK_KEY) for vector in item["vectors"]]
         ids = _convert_tracks(values, results=results, token=token)

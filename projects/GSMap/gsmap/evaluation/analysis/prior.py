@@ -77,10 +77,10 @@ class _ClassFit:
             if len(frame):
                 self.frames.append(frame)
                 lines.append(resample_all(frame.points, frame.offsets, num_points=_NUM_POINTS))
-        # Index of the first ground truth of each frame, and their total number. (F + 1,)
+        # Index of the first ground truth of each frame; the last entry is their number K. (F + 1,)
         self.first = np.cumsum([0, *map(len, self.frames)])
-        self.points = np.concatenate(lines)  # (K, P, 2 or 3)
-        self.is_taken = np.zeros((len(self.thresholds), len(self.points)), dtype=np.bool_)
+        self.points = np.concatenate(lines)  # ground truths of all frames, (K, P, 2 or 3)
+        self.is_taken = np.zeros((len(self.thresholds), len(self.points)), dtype=np.bool_)  # (T, K)
         order = np.random.default_rng(0).permutation(len(self.points))
         self.candidates = self.points[np.sort(order[:_MAX_CANDIDATES])]
         self.nearest, self.distance = self._compare(self.candidates)
@@ -122,7 +122,7 @@ class _ClassFit:
         best = int(hits.argmax())
         num_hits = float(hits[best])
         precision = num_hits / self.num_samples
-        gain = precision * num_hits / len(self.points)
+        gain = precision * num_hits / len(self.points)  # precision times recall
         return gain, precision, best
 
     def take(self, index: int) -> tuple[FloatArray, float]:

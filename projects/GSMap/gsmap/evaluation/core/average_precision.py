@@ -68,8 +68,8 @@ def interpolated_ap(hits: BoolArray, num_gts: int) -> float:
 def ten_point_ap(hits: BoolArray, num_gts: int) -> float:
     """Compute the mean of the precision envelope at the recalls 0.1, 0.2, ... 1.
 
-    A released evaluator compares recalls in float32, where 7 of 10 is less than 0.7. Here they are
-    equal.
+    The public evaluators of the methods compare recalls in float32, where 7 matches of 10 are less
+    than the recall 0.7. Here, both are equal.
 
     Args:
         hits: Whether each prediction matches, in the order in which predictions count. (N,)
@@ -98,6 +98,7 @@ def reliability(scores: FloatArray, hits: BoolArray) -> tuple[FloatArray, FloatA
         3 x (<= 10,)
     """
     bins = np.clip((scores * 10).astype(np.int64), 0, 9)
+    # Number the bins that are not empty.
     _, bins, counts = np.unique(bins, return_inverse=True, return_counts=True)
     score_sums = np.bincount(bins, weights=scores)
     hit_sums = np.bincount(bins, weights=hits)

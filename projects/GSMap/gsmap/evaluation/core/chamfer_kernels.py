@@ -1,6 +1,6 @@
 """Compiled inner loops of the Chamfer distance.
 
-Coordinates of lines are in separate rows, so that the loops vectorise; in the plane z is 0.
+Lines are stored as rows of x, y and z, so that the loops vectorise; z is 0 for 2D lines.
 """
 
 import math
@@ -13,8 +13,10 @@ from gsmap.structures.elements import FloatArray, IntArray
 
 Lines = tuple[FloatArray, IntArray, IntArray]
 """Points of N lines in metres (3, M), offsets of the lines (N + 1,), and labels (N,)."""
-_NO_NAN = {"nnan", "nsz"}  # minima vectorise; the order of additions stays as it is written
-_BOUND_SLACK = 1.0 - 1e-12  # a lower bound may be too large by the rounding of its sum
+# Compiler flags: no value is NaN, and the sign of zero does not matter. Minima then vectorise,
+# and sums still add in the written order.
+_NO_NAN = {"nnan", "nsz"}
+_BOUND_SLACK = 1.0 - 1e-12  # factor of computed bounds, which rounding may have made too large
 
 
 @njit(cache=True, error_model="numpy")
@@ -139,6 +141,8 @@ def beside_a_segment(points: FloatArray, line: FloatArray, half_width_m: float) 
             sy = ly[j + 1] - ly[j]
             qx = px[i] - lx[j]
             qy = py[i] - ly[j]
+            # `along` and `across` are the point's distances from the start of the segment, along
+            # and across its direction, times the length of the segment.
             seg_sq = sx * sx + sy * sy
             along = qx * sx + qy * sy
             if 0.0 < along < seg_sq:
@@ -161,8 +165,9 @@ def pair_distances(pred: Lines, gt: Lines, max_distance: float) -> FloatArray:
         max_distance: Largest distance in metres.
 
     Returns:
-        Distances in metres; infinite beyond ``max_distance``, for different classes, for lines
-        without length and in the last column. (N, K + 1)
+        Distances in metres; infinite beyond ``max_distance``, for different classes and for lines
+        without length. The last column is infinite, so that each row has a minimum even if K is 0.
+        (N, K + 1)
     """
     pred_points, pred_offsets, pred_labels = pred
     gt_points, gt_offsets, gt_labels = gt

@@ -1,4 +1,4 @@
-"""Evaluation of several metrics over a stream of samples, of which only the matches are kept."""
+"""Evaluation of several metrics over a stream of samples; only the matches stay in memory."""
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
@@ -51,7 +51,7 @@ class MapEvaluator:
         object.__setattr__(self, "ground_truth_points", ground_truth_points)
         names = [metric.name for metric in metrics]
         if len({metric.classes for metric in metrics}) != 1:
-            raise InputError("name at least one metric; all have the same classes.")
+            raise InputError("give at least one metric; all metrics must have equal classes.")
         if len(set(names)) != len(names):
             raise InputError(f"the metrics must have different names, got {names}.")
         if ground_truth_points is not None and ground_truth_points < 2:

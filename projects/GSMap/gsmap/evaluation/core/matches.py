@@ -11,7 +11,7 @@ import gsmap.utils.compilation  # noqa: F401 - reports that kernels are compiled
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 from gsmap.utils.errors import InputError
 
-_COLUMNS = {  # type codes of the columns of a table
+_COLUMNS = {  # type codes (Python's `array`) of the columns of a table
     "length": "q",
     "labels": "q",
     "scores": "d",
@@ -228,7 +228,8 @@ class MatchTable:
         num_thresholds = len(next(iter(thresholds.values())))
         order = self._order
 
-        # Rows of the columns, with the samples in the order of their tokens.
+        # Rows of the columns, with the samples in the order of their tokens. The rows of one
+        # sample are consecutive in both orders, so all of them have one shift between the orders.
         lengths = columns["length"]
         starts = np.cumsum(lengths) - lengths  # first row of each sample in the columns
         sorted_lengths = lengths[order]
@@ -245,6 +246,7 @@ class MatchTable:
         for label, (name, class_thresholds) in enumerate(thresholds.items()):
             places = np.flatnonzero(labels == label)
             samples_of_class = samples[places]  # ascending
+            # Place of the first prediction of each prediction's sample.
             first_of_sample = np.searchsorted(samples_of_class, samples_of_class)
             ranks = np.arange(len(places)) - first_of_sample
             by_score = np.argsort(-scores[places], kind="stable")

@@ -301,7 +301,7 @@ def _fits_record(shapes: Mapping[str, _Shape], expected: Mapping[str, _Shape]) -
 
 
 def _fits_shape(shape: _Shape, empty_shape: _Shape) -> bool:
-    """Whether a shape equals the shape of an empty sample, apart from a first axis of length 0."""
+    """Whether a shape equals the shape of an empty sample; a first axis of length 0 may vary."""
     if shape == empty_shape:
         return True
     varies = len(empty_shape) > 0 and empty_shape[0] == 0

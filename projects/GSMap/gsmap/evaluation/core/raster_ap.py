@@ -36,7 +36,7 @@ LINE_THRESHOLDS = (0.25, 0.3, 0.35, 0.4, 0.45, 0.5)
 POLYGON_THRESHOLDS = (0.5, 0.55, 0.6, 0.65, 0.7, 0.75)
 MIN_SCORE = 0.05
 MAX_PREDICTIONS = 100  # largest number of predictions of a class in a sample
-RECALL_LIMITS = (1, 10, 100)
+RECALL_LIMITS = (1, 10, 100)  # AR@n counts the n best predictions of a class in each sample
 NUSCENES_GRID = BEVGrid(x_range=(-15.0, 15.0), y_range=(-30.0, 30.0))
 _MOST_PX = 2e7  # largest canvas: 560 m by 560 m at 8 pixels per metre
 _FAR_PX = 2.0**20  # farther points are pulled in, so that they fit the integers of the drawing
@@ -77,7 +77,7 @@ class RasterConfig(Metric):
             columns, rows = self.size_px
             raise InputError(
                 f"a canvas of AP_raster has at most {_MOST_PX:.0e} pixels, not {columns} x {rows}: "
-                "give --range, or leave that metric out with --eval chamfer"
+                "give --range, or leave AP_raster out with --eval chamfer"
             )
         if self.dilation_px < 1 or self.dilation_px % 2 == 0:
             raise InputError(f"dilation_px must be odd and >= 1, got {self.dilation_px}.")

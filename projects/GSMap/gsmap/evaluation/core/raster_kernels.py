@@ -18,7 +18,7 @@ from gsmap.structures.elements import BoolArray, FloatArray, IntArray
 WordArray = npt.NDArray[np.uint64]
 
 _ALL_BITS = np.uint64(0xFFFFFFFFFFFFFFFF)
-_PER_PIXEL = 65536  # units of a crossing in a pixel
+_PER_PIXEL = 65536  # crossings of a row are integers in units of 1 / 65536 pixel
 
 
 @njit(cache=True)
@@ -26,10 +26,10 @@ def _stamp(mask: WordArray, width: int, row: int, left: int, right: int, radius:
     """Set the pixels ``left`` to ``right`` of a row, dilated by a square and cut to the mask."""
     low = max(left - radius, 0)
     high = min(right + radius, width - 1)
-    first = low >> 6
+    first = low >> 6  # word of the column `low`
     last = high >> 6
-    head = _ALL_BITS << np.uint64(low & 63)
-    tail = _ALL_BITS >> np.uint64(63 - (high & 63))
+    head = _ALL_BITS << np.uint64(low & 63)  # bits of the first word from column `low` on
+    tail = _ALL_BITS >> np.uint64(63 - (high & 63))  # bits of the last word up to column `high`
     for y in range(max(row - radius, 0), min(row + radius + 1, mask.shape[0])):
         if first == last:
             mask[y, first] |= head & tail
@@ -66,22 +66,26 @@ def _clip_segment(a: IntArray, b: IntArray, height: int, width: int) -> bool:
         other_limit = (width if other == 0 else height) - 1
         beyond_a = _side(a[axis], limit=limit)
         beyond_b = _side(b[axis], limit=limit)
-        if beyond_a * beyond_b > 0:
+        if beyond_a * beyond_b > 0:  # both ends are beyond one border
             return False
         if _side(a[other], limit=other_limit) * _side(b[other], limit=other_limit) > 0:
             return False
         for end, beyond in ((a, beyond_a), (b, beyond_b)):
             if beyond:
+                # Move the end along the segment to the border.
                 border = 0 if beyond < 0 else limit
                 along = float(border - end[axis]) * (b[other] - a[other])
                 end[other] += int(along / (b[axis] - a[axis]))
                 end[axis] = border
-    return _side(a[0], limit=width - 1) == 0 and _side(b[0], limit=width - 1) == 0
+    return True
 
 
 @njit(cache=True)
 def _draw_segment(mask: WordArray, width: int, start: IntArray, end: IntArray, radius: int) -> None:
-    """Draw a dilated 8-connected segment between two points (column, row) inside the mask."""
+    """Draw a dilated 8-connected segment between two points (column, row) inside the mask.
+
+    Bresenham's algorithm steps along the longer axis. The pixels of each row are set together.
+    """
     if end[0] < start[0]:
         start, end = end, start  # from left to right
     dx = end[0] - start[0]
@@ -95,7 +99,7 @@ def _draw_segment(mask: WordArray, width: int, start: IntArray, end: IntArray, r
     error = major - 2 * minor
     left = x  # first pixel of the current row
     for _ in range(major):
-        steps_aside = error < 0  # a step along the shorter axis, too
+        steps_aside = error < 0  # this step goes along the shorter axis, too
         error -= 2 * minor
         if steps_aside:
             error += 2 * major
@@ -141,14 +145,15 @@ def _fill(
         if a[1] != b[1]:
             first = edges[i, 0]
             last = edges[i, 1]
-            # as C divides: no quotient of such numbers (2^37) rounds up to the next integer
+            # Equal to the integer division of C, which truncates: numbers up to 2^37 are so small
+            # that their quotient in float64 never rounds up to the next integer.
             slope[i] = int((last[0] - first[0]) * _PER_PIXEL / (last[1] - first[1]))
             low[i] = min(a[1], b[1])
             high[i] = max(a[1], b[1])
             upper = first if a[1] < b[1] else last
-            x_start[i] = upper[0] * _PER_PIXEL + (low[i] - upper[1]) * slope[i]
+            x_start[i] = upper[0] * _PER_PIXEL + (low[i] - upper[1]) * slope[i]  # in row low[i]
             if not cut[i]:
-                x_start[i] += _PER_PIXEL // 2
+                x_start[i] += _PER_PIXEL // 2  # the division below then rounds to nearest
     crossings = np.zeros(num_edges, dtype=np.int64)
     for row in range(max(0, low.min()), min(height, high.max())):
         count = 0
@@ -198,7 +203,7 @@ def draw(
                 cut[j] |= _side(point[1], limit=height - 1) != 0
             if not cut[j] or _clip_segment(edges[j, 0], edges[j, 1], height=height, width=width):
                 _draw_segment(masks[i], width, start=edges[j, 0], end=edges[j, 1], radius=radius)
-            if edges[j, 0, 1] == edges[j, 1, 1]:  # clipping left no slope
+            if edges[j, 0, 1] == edges[j, 1, 1]:  # within one row: the clipped edge has no slope
                 edges[j, 0] = start
                 edges[j, 1] = end
         if filled[i] and len(corners):

@@ -171,11 +171,11 @@ def _group_lines(report: MetricReport, group: str) -> list[str]:
     lines = []
     for name, cells in rows.items():
         line = name.ljust(name_width)
-        for cell, title in zip(cells, titles, strict=False):  # the means have no details
+        for cell, title in zip(cells, titles, strict=False):  # the row of means has AP alone
             line += cell.rjust(max(len(title), 6) + 2)
         lines.append(line)
     last_class_line = lines[-2]
-    lines.insert(1, "-" * len(last_class_line))
+    lines.insert(1, "-" * len(last_class_line))  # below the titles
     return lines
 
 

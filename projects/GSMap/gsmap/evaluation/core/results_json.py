@@ -136,7 +136,8 @@ class SampleFile:
             if token_in_file == token:
                 return elements
         raise InputError(
-            f"{self.path} was changed while it was read: end what writes there, and start again."
+            f"{self.path} was changed while it was read: stop the program that writes to it, and "
+            "start again."
         )
 
     def _convert(self, item: Any, ignored: Counter[str]) -> tuple[str, MapElements]:
@@ -217,7 +218,9 @@ def read_vectors(
 
 
 def _check_lengths(elements: MapElements) -> None:
-    """Check that lines are as short as in a map around a vehicle; resampling takes memory.
+    """Check that lines are not far longer than a map around a vehicle.
+
+    Long lines in a malformed file would be resampled to more points than fit in memory.
 
     Raises:
         ValueError: If a point is too far from the vehicle, or a line too long.
@@ -225,10 +228,12 @@ def _check_lengths(elements: MapElements) -> None:
     points = elements.points
     if not len(points):
         return
+    # Fast check: no two points are farther apart than the diagonal of the box of all points.
     max_coordinate = np.abs(points).max()
     max_step = 2 * float(max_coordinate) * points.shape[1] ** 0.5
-    if max_step * len(points) <= MAX_LENGTH_M:  # a bound on the length of all lines
+    if max_step * len(points) <= MAX_LENGTH_M:
         return
+    # Length of the step to each vertex from the one before it, 0 for the first of a line.
     steps = np.linalg.norm(np.diff(points, axis=0, prepend=points[:1]), axis=1)
     starts = elements.offsets[:-1]
     first_vertices = starts[starts < len(steps)]  # a last line may have no vertex
@@ -239,13 +244,13 @@ def _check_lengths(elements: MapElements) -> None:
         worst = max([max_coordinate, *lengths])
         if worst > MAX_LENGTH_M:
             raise InputError(
-                f"a line of {worst:.3g} m, or that far from the vehicle: at most "
+                f"a line is {worst:.3g} m long, or a point is that far from the vehicle: at most "
                 f"{MAX_LENGTH_M / 1000:g} km are read"
             )
     if total > MAX_TOTAL_LENGTH_M:
         raise InputError(
-            f"lines of {total:.3g} m in all: at most {MAX_TOTAL_LENGTH_M / 1000:g} km of a sample "
-            "are read"
+            f"all lines together are {total:.3g} m long: at most {MAX_TOTAL_LENGTH_M / 1000:g} km "
+            "of a sample are read"
         )
 
 

@@ -1,6 +1,6 @@
 """AP per sample of older methods: lines are drawn to masks, and AP is averaged over samples.
 
-Rules, equal to the released evaluators of the methods that use it:
+Rules, equal to the public evaluation code of HDMapNet and BeMapNet:
 
 - The lines of a class in a sample are drawn to one mask of 0.15 m pixels in the order of the file,
   so that a later line hides the pixels that it crosses.
@@ -43,7 +43,7 @@ GapArray = npt.NDArray[np.float32]
 
 @dataclass(frozen=True)
 class SampleAP(Metric):
-    """AP per sample; the metric of each method is a subclass in its folder.
+    """AP per sample; the metric of each method is a subclass in ``models/<method>/metric.py``.
 
     Attributes:
         line_px: Thickness of lines in pixels.
@@ -52,8 +52,8 @@ class SampleAP(Metric):
     Args:
         classes: Names of the classes; a label is an index into them.
         grid: Extent of the canvas in metres; its raster is not used.
-        min_score: Smallest score of a prediction that counts, in [0, 1]. The released evaluators
-            count all predictions.
+        min_score: Smallest score of a prediction that counts, in [0, 1]. The public code of the
+            methods counts all predictions.
 
     Raises:
         ValueError: If a value is out of its range.
@@ -131,17 +131,18 @@ def draw_numbers(elements: MapElements, label: int, config: SampleAP) -> MaskArr
     is_drawn = (elements.labels == label) & (elements.num_points >= 2)
     for i in np.flatnonzero(is_drawn).tolist():
         line = pixels[elements.offsets[i] : elements.offsets[i + 1]]
+        # Element i is drawn as i + 1, because the background is 0.
         cv2.polylines(mask, [line], isClosed=False, color=(i + 1,), thickness=config.line_px)
     return mask - 1
 
 
 @dataclass(frozen=True)
 class _MaskPixels:
-    """Pixels of the n elements that are visible in a mask, numbered from 0.
+    """Pixels of a mask of elements. The n elements with a pixel are numbered from 0 to n - 1.
 
     Args:
         mask: Number of the element at each pixel, or -1. (H, W)
-        indices: Index of each element in the sample. (n,)
+        indices: Index in the sample of the element of each number. (n,)
         rows: Row of each pixel. (M,)
         columns: Column of each pixel. (M,)
         owners: Number of the element of each pixel, ascending. (M,)
@@ -185,14 +186,20 @@ class _MaskPixels:
 
 @njit(cache=True)
 def _fill_gaps(gaps: GapArray, mask: MaskArray, number: int) -> None:
-    """Write the distance of each pixel to the nearest pixel of an element in its column. (H, W)"""
+    """Write to ``gaps`` how far each pixel is from the nearest pixel of an element in its column.
+
+    Args:
+        gaps: Distances in pixels, overwritten. (H, W)
+        mask: Number of the element at each pixel, or -1. (H, W)
+        number: Number of the element.
+    """
     height, width = mask.shape
-    gaps[0] = _NO_PIXEL
-    for r in range(height):
+    gaps[0] = _NO_PIXEL  # the first row has no row above: it reads this value
+    for r in range(height):  # distance from the nearest pixel above
         above = gaps[max(r - 1, 0)]
         for c in range(width):
             gaps[r, c] = 0.0 if mask[r, c] == number else above[c] + 1
-    for r in range(height - 2, -1, -1):
+    for r in range(height - 2, -1, -1):  # or from the nearest pixel below, if that is less
         for c in range(width):
             gaps[r, c] = min(gaps[r, c], gaps[r + 1, c] + 1)
 
@@ -206,7 +213,7 @@ def _distance_from_gaps(gaps: GapArray, column: int) -> float:
         column: Column of the pixel.
     """
     best_sq = gaps[column] ** 2
-    step = 1
+    step = 1  # columns aside; pixels there are at least as far away as this number
     while step * step < best_sq and step < len(gaps):
         if column >= step:
             best_sq = min(best_sq, step * step + gaps[column - step] ** 2)
@@ -220,14 +227,14 @@ def _distance_from_gaps(gaps: GapArray, column: int) -> float:
 def _mean_distances(
     mask: MaskArray, is_near: BoolArray, rows: IntArray, columns: IntArray, owners: IntArray
 ) -> FloatArray:
-    """Compute the mean distance from the pixels of other elements to each element of a mask.
+    """Compute the mean distance from the pixels of m other elements to each of N elements.
 
     Args:
-        mask: Number of the element at each pixel, or -1. (H, W)
-        is_near: Whether to measure each pair. (N, m)
+        mask: Number of the element at each pixel, of N elements, or -1. (H, W)
+        is_near: Whether to measure each pair of an element and an other element. (N, m)
         rows: Row of each pixel of the other elements. (M,)
         columns: Column of each pixel of the other elements. (M,)
-        owners: Number of the other element of each pixel. (M,)
+        owners: Number, below m, of the other element of each pixel. (M,)
 
     Returns:
         Mean distances in pixels, infinite where they are not measured. (N, m)
@@ -339,7 +346,7 @@ def match_sample_ap(
         gt_mask = draw_numbers(ground_truth, label=label, config=config)
         distance, pred_rows, gts = line_distances(pred_mask, gt_mask, limit_m=limit_m)
         preds = confident[pred_rows]
-        matched = closest_pairs(distance, limit_m)
+        matched = closest_pairs(distance, limit_m)  # column of each row of `distance`, or -1
         is_match = matched >= 0
         is_visible[preds] = True
         num_gts[label] = len(gts)
@@ -362,8 +369,8 @@ def match_sample_ap(
 def sample_aps(detections: ClassDetections) -> FloatArray:
     """Compute the AP of a class in each sample.
 
-    Predictions count in the order of rising score, as released; matches come first among equal
-    scores.
+    Predictions count in the order of rising score, as in the public code; matches come first among
+    equal scores.
 
     Args:
         detections: Predictions of the class in all samples.

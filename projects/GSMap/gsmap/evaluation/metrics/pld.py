@@ -64,8 +64,11 @@ def _align_points(distances: FloatArray, gap_cost: float) -> tuple[float, float]
         gap_cost: Cost of a point without partner, in metres.
 
     Returns:
-        Total cost, and the part of it that the distances of the pairs have.
+        Total cost, and the sum of the distances of the pairs, which is a part of it.
     """
+    # cost[j] is the smallest cost of pairing the rows so far with the first j columns, and
+    # paired[j] the distances in it. A row overwrites both from left to right; the values of the
+    # row before at column j are kept as `diagonal_cost` and `diagonal_paired`.
     num_columns = distances.shape[1] + 1
     cost = gap_cost * np.arange(num_columns)
     paired = np.zeros(num_columns)
@@ -76,10 +79,10 @@ def _align_points(distances: FloatArray, gap_cost: float) -> tuple[float, float]
         for j in range(len(row)):
             best_cost = diagonal_cost + row[j]
             best_paired = diagonal_paired + row[j]
-            if cost[j + 1] + gap_cost < best_cost:
+            if cost[j + 1] + gap_cost < best_cost:  # the point of the row has no partner
                 best_cost = cost[j + 1] + gap_cost
                 best_paired = paired[j + 1]
-            if cost[j] + gap_cost < best_cost:
+            if cost[j] + gap_cost < best_cost:  # the point of the column has no partner
                 best_cost = cost[j] + gap_cost
                 best_paired = paired[j]
             diagonal_cost = cost[j + 1]
@@ -113,10 +116,12 @@ def _align_lines(distances: FloatArray, gap_cost: float, num_starts: int) -> tup
 def sospa(first: FloatArray, second: FloatArray, cutoffs_m: Sequence[float]) -> FloatArray:
     """Compute the SOSPA distance of two lines, and its localisation part.
 
-    Points are paired in order. A pair costs its distance, a point without partner c / 2. C is the
-    smallest sum over both directions, and over all starts of the first line if one of the lines is
-    closed (ends within 0.1 m). With G = c / 2 (m + n), the sum without any pair, the distance is
-    2 C / (G + C): 0 for equal lines, 1 for lines without points within c.
+    Points are paired in order. A pair costs its distance, a point without partner costs c / 2. C is
+    the smallest sum of costs, over both directions of the first line and, if one of the lines is
+    closed (ends within 0.1 m), over all starts of the first line. G = c / 2 (m + n) is the sum of
+    costs without any pair. The distance is 2 C / (G + C): 0 for equal lines, 1 for lines without
+    points within c of each other. The localisation part has the distances of the pairs in place of
+    the C above the fraction bar.
 
     Args:
         first: Points at equal distances (`sample_line`), in metres. (m, D)
@@ -124,12 +129,12 @@ def sospa(first: FloatArray, second: FloatArray, cutoffs_m: Sequence[float]) -> 
         cutoffs_m: Cut-offs c in metres, > 0. (T,)
 
     Returns:
-        Distance at each cut-off, and the part of it that the distances of the pairs have. (T, 2)
+        Distance and localisation part at each cut-off. (T, 2)
     """
     first_is_closed = _is_closed(first)
     second_is_closed = _is_closed(second)
     if first_is_closed:
-        first = first[:-1]
+        first = first[:-1]  # without the repeated first point
     if second_is_closed:
         second = second[:-1]
     figures = np.tile([1.0, 0.0], reps=(len(cutoffs_m), 1))
@@ -140,7 +145,7 @@ def sospa(first: FloatArray, second: FloatArray, cutoffs_m: Sequence[float]) -> 
     for row, cutoff in enumerate(cutoffs_m):
         if distances.min() < cutoff:
             gap_cost = cutoff / 2
-            sums = np.array(_align_lines(distances, gap_cost, num_starts))
+            sums = np.array(_align_lines(distances, gap_cost, num_starts))  # C, distances of pairs
             figures[row] = 2 * sums / (gap_cost * sum(distances.shape) + sums[0])
     return figures
 
@@ -157,6 +162,9 @@ def _pair_sums(
     cutoffs_m: Sequence[float],
 ) -> FloatArray:
     """Sum r (1 - s), and r times the localisation part, over the best pairs of one class.
+
+    A pair of score r and SOSPA distance s costs r s + (1 - r) / 2 (`PLD`), and its elements without
+    partners r / 2 + 1 / 2. The difference, r (1 - s), is the gain of the pair.
 
     Args:
         preds: Points of each prediction. n x (m, 2)
@@ -247,11 +255,11 @@ class PLD(Metric):
     def reports(self, table: ValueTable) -> list[MetricReport]:
         """Compute PLD from the sums of all samples.
 
-        The keys of figures are ``CLASS/PLD@CUTOFF``. ``localisation`` in place of ``PLD`` is the
-        part that the distances of paired points have; ``cardinality`` is the rest, for points,
-        lines and scores that are too many or too few. Figures without cut-off are means over the
-        cut-offs; figures without class are means over the classes. A class that occurs in no sample
-        has 0.
+        The keys of figures are ``CLASS/PLD@CUTOFF``. Keys with ``localisation`` in place of ``PLD``
+        are the part of PLD due to the distances of paired points. ``cardinality`` is the rest: it
+        is due to points and lines without partners, and to scores below 1. Figures without cut-off
+        are means over the cut-offs; figures without class are means over the classes. A class that
+        occurs in no sample has 0.
 
         Args:
             table: Values of all samples.
@@ -260,8 +268,9 @@ class PLD(Metric):
         masses = np.sum(table.column("masses"), axis=0)
         gains = sums[..., 0]
         errors = sums[..., 1]
+        # D = M - gains, so M + D = 2 M - gains.
         whole = np.maximum(2 * masses - gains, np.finfo(float).tiny)
-        pld = 2 * (masses - gains) / whole  # D = M - gains
+        pld = 2 * (masses - gains) / whole
         localisation = 2 * errors / whole
         figures: dict[str, float] = {}
         for part, values in zip(_PARTS, (pld, localisation, pld - localisation), strict=True):

@@ -93,10 +93,10 @@ class Topology(Metric):
     def reports(self, table: ValueTable) -> list[MetricReport]:
         """Add up the counts of all samples.
 
-        The keys of figures are ``CLASS/NAME``. If different predictions cover n
-        pieces of a ground truth, it has n - 1 ``breaks``. If a prediction follows n ground truths,
-        it has n - 1 ``false_joints``. ``folds`` are counted as in `count_folds`. ``num_gts`` and
-        ``num_preds`` are the numbers of ground truths and predictions.
+        The keys of figures are ``CLASS/NAME``. If different predictions cover n pieces of a ground
+        truth, it has n - 1 ``breaks``. If a prediction follows n ground truths, it has n - 1
+        ``false_joints``. ``folds`` are counted as in `count_folds`. ``num_gts`` and ``num_preds``
+        are the numbers of ground truths and predictions.
 
         Args:
             table: Values of all samples.
@@ -126,6 +126,7 @@ def count_pieces(covered: BoolArray, step_m: float, min_piece_m: float) -> int:
     while len(covered):
         gains = (covered & is_free).sum(axis=1)
         best = int(gains.argmax())
+        # `not >=` also holds for NaN: no points times the infinite step of a malformed line.
         if not gains[best] * step_m >= min_piece_m:
             break
         is_free &= ~covered[best]
