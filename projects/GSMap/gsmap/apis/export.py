@@ -78,6 +78,7 @@ class ExportedDetector(nn.Module):
                 if name not in calibration:
                     calibration.append(name)
         self.input_names = ("images", *calibration, *prior_inputs, *stream_inputs)
+        # The first output of a head's references is the points.
         self.output_names = ("scores", "labels", "points", *head.reference.outputs[1:])
         self.memory: tuple[str, ...] = ()
         self._empty_memory: dict[str, Tensor] = {}

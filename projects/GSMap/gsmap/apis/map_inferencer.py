@@ -100,7 +100,7 @@ def _build_visualizer(cfg: Config) -> "MapVisualizer":
 
     options = dict(cfg.get("visualizer") or {})
     kind = str(options.pop("type", "MapVisualizer"))
-    if kind.split(".")[-1] != "MapVisualizer":
+    if kind.split(".")[-1] != "MapVisualizer":  # options of another class
         options = {}
     for name in ("name", "vis_backends", "save_dir"):
         options.pop(name, None)

@@ -273,7 +273,7 @@ def _fit_classes(
     first_rows = _find_class_weights(
         state, initial=initial, old_count=len(trained), new_count=len(names)
     )
-    if all(key.startswith(_GENERATOR_LABELS) for key in first_rows):
+    if all(key.startswith(_GENERATOR_LABELS) for key in first_rows):  # also without any such weight
         return [
             f"classes were {', '.join(trained)}, are {', '.join(names)}: this head's weights of "
             "classes are taken as they are, where their sizes fit."

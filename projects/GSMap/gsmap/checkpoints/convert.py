@@ -1,4 +1,7 @@
-"""Conversion of state dicts between the formats of the earlier systems and of this project."""
+"""Conversion of state dicts between the formats of the earlier systems and of this project.
+
+"Upstream" is the code of the authors of a model.
+"""
 
 from collections.abc import Mapping, Sequence
 

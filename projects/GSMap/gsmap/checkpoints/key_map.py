@@ -21,9 +21,9 @@ def key_maps() -> tuple[KeyMap, ...]:
     num_users: Counter[str] = Counter()
     for method in METHODS:
         num_users.update(method.built_on)
-    # Models are sorted by the number of models that build on them, so that a model comes after
-    # those. Models of equal numbers stay in the reversed order of METHODS: the later is the more
-    # special one.
+    # Models are sorted by the number of models that build on them, so a model comes after all
+    # models that build on it. At equal numbers, the model that is later in METHODS comes first,
+    # because it is more special.
     methods = sorted(reversed(METHODS), key=lambda method: num_users[method.name])
     maps: list[KeyMap] = []
     for method in methods:

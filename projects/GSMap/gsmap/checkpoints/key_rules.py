@@ -1,4 +1,7 @@
-"""Rules between the state keys of an earlier system and of this project, for both directions."""
+"""Rules between the state keys of an earlier system and of this project, for both directions.
+
+The earlier system, the code of the authors of a model, is called "upstream".
+"""
 
 import re
 from collections.abc import Collection, Mapping

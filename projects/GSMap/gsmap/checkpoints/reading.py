@@ -60,7 +60,8 @@ class Checkpoint:
         can_bus: Whether the training samples had vehicle signals; False if unknown.
         trained_on: Data set of the training and identity of its list of scenes; empty if unknown.
         dataset_meta: Metadata of the training's data set, not checked.
-        calibration: Law and interval that the sigmas were fitted by; empty if they were not.
+        calibration: Distribution of the errors and interval to which the sigmas of the Gaussians
+            were fitted (`calibration_of`); empty if they were not fitted.
     """
 
     state: dict[str, Tensor]

@@ -252,8 +252,8 @@ class VectorizedMapDataset(BaseDataset):
             raise InputError(f"{self.ann_file} has no sample to use (of {len(self.annotations)}).")
         image_rows = rows
         if self._shuffle_images_seed is not None:
-            # Each sample gets the images of the one before it in a random order, and the first one
-            # those of the last. So no sample keeps its images.
+            # In a random order, each sample gets the images of the sample before it, and the first
+            # sample gets the images of the last one. So no sample keeps its images.
             order = np.random.default_rng(self._shuffle_images_seed).permutation(len(rows))
             image_rows = np.empty_like(rows)
             image_rows[order] = rows[np.roll(order, shift=1)]

@@ -289,6 +289,7 @@ class MapPrior:
         width = int(columns.max()) - first_column + 1
         height = int(rows.max()) - first_row + 1
         cells = (rows - first_row) * width + (columns - first_column)
+        # Poses and grids are bounded, so the columns and rows of tiles fit the index of a file.
         farthest = max(abs(first_column), abs(first_row)) + max(width, height)
         assert farthest < FARTHEST_TILE * self.settings.tile_cells
         return _Window(

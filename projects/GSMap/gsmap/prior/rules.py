@@ -137,7 +137,7 @@ class HitMissCounts(WriteRule):
 
     @property
     def _unit(self) -> np.float32:
-        """Stored number of one view."""
+        """Number that is stored for a count of 1."""
         return np.float32(255 * (1 - self.decay))
 
     def update(self, states: States, values: Floats) -> States:

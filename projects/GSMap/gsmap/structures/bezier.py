@@ -139,7 +139,7 @@ def _in_plane(points: Float) -> Float:
 
 
 def _fit_test(degree: int, max_error_m: float, deviation: Deviation) -> Callable[[Float], bool]:
-    """Create a test whether one piece is close enough to a part of a line (n, D)."""
+    """Create the function that tests whether one piece fits a part of a line (n, D)."""
 
     def fits(part: Float) -> bool:
         curve = curve_points(fit_piece(part, degree), degree)

@@ -176,7 +176,7 @@ class MapElements:
         return replace(self, points=np.ascontiguousarray(points))
 
     def to_frame(self, transform: FloatArray) -> "MapElements":
-        """Transform the elements to another level frame, by the position and yaw of a pose.
+        """Transform the elements to another frame, by the position and yaw of a pose.
 
         Ground truth is cut out of maps by the inverse of this transform. Roll and pitch are
         ignored; they would move a point 30 m away by centimetres.

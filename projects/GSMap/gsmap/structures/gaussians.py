@@ -37,9 +37,11 @@ class Gaussians(NamedTuple):
 class GaussianSpace:
     r"""Encoding of Gaussians as references of a decoder.
 
-    The first entries of a reference are the centre, [0, 1] over the map. The last three encode
-    sigma (2) and theta (1) and are zero for the initial Gaussian of a query. The initial Gaussian
-    lies along the direction of travel, since a round one has no direction and no gradient in theta.
+    A reference is the vector that the decoder layers refine for each point, like the reference
+    points in Deformable DETR. Its first entries are the centre, [0, 1] over the map. Its last three
+    entries encode sigma (2) and theta (1) and are zero for the initial Gaussian of a query. The
+    initial Gaussian lies along the direction of travel, since a round one has no direction and no
+    gradient in theta.
 
     Args:
         grid: Extent and direction of travel of the map; its raster is not used.
@@ -191,6 +193,8 @@ class GaussianSpace:
         y_per_x = cell_m[1] / cell_m[0]
         along_x = self.grid.forward == "x"
         if invariant:
+            # R diag(a, b) R^T is [[middle + half cos, half sin], [half sin, middle - half cos]],
+            # with middle = (a + b) / 2, half = (a - b) / 2, and cos and sin of twice the angle.
             cos, sin = self._double_angle(theta).split(1, dim=-1)
             middle = (stretch[..., :1] + stretch[..., 1:]) / 2
             half = (stretch[..., :1] - stretch[..., 1:]) / 2
@@ -268,8 +272,8 @@ def with_covariances(means: Tensor, covariances: Tensor, near: Tensor) -> Gaussi
     half = torch.where(is_round, torch.ones_like(half), half)
     cross = torch.where(is_round, torch.zeros_like(cross), cross)
     # If half < 0, the axis of the larger eigenvalue is more than an eighth of a turn from `near`.
-    # The axis of the smaller one is then the first axis: with this sign, both angle and radius are
-    # those of the smaller eigenvalue.
+    # The first axis is then the axis of the smaller eigenvalue: the sign turns the angle to this
+    # axis, and makes the radius negative.
     sign = torch.where(half < 0, -1.0, 1.0)
     angle = torch.atan2(sign * cross, half.abs()) / 2
     radius = torch.where(is_round, 0.0, sign * (half.square() + cross.square()).sqrt())
@@ -318,7 +322,8 @@ def fuse_gaussians(first: Gaussians, second: Gaussians) -> Gaussians:
 
     Args:
         first: Gaussians. (...)
-        second: Gaussians, to whose first axes the first axes of the products are close. (...)
+        second: Gaussians. Their rotations select the first axes of the products
+            (`with_covariances`). (...)
 
     Returns:
         Products. (...)
@@ -338,7 +343,7 @@ def fuse_gaussians(first: Gaussians, second: Gaussians) -> Gaussians:
 
 
 def gaussians_along(points: Tensor, across_m: float) -> Gaussians:
-    """Create Gaussians that cover lines, with sigma half the distance of neighbours along a line.
+    """Create Gaussians that cover lines: sigma along a line is half the distance of its points.
 
     Args:
         points: Ordered centres in metres. (..., P, 2)

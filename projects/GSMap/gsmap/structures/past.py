@@ -1,4 +1,4 @@
-"""Memory of previous frames, as a model with memory receives it for a batch."""
+"""Temporal memory of a batch: the tensors that the previous frames left, and the motion since."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

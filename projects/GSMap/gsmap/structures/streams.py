@@ -1,4 +1,8 @@
-"""Memory of streams of frames, and rules for the order of frames."""
+"""Streams of frames, their memory, and rules for the order of frames.
+
+A stream is a sequence of frames of one drive. Its memory is the tensors that a temporal model
+computes in a frame and reads in the next one.
+"""
 
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence

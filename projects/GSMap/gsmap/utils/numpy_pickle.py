@@ -44,7 +44,7 @@ class CheckedDtype:
     def __setstate__(self, state: Any) -> None:
         is_plain = isinstance(state, tuple) and all(type(part) in _STATE_PARTS for part in state)
         for candidate in (self.dtype.newbyteorder("<"), self.dtype.newbyteorder(">")):
-            numpy_state = candidate.__reduce__()[2]
+            numpy_state = candidate.__reduce__()[2]  # the state with which numpy pickles it
             if is_plain and state == numpy_state:
                 self.dtype = candidate
                 return

@@ -152,7 +152,7 @@ def describe_override(error: BaseException) -> str | None:
 
 
 def _frames(error: BaseException) -> Iterator[FrameType]:
-    """Yield the frames of an error, the innermost first; those of its cause come first."""
+    """Yield the frames of the cause of an error, then its frames, each the innermost first."""
     cause = error.__cause__ or error.__context__  # mmengine replaces errors of hooks
     if cause is not None:
         yield from _frames(cause)

@@ -134,7 +134,7 @@ def _images(
 def _polylines(
     elements: MapElements, camera: CameraRecord, view: FrameView, classes: Sequence[str]
 ) -> Iterator[dict[str, Any]]:
-    """Yield the elements that a camera sees; those of unknown classes are left out."""
+    """Yield the elements inside the image of a camera, without elements of unknown classes."""
     for number, line in enumerate(elements.polylines):
         label = int(elements.labels[number])
         shapes = _visible_parts(view.lift(line), camera)

@@ -76,7 +76,9 @@ class MapVisualizationHook(Hook):
         if not self.draw or not outputs or runner.rank != 0:
             return
         stride = max(len(runner.val_dataloader) // max(self.num_val_samples, 1), 1)
-        if batch_idx % stride or batch_idx // stride >= self.num_val_samples:
+        is_at_stride = batch_idx % stride == 0
+        num_drawn = batch_idx // stride
+        if not is_at_stride or num_drawn >= self.num_val_samples:
             return
         name = file_name(f"val_{outputs[0].metainfo['token']}")
         points = _points(data_batch, 0)

@@ -128,8 +128,9 @@ def plot_result(reports: Sequence[MetricReport]) -> Figure:
 def plot_uncertainty(vertices: Vertices, classes: Sequence[str], law: str = "normal") -> Figure:
     """Plot coverage of intervals and sparsification, in a row each for errors along and across.
 
-    Sparsification is the mean error of the remaining vertices when those with the largest sigma
-    are removed. The pale curve below it is the optimum, by the largest errors.
+    Sparsification is the mean error of the remaining vertices when the vertices with the largest
+    sigma are removed. The pale curve below it is the optimum: the vertices with the largest errors
+    are removed.
 
     Args:
         vertices: Matched vertices.

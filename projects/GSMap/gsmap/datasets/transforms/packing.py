@@ -84,5 +84,5 @@ class PackMapInputs(BaseTransform):
 
 
 def _is_finite(image: NDArray[np.floating[Any]]) -> bool:
-    """Test whether all values are finite. A finite sum proves it in one fast pass."""
+    """Test whether all values are finite. A finite sum proves it fast, but a sum may overflow."""
     return bool(np.isfinite(image.sum()) or np.isfinite(image).all())

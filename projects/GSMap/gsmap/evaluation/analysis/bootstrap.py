@@ -24,7 +24,7 @@ _PERCENTILES = (2.5, 97.5)  # ends of the interval of 95 %
 
 @dataclass(frozen=True)
 class Interval:
-    """Interval of 95 % of a figure, or of the difference of two figures.
+    """Interval of 95 % of a figure (the value of a metric), or of the difference of two figures.
 
     Args:
         value: Figure or difference over all scenes.
@@ -116,7 +116,7 @@ def _weighted_ap(
     Args:
         hit_rows: Indices of the predictions that match, in descending order of score. (H,)
         copies: Number of copies of each prediction. (N,)
-        ranks: Number of copies of each prediction and of those with a higher score. (N,)
+        ranks: Number of copies of each prediction and of all predictions with a higher score. (N,)
         total: Number of ground truths with their copies, > 0.
         interpolated: Whether AP is the mean at 101 recalls; the area otherwise.
     """

@@ -293,7 +293,7 @@ def format_uncertainty(metrics: Mapping[str, float], law: str = "normal") -> str
 def fit_factors(
     vertices: Vertices, classes: Sequence[str], num_sigmas: float = 1.0, law: str = "normal"
 ) -> FloatArray:
-    """Fit factors of the sigmas of each class so that a central interval has its coverage.
+    """Fit factors of the sigmas of each class, so that a central interval has its coverage.
 
     Args:
         vertices: Matched vertices.

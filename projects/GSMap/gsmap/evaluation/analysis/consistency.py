@@ -1,5 +1,6 @@
 """Consistency over the frames of a drive: tracks, C-mAP of MapTracker, jitter of vertices.
 
+C-mAP is an mAP whose matches must also continue the track of their ground truth.
 The rules equal MapTracker's public code. They differ from AP_chamfer in four ways:
 predictions with a score of 0.4 or less are left out, a frame without ground truth of a class does
 not count for the class, lines have 200 points, and the 4 m wide strips around a matched pair of

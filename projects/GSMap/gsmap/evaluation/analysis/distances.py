@@ -84,10 +84,11 @@ def cut_line(points: FloatArray) -> Iterator[tuple[int, FloatArray]]:
     pieces = []
     for start, end in pairwise([0, *changes.tolist(), len(bands)]):
         pieces.append((int(bands[start]), vertices[start : end + 1]))
-    if len(pieces) > 1 and pieces[0][0] == pieces[-1][0] and is_closed(points):
-        band, last = pieces.pop()
-        _, first = pieces[0]
-        pieces[0] = (band, np.concatenate([last, first[1:]]))
+    first_band, first = pieces[0]
+    last_band, last = pieces[-1]
+    if len(pieces) > 1 and first_band == last_band and is_closed(points):
+        pieces.pop()
+        pieces[0] = (first_band, np.concatenate([last, first[1:]]))
     for band, piece in pieces:
         dx, dy = np.diff(piece, axis=0).T
         if np.hypot(dx, dy).sum() >= SHORTEST_M:

@@ -20,7 +20,7 @@ from gsmap.utils.files import read_json
 
 CONDITIONS = ("clear", "cloudy", "dusk", "night", "rain")
 """Words for weather and light in the descriptions of scenes, in nuScenes and MiniCity."""
-OTHERWISE = "day"  # descriptions of nuScenes do not mention dry days
+OTHERWISE = "day"  # group of a scene without such a word: nuScenes does not describe dry days
 _COLUMNS = {"scene": "scene", "map": "map_name"}
 _LONGEST = 80  # characters of the name of a group
 
@@ -41,13 +41,16 @@ class Groups:
         return sorted(set(self.group_of.values()))
 
     def draw_copies(self, tokens: Sequence[str]) -> tuple[IntArray, FloatArray]:
-        """Return each group alone as a resample (`bootstrap.Weights`).
+        """Return one resample per group, which has the samples of this group once and no others.
+
+        The interface is `bootstrap.Weights`.
 
         Args:
             tokens: Tokens of the samples. (S,)
 
         Returns:
-            Index of the group of each sample (S,), and number of copies of each group (G, G).
+            Index of the group of each sample (S,), and number of copies of each group in each
+            resample, the identity matrix (G, G).
 
         Raises:
             ValueError: If the group of a sample is unknown.
@@ -84,19 +87,20 @@ def read_groups(annotations: str | Path, by: str) -> Groups:
     if Path(by).suffix.lower() == CHANGES_SUFFIX:
         return Groups(changed_samples(read_changes(by), file))
     tokens = file.column("token")
-    groups = file.column(_COLUMNS.get(by, "scene"))
-    if by not in _COLUMNS:
-        group_of = _read_group_file(by)
-        if group_of.keys().isdisjoint(tokens):
-            kind = "scene"
-            names = groups
-        else:
-            kind = "sample"
-            names = tokens
-        for name in names:
-            if name not in group_of:
-                raise InputError(f"{by} has no {kind} {name!r}, which {annotations} has.")
-        groups = [group_of[name] for name in names]
+    if by in _COLUMNS:
+        groups = file.column(_COLUMNS[by])
+        return Groups(dict(zip(tokens, groups, strict=True)))
+    group_of = _read_group_file(by)
+    if group_of.keys().isdisjoint(tokens):
+        kind = "scene"
+        names = file.column("scene")
+    else:
+        kind = "sample"
+        names = tokens
+    for name in names:
+        if name not in group_of:
+            raise InputError(f"{by} has no {kind} {name!r}, which {annotations} has.")
+    groups = [group_of[name] for name in names]
     return Groups(dict(zip(tokens, groups, strict=True)))
 
 

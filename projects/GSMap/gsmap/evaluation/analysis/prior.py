@@ -92,7 +92,8 @@ class _ClassFit:
             lines: Points in metres. (N, P, 2 or 3)
 
         Returns:
-            Index of the ground truth, or -1, and its Chamfer distance in metres. 2 x (N, F)
+            Two arrays: index of the ground truth, or -1, and its Chamfer distance in metres,
+            infinite without one. (N, F) each
         """
         labels = np.full(len(lines), fill_value=self.label)
         elements = MapElements.from_polylines(lines, labels=labels)

@@ -19,7 +19,7 @@ def precision_recall(hits: BoolArray, num_gts: int) -> tuple[FloatArray, FloatAr
         num_gts: Number of ground truths.
 
     Returns:
-        Recall and precision in [0, 1]. 2 x (N,)
+        Two arrays: recall and precision in [0, 1]. (N,) each
     """
     true_positives = np.cumsum(hits, dtype=np.float64)
     recall = true_positives / max(num_gts, 1)
@@ -94,8 +94,8 @@ def reliability(scores: FloatArray, hits: BoolArray) -> tuple[FloatArray, FloatA
         hits: Whether each prediction matches. (N,)
 
     Returns:
-        Mean score, share of matches, and number of predictions of each bin that is not empty.
-        3 x (<= 10,)
+        Three arrays: mean score, share of matches, and number of predictions of each bin that is
+        not empty. (<= 10,) each
     """
     bins = np.clip((scores * 10).astype(np.int64), 0, 9)
     # Number the bins that are not empty.

@@ -187,8 +187,8 @@ def nearest_by_chamfer(
         max_distance: Largest Chamfer distance in metres.
 
     Returns:
-        Index of the ground truth, -1 if there is none within ``max_distance``, and its Chamfer
-        distance in metres, infinite without one. 2 x (N,)
+        Two arrays: index of the ground truth, -1 if there is none within ``max_distance``, and its
+        Chamfer distance in metres, infinite without one. (N,) each
 
     Raises:
         ValueError: If heights count, and a side has none.

@@ -55,6 +55,7 @@ class AnnotatedTruth:
                 self._labels[label] = classes.index(name)
         self._rows = shard.part(range(len(self._file)))
         has_heights = self._file.meta.dim == 3
+        # Under this key, `SampleFile` counts samples with heights, too.
         self.ignored = Counter({THREE_D: len(self._file) if has_heights else 0})
 
     def __iter__(self) -> Iterator[tuple[str, MapElements, int]]:

@@ -34,7 +34,7 @@ class _SampleFields(NamedTuple):
     ground_truth: MapElements
 
 
-class Sample(_SampleFields):
+class Sample(_SampleFields):  # a subclass, because a NamedTuple itself cannot cache a property
     """Predictions and ground truth of one sample, in metres in the annotation frame.
 
     Attributes:

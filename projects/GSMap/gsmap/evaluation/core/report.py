@@ -1,4 +1,4 @@
-"""Reports of metrics: flat figures, ranked predictions, and tables for people."""
+"""Reports of metrics: figures (named numbers), ranked predictions, and tables for people."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -29,8 +29,8 @@ class MetricReport:
         tokens: Tokens of the samples, sorted.
         sample_aps: AP of each class in each sample, for a metric that is the mean over samples; NaN
             where a sample does not count. C x (S, T)
-        by_distance: True if thresholds are distances in metres, of which the last is the loosest;
-            False if they are IoUs, of which the first is the loosest.
+        by_distance: True if thresholds are distances in metres, and the last one is the loosest;
+            False if thresholds are IoUs, and the first one is the loosest.
     """
 
     name: str

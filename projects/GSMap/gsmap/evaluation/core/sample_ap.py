@@ -176,7 +176,7 @@ class _MaskPixels:
         return len(self.indices)
 
     def bounds(self, coordinates: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return the smallest and the largest row, or column, of each element. 2 x (n,)"""
+        """Return the smallest and the largest row, or column, of each element. (n,) each"""
         values = coordinates.astype(np.float64)
         if not self.count:
             return values, values

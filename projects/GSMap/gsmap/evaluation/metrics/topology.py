@@ -81,7 +81,7 @@ class Topology(Metric):
             num_folds = 0
             for line in preds:
                 num_folds += count_folds(line, is_area=label in self.area_labels)
-            counts[label] = (
+            counts[label] = (  # in the order of _COUNTS
                 _count_excess_pieces(gts, lines=preds, config=self),
                 _count_excess_pieces(preds, lines=gts, config=self),
                 num_folds,
@@ -175,7 +175,7 @@ def count_folds(line: FloatArray, is_area: bool) -> int:
         return 0
     span = max(round(_FOLD_CHORD_M / length * (_POINTS - 1)), 1)  # points per chord
     chords = points[span:] - points[:-span]
-    before = chords[:-span]  # chords that end where those in `after` start
+    before = chords[:-span]  # each one ends where the chord of equal index in `after` starts
     after = chords[span:]
     lengths = np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
     is_fold = (before * after).sum(axis=1) < _FOLD_COS * lengths

@@ -41,7 +41,9 @@ def choose_frames(
     """
     if len(tokens) <= max_frames:
         return list(range(len(tokens)))
-    num_even = max_frames - max_frames // 4 if results else max_frames
+    num_even = max_frames
+    if results:
+        num_even -= max_frames // 4
     even = np.linspace(0, len(tokens) - 1, num_even).round().astype(int)
     chosen = set(even.tolist())
     if results:

@@ -12,6 +12,7 @@ from string import Template
 from typing import Any
 
 from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.annotations.record import MapSample
 from gsmap.evaluation.analysis import DISTANCE
 from gsmap.evaluation.analysis.bootstrap import Resamples
 from gsmap.evaluation.analysis.distances import distance_groups
@@ -19,7 +20,7 @@ from gsmap.evaluation.analysis.groups import read_groups
 from gsmap.evaluation.core.file_evaluation import read_ground_truth
 from gsmap.evaluation.core.raster_ap import MIN_SCORE
 from gsmap.structures.elements import MapElements
-from gsmap.structures.frames import frame_view
+from gsmap.structures.frames import FrameView, frame_view
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.errors import InputError
 from gsmap.utils.files import write_text
@@ -136,19 +137,14 @@ def page_data(
         # The mounting contains the slope of the ground, which is visible in the images.
         sample_view = view.with_mounting(sample.ego_from_frame)
         cameras = cameras_of(sample, view=sample_view, data_root=root, width_px=options.image_width)
-        predictions = []
-        for result in scored:
-            predictions.append(predictions_of(sample.token, result=result, view=view))
-        frame = {
-            "token": sample.token,
-            "title": _frame_title(sample.scene, seconds[index]),
-            "scene": sample.scene,
-            "place": sample.map_name,
-            "truth": truth_of(sample, view),
-            "found": predictions,
-            "cameras": cameras,
-            "changes": layer.entries(sample, view),
-        }
+        frame = _frame_entry(
+            sample,
+            title=_frame_title(sample.scene, seconds[index]),
+            cameras=cameras,
+            scored=scored,
+            layer=layer,
+            view=view,
+        )
         frames.append(frame)
     notes = []
     for result in scored:
@@ -157,21 +153,16 @@ def page_data(
     if len(chosen) < len(tokens):
         choice = _describe_choice(scored, num_chosen=len(chosen), max_frames=options.max_frames)
         notes.append(f"The page shows {len(chosen)} of {len(tokens)} frames: {choice}.")
-    classes = []
-    for label in range(len(meta.classes)):
-        colour = style.colour(label)
-        is_area = style.is_closed(label)
-        classes.append({"title": style.title(label), "colour": colour, "area": is_area})
     tables: list[Table] = []
     if scored:
         tables = _tables(scored, truth=truth, style=style, file=file, options=options)
-    notes += layer.notes()
+    notes += layer.notes()  # after all frames: it counts the changes in them
     tables += layer.tables()
     return {
         "title": f"{meta.dataset} {meta.split}: {' and '.join(results) or 'ground truth'}",
         "notes": notes,
         "samples": len(tokens),
-        "classes": classes,
+        "classes": _class_entries(style),
         "match_colours": MATCH_COLOURS,
         "extent": display_extent(BEVGrid(meta.x_range, meta.y_range), view),
         "vehicle": view.vehicle_m,
@@ -184,6 +175,49 @@ def page_data(
         "reliability": reliability_curves(scored, truth, style),
         "frames": frames,
     }
+
+
+def _frame_entry(
+    sample: MapSample,
+    title: str,
+    cameras: list[list[dict[str, Any]]],
+    scored: Sequence[ScoredResult],
+    layer: ChangeLayer,
+    view: FrameView,
+) -> dict[str, Any]:
+    """Plain values of one frame.
+
+    Args:
+        sample: Sample of the annotation file.
+        title: Title of the frame.
+        cameras: Plain values of the cameras (`cameras_of`).
+        scored: Results, whose predictions are added.
+        layer: Changes of the map.
+        view: Orientation of the annotation frame.
+    """
+    predictions = []
+    for result in scored:
+        predictions.append(predictions_of(sample.token, result=result, view=view))
+    return {
+        "token": sample.token,
+        "title": title,
+        "scene": sample.scene,
+        "place": sample.map_name,
+        "truth": truth_of(sample, view),
+        "found": predictions,
+        "cameras": cameras,
+        "changes": layer.entries(sample, view),
+    }
+
+
+def _class_entries(style: MapStyle) -> list[dict[str, Any]]:
+    """Plain values of the classes, in label order."""
+    entries = []
+    for label in range(len(style.classes)):
+        colour = style.colour(label)
+        is_area = style.is_closed(label)
+        entries.append({"title": style.title(label), "colour": colour, "area": is_area})
+    return entries
 
 
 def _describe_choice(scored: Sequence[ScoredResult], num_chosen: int, max_frames: int) -> str:
