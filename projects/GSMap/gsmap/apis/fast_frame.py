@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 SWITCH = "cuda_graphs"  # argument of `MapInferencer`; --cuda-graphs in commands
 CAPTURE_BY_DEFAULT = True  # replayed and launched frames were equal on an H100
-_MOST_GRAPHS = 4  # of different sizes; each occupies the memory of a frame
+_MOST_GRAPHS = 4  # largest number of graphs, of different image sizes; each takes memory
 _WARM_UP = 3  # frames before a capture, in which libraries select and load kernels
 
 

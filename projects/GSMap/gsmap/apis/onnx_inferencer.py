@@ -348,7 +348,7 @@ class OnnxInferencer:
             ) from error
 
     def _select_elements(self, outputs: Mapping[str, NDArray[Any]]) -> MapElements:
-        """Select elements as `elements`, with the errors of numpy."""
+        """Implementation of `elements`, which may raise errors of numpy."""
         margin = self.metadata["margin_m"]
         threshold = self.metadata["score_threshold"]
         keep = np.ones(len(outputs["scores"]), dtype=bool)  # (M,)

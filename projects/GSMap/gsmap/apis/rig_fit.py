@@ -175,7 +175,7 @@ def _fit_cameras(
     if trained is None or len(trained) != len(embeds):
         if len(embeds) == num_cameras:
             return []
-        trained = ()
+        trained = ()  # unknown
     names = _camera_names(dataset)
     names_are_known = set(names) <= set(trained)
     directions_are_known = bool(trained) and set(trained) <= AZIMUTHS_DEG.keys()
@@ -338,9 +338,8 @@ class RigFitHook(Hook):
             runner: Runner of the training.
             checkpoint: Contents of the checkpoint; changed in place.
         """
-        if runner._resume or isinstance(
-            runner._train_loop, dict | None
-        ):  # no loop is built: a test
+        # In a test, no training loop is built.
+        if runner._resume or isinstance(runner._train_loop, dict | None):
             return
         dataset = innermost(runner.train_dataloader.dataset)
         state = checkpoint.get("state_dict", checkpoint)

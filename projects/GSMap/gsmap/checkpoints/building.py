@@ -98,7 +98,7 @@ def building(cfg: Config, kind: type | None = None) -> Iterator[None]:
         yield
     except GsmapError as error:
         text = str(error)
-        names_a_path = "/" in text
+        names_a_path = "/" in text  # such as the path of a file that cannot be read
         if names_a_path or not _parts_under_construction(error):
             raise
         raise type(error)(f"{where}{text}") from error
@@ -134,7 +134,7 @@ def _parts_under_construction(error: BaseException) -> list[_Part]:
                 kind = registry.get(kind)
             parts.append(_Part(registry=registry, kind=kind, settings=settings))
         elif frame.f_globals.get("__name__") == _RUNNER and name.startswith(("build_", "__init__")):
-            parts.append(_Part(registry=None, kind=None))
+            parts.append(_Part(registry=None, kind=None))  # the runner builds an object itself
     return parts
 
 
@@ -152,7 +152,7 @@ def _describe_fault(error: BaseException, parts: list[_Part], cfg: Config) -> st
     text = str(error)
     if isinstance(error, KeyError) and error.args:
         text = str(error.args[0])  # without the quotes of a KeyError
-    scope = _frames(error)[0].f_globals
+    scope = _frames(error)[0].f_globals  # names of the module that raised the error
     of_config = scope.get("__name__", "").startswith(_CONFIGS)
     if of_config and isinstance(error, KeyError | AttributeError):
         return f"a setting is missing: {text}."

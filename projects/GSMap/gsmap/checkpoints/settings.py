@@ -23,8 +23,8 @@ SIGNALS = "can_bus"  # key in a checkpoint's meta: whether training samples had 
 _REPLACEMENTS = {"Det3DDataPreprocessor": "MapDataPreprocessor"}
 _KEY = re.compile(r"[a-zA-Z]\w*")
 _TEXT = re.compile(r"[\w -]*")  # excludes file names, addresses, modules and expressions
-_LARGEST = 1_000_000  # layers, channels, voxels
-_DEEPEST = 20
+_LARGEST = 1_000_000  # largest number in a setting, such as a number of channels or voxels
+_DEEPEST = 20  # largest depth of nested settings
 
 
 def plain(settings: Any) -> Any:

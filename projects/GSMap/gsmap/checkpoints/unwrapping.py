@@ -12,7 +12,7 @@ from gsmap.utils.errors import InputError
 WRAPPERS = ("state_dict", "model_state_dict", "model_state", "model", "network", "net", "weights")
 _DEEPEST = 3  # nested wrappers
 _OUTER_PREFIXES = ("model.", "network.", "net.")  # removed if all keys start with it
-_PARALLEL_PREFIX = "module."  # of parallel training; removed at the start of a key alone
+_PARALLEL_PREFIX = "module."  # of parallel training; removed only at the start of a key
 _WRAPPER_PARTS = ("_orig_mod", "_fsdp_wrapped_module", "_checkpoint_wrapped_module")
 _AVERAGED = "ema_"  # prefix of keys of exponential moving averages of weights
 _MAX_KEYS_SHOWN = 8  # number of keys that a message names

@@ -376,7 +376,8 @@ def _check_keys(cfg: Config) -> None:
     """Refuse unknown top-level keys, and sections that are not dictionaries or lists of them."""
     for key, value in cfg.items():
         is_known = key in _known_keys()
-        if is_known and key.endswith(_SECTIONS) and not isinstance(value, dict | None):
+        is_section = is_known and key.endswith(_SECTIONS)
+        if is_section and not isinstance(value, dict | None):
             raise InputError(f"{cfg.filename}: {key} must be dict(...), got {value!r:.60}.")
         if key in _PART_LISTS and not isinstance(value, dict | None):
             is_list = isinstance(value, list | tuple)

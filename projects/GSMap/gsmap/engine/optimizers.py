@@ -74,6 +74,7 @@ class MapOptimWrapper(_LateNorm):
 
     def step(self, **kwargs: Any) -> None:
         """Clip the gradients and take a step."""
+        # A fused optimizer of torch skips a step if its attribute `found_inf` is 1.
         can_skip_steps = getattr(self.optimizer, "_step_supports_amp_scaling", False)
         if can_skip_steps and self._has_nonfinite_loss is not None:
             self.optimizer.found_inf = self._has_nonfinite_loss
@@ -172,7 +173,7 @@ def fit_optimizer_state(checkpoint: dict[str, Any], wrapper: Any) -> None:
     group_sizes = [len(group["params"]) for group in groups]
     if len(groups) > len(members) and group_sizes == [1] * param_count:
         _merge_state(state, members=members)
-        # mmengine appends a group with its base settings
+        # mmengine may append a group with its base settings, after all others.
         extra_groups = len(wrapper.param_groups) - len(members)
         if not extra_groups:
             state.pop("base_param_settings", None)

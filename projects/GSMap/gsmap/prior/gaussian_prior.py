@@ -209,6 +209,7 @@ class GaussianPrior:
                 kept = of_class.select(~of_class.are_forgotten(self.rule))
                 parts.append(kept)
                 parts.append(_new_gaussians(kept, lines, label=label, rule=self.rule))
+            # All Gaussians of the tiles in view are distributed again, as some have moved.
             for key in keys:
                 self._tiles.pop(key, None)
             _Active.join(parts).scatter(self._tiles, self.settings.tile_m)
@@ -260,7 +261,7 @@ class GaussianPrior:
         width = self.rule.line_sigma_m
         for label in range(num_classes):
             chosen = active.labels == label
-            part = (label, slice(counts[label]))
+            part = (label, slice(counts[label]))  # entries of the class without the padding
             means[part] = local[chosen]
             rotations[part] = turns[chosen]
             scales[:, label, : counts[label], 0] = self.rule.spacing_m / 2
@@ -321,7 +322,7 @@ class _Active:
 
     @classmethod
     def gather(cls, tiles: dict[TileKey, Stored], keys: list[TileKey], tile_m: float) -> "_Active":
-        """Convert the Gaussians of tiles."""
+        """Join the Gaussians of tiles, and convert their positions to the global frame."""
         stored = np.concatenate([np.zeros(0, _STORED), *(tiles[key] for key in keys)])
         counts = [len(tiles[key]) for key in keys]
         corners = tile_m * np.array(keys, dtype=np.float64).reshape(-1, 2)

@@ -91,15 +91,16 @@ def sample_lines(
         local_x = np.interp(positions, along, line[:, 0])
         local_y = np.interp(positions, along, line[:, 1])
         local = np.stack([local_x, local_y], axis=1)
-        part = slice(chosen.offsets[index], chosen.offsets[index + 1])
-        far = (_SIGMA_PER_M * np.linalg.norm(local, axis=1)) ** 2
+        vertices = slice(chosen.offsets[index], chosen.offsets[index + 1])
+        distance_variances = (_SIGMA_PER_M * np.linalg.norm(local, axis=1)) ** 2
         in_global = pose.to_global(local)
         steps = np.gradient(in_global, axis=0)
         points.append(in_global)
-        variances.append(np.interp(positions, along, vertex_variances[part]) + far)
+        line_variances = np.interp(positions, along, vertex_variances[vertices])
+        variances.append(line_variances + distance_variances)
         scores.append(np.full(count, score))
         angles.append(np.arctan2(steps[:, 1], steps[:, 0]))
-        starts.append(num_points + np.arange(count - 1))
+        starts.append(num_points + np.arange(count - 1))  # all points but the last of the line
         num_points += count
     return LineSamples(
         points=np.concatenate(points),

@@ -26,7 +26,7 @@ from gsmap.utils.files import atomic_write
 
 MEMORY_BYTES = 100 << 20
 """Default of the largest size of the tiles in memory."""
-_MOST_CELLS = 1 << 24  # in the rectangle around the view of a frame
+_MOST_CELLS = 1 << 24  # largest number of cells in the rectangle around the view of a frame
 
 
 class MapPrior:
@@ -233,7 +233,7 @@ class MapPrior:
         touched, largest = _largest_per_cell(cells, flat_values, size=window.height * window.width)
         with self._lock:
             canvas = self._load_canvas(window)
-            flat_canvas = _flatten_cells(canvas)
+            flat_canvas = _flatten_cells(canvas)  # a view, so that `canvas` is updated
             flat_canvas[..., touched] = self.rule.update(
                 states=flat_canvas[..., touched], values=largest
             )

@@ -16,7 +16,7 @@ from gsmap.prior.file_format import TileKey, TilePlace, unpack_tile
 from gsmap.utils.errors import WorkError
 
 Tile = NDArray[np.uint8]
-_LEVEL = 1  # of zlib; higher levels save little on sparse rasters
+_LEVEL = 1  # compression level of zlib; higher levels save little on sparse rasters
 _MAPPED_BYTES = 32 << 20  # after reading this from a mapped file, its pages leave memory
 _WASTED_BYTES = 64 << 20  # of replaced tiles in the temporary file, before it is written again
 
@@ -70,7 +70,7 @@ class TileStore:
         return len(self._tiles)
 
     def get(self, key: TileKey) -> Tile | None:
-        """Return a tile, which the caller must not keep; None for a tile without states."""
+        """Return a tile, or None for a tile without states. The caller must not store the tile."""
         tile = self._tiles.get(key)
         if tile is None:
             tile = self._load(key)
@@ -113,7 +113,7 @@ class TileStore:
         return content
 
     def _stored(self, key: TileKey) -> tuple[bytes, int]:
-        """Compressed states and checksum of a tile that has been written or spilled."""
+        """Compressed states and checksum of a tile in the temporary file or the prior's file."""
         if key in self._spill.places:
             return self._spill.read(key)
         assert self._mapped is not None
@@ -191,6 +191,7 @@ class _SpillFile:
             )
 
     def _append(self, key: TileKey, content: bytes) -> None:
+        """Write a tile at the end of the file."""
         if self._file is None:
             self._file = tempfile.TemporaryFile()  # noqa: SIM115
         self._file.seek(self._end)

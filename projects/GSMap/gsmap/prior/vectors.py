@@ -17,7 +17,7 @@ from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import is_closed
 from gsmap.utils.errors import InputError
 
-_MOST_PIECES = 1_000_000  # of lines and areas, in all tiles together
+_MOST_PIECES = 1_000_000  # largest number of pieces of lines and areas, in all tiles together
 _CHUNK = 64  # pieces of a tile that are drawn at a time
 _FARTHEST_M = 1e7  # largest coordinate of a vertex
 Piece = tuple[int, bool, FloatArray]

@@ -79,7 +79,7 @@ def _inverse(degree: int) -> Float:
 
 
 def fit_piece(points: Points, degree: int) -> Float:
-    """Fit one piece to a line: least squares at equal lengths, with the ends of the line.
+    """Fit one piece to a line by least squares at equal arc lengths; the ends are the line's ends.
 
     Args:
         points: Vertices in metres. (n >= 2, D)

@@ -129,7 +129,8 @@ def update_from_known_lines(
     updated = with_covariances(means, covariance - gain @ toward.mT, near=now.rotations)
     belongs = (smallest_mean < gate_m)[:, None]
     is_updated = belongs & places.beside[pair] & (point_distances < gate_m)  # (N, P)
-    is_updated &= along.norm(dim=-1) > 0.5  # a segment without length has no direction
+    # The direction has length 1, or 0 for a segment without length, across which nothing is known.
+    is_updated &= along.norm(dim=-1) > 0.5
     return Gaussians(
         means=torch.where(is_updated[..., None], updated.means, now.means),
         scales=torch.where(is_updated[..., None], updated.scales, now.scales),

@@ -170,9 +170,9 @@ def equivalent_orders(
     """Compute the point orders that describe one map element ("v2" of MapTR).
 
     An open polyline has two orders: forward and reversed. A ring, whose last vertex equals its
-    first, has one order for each of its K vertices, which starts there and keeps the direction of
-    the ring. Order k starts k vertices before the first one. If there are more than P - 1 vertices,
-    P - 1 of them are selected.
+    first, has n - 1 different vertices and one order for each of them. The order starts at the
+    vertex and keeps the direction of the ring. Order k starts k vertices before the first one. If
+    there are more than P - 1 vertices, P - 1 of them are selected.
 
     Args:
         points: Vertices at full resolution, in metres. (n, D)

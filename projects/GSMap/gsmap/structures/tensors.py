@@ -79,8 +79,10 @@ def cached_constant(like: Tensor, key: Hashable, make: Callable[[], Tensor]) -> 
     entry = (like.device, key)
     values = _constants.get(entry)
     if values is None:
-        with torch.inference_mode(False), torch.no_grad():  # also usable in a later training
+        # A tensor that is made in inference mode could not be used in a later training.
+        with torch.inference_mode(False), torch.no_grad():
             values = make()
+        # A tensor that is made during a capture has values only after a replay of the graph.
         capturing = like.is_cuda and torch.cuda.is_current_stream_capturing()
         if not capturing and len(_constants) < _MOST_CONSTANTS:
             _constants[entry] = values

@@ -243,7 +243,7 @@ def _report_thread_error(args: Any) -> None:
 
 
 class _SignalError(BaseException):
-    """Exception for a signal, which reports when it is garbage collected."""
+    """Exception for a signal, which calls ``on_drop`` when it is garbage collected."""
 
     on_drop: Callable[[], None]
 

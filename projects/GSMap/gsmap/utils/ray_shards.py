@@ -71,7 +71,10 @@ def run_on_ray(
 
 
 def _without_cluster_options(words: Sequence[str]) -> list[str]:
-    """Remove the options for all shards from a command."""
+    """Remove the options for all shards from a command.
+
+    ``--per-shard`` is followed by any number of words ``NAME=AMOUNT``.
+    """
     rest: list[str] = []
     is_resource = False
     for word in without_options(words, "--executor", "--shards"):
@@ -104,7 +107,7 @@ def _run_shard(words: Sequence[str], shard: str, folder: str) -> tuple[str, floa
         preexec_fn=partial(die_with_parent, os.getpid()),
     )
     code = process.returncode
-    if code < 0 or code >= 128:
+    if code < 0 or code >= 128:  # a shell returns 128 plus the number of the signal
         raise ShardKilledError(f"shard {shard} was killed: exit code {code}")
     duration_s = time.perf_counter() - start_s
     if not code:

@@ -24,7 +24,7 @@ from gsmap.visualization.style import MapStyle
 
 _STEP_M = 2.0  # largest length of a segment, which has one depth and so one line width
 _WIDTH_STEP = 0.2  # logarithm of the ratio of successive line widths; few widths make few paths
-_NOMINAL_SIZE_IN = 2.4  # root of the area of a panel on which line widths are not scaled
+_NOMINAL_SIZE_IN = 2.4  # square root of the area of a panel on which line widths are not scaled
 _OPEN_PATHS: dict[str, Any] = {"facecolors": "none", "capstyle": "round", "joinstyle": "round"}
 
 

@@ -44,7 +44,7 @@ _TITLE = 44  # space for the title of a panel
 _USABLE = _WIDTH - 2 * _MARGIN
 _PNG_IN_SVG = re.compile(rb"data:image/png;base64,([\w+/=\s]+)")
 _RANDOM_TOKEN = re.compile(r"[0-9a-f]{16,}")
-# Numbers of four and more decimals, which are cut after the second; factors of scale( stay.
+# Numbers with four or more decimals, of which two are kept. Factors in scale(...) do not match.
 _LONG_NUMBER = re.compile(rb"(?<!scale\()\b(\d+\.\d\d)\d{2,}")
 _TALLEST = 0.5 * _USABLE  # largest height of a row of cameras or a panel
 _LONGEST_TITLE = 88  # characters

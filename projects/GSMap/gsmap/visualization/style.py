@@ -23,7 +23,7 @@ _GREY = "#8E8E93"
 # Colours of matches: a prediction is a hit or false, a ground truth is found or missed.
 MATCH_COLOURS = {"hit": "#00A39A", "false": "#FF3B30", "found": _GREY, "missed": "#AF52DE"}
 TRUTH_OPACITY = {"found": 0.4, "missed": 0.75}
-FALSE_DASHES = (0, (3, 1.5))  # a line style of matplotlib
+FALSE_DASHES = (0, (3, 1.5))  # line style of matplotlib: offset, and lengths of dash and gap
 # Colours of runs and methods in plots, distinct from the colours of classes and matches.
 RUN_COLOURS = (
     "#34495E",

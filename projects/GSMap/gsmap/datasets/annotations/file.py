@@ -38,7 +38,7 @@ from gsmap.utils.shards import WHOLE, Shard, ShardFile
 
 SHARD_KIND = "annotations"
 _ROWS_PER_BATCH = 256
-# Texts of the metadata.
+# Fields of the metadata whose values are texts.
 _TEXTS = ("dataset", "frame", "split", "command", "source_fingerprint")
 
 
@@ -273,7 +273,7 @@ class AnnotationFile(Sequence[MapSample]):
         self._decoders = []
         for batch in self._batches:
             self._decoders.append(decoder_of(batch.to_struct_array(), dim=self.meta.dim))
-        # Index of the first sample of each batch, and number of all samples.
+        # Index of the first sample of each batch; the last entry is the number of all samples.
         self._starts = np.cumsum([0, *map(len, self._batches)])
 
     def _check_content(self, seal: bytes | None) -> None:

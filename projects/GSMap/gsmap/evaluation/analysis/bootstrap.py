@@ -117,7 +117,7 @@ def _weighted_ap(
         hit_rows: Indices of the predictions that match, in descending order of score. (H,)
         copies: Number of copies of each prediction. (N,)
         ranks: Number of copies of each prediction and of all predictions with a higher score. (N,)
-        total: Number of ground truths with their copies, > 0.
+        total: Number of ground truths, each counted as often as it has copies, > 0.
         interpolated: Whether AP is the mean at 101 recalls; the area otherwise.
     """
     true_positives = 0.0

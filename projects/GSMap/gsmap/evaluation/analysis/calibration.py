@@ -24,7 +24,8 @@ LEVELS = np.linspace(0.05, 0.95, num=19)  # probabilities of central intervals
 _STANDARD = (stats.norm(), stats.laplace(scale=0.5**0.5))
 LAWS = dict(zip(LAW_NAMES, _STANDARD, strict=True))
 """Laws of errors (probability distributions) of variance 1, by name."""
-COVERED = (2 * stats.norm.cdf([1.0, 2.0]) - 1).tolist()  # within one and two sigma of a normal law
+# Probabilities that an error of a normal law lies within one and within two sigma.
+COVERED = (2 * stats.norm.cdf([1.0, 2.0]) - 1).tolist()
 _FEWEST = 100  # smallest number of vertices of a class, to fit factors for the class
 _COLUMNS = (  # keys of figures and titles of the columns of the table
     ("nll", "NLL"), ("coverage@1", "68.3 %"), ("coverage@2", "95.4 %"), ("sigma_m", "sigma m"),

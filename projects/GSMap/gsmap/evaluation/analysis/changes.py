@@ -89,7 +89,7 @@ def _level(pose: FloatArray) -> FloatArray:
 def with_map_names(
     changes: Iterable[MapChange], map_names: Sequence[str], where: str
 ) -> list[MapChange]:
-    """Give changes without the name of their map the name of the only map.
+    """Complete changes that do not name their map by the name of the only map.
 
     Args:
         changes: Changes of a file.
@@ -131,7 +131,7 @@ def changed_samples(changes: Sequence[MapChange], annotations: AnnotationFile) -
     group_of = {}
     for map_name, tokens_of_map in tokens.items():
         points = _all_samples([change for change in changes if change.map_name == map_name])
-        for index, token in enumerate(tokens_of_map):  # in the order of the file, as the views
+        for index, token in enumerate(tokens_of_map):  # views have the order of the file, too
             is_changed = views[map_name].contains(index, points).any()
             group_of[token] = CHANGED if is_changed else UNCHANGED
     return group_of
@@ -311,7 +311,7 @@ def _confidence_limit(
 
 
 def _may_match(change: MapChange, other: MapChange, same_kind: bool) -> bool:
-    """Whether two changes have one map and class and, if it counts, one kind."""
+    """Whether two changes have equal maps and classes and, with ``same_kind``, equal kinds."""
     if (change.map_name, change.class_name) != (other.map_name, other.class_name):
         return False
     return not same_kind or change.kind == other.kind

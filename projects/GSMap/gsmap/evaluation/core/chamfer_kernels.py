@@ -123,12 +123,12 @@ def _boxes(points: FloatArray, offsets: IntArray) -> FloatArray:
 
 @njit(cache=True)
 def beside_a_segment(points: FloatArray, line: FloatArray, half_width_m: float) -> bool:
-    """Check whether a point projects onto a segment of a line and is close to it.
+    """Check whether any of some points projects onto a segment of a line and is close to it.
 
     Args:
         points: Points in metres; z is not used. (3, P)
         line: Vertices in metres; z is not used. (3, Q)
-        half_width_m: Largest distance of the point from the segment, in metres.
+        half_width_m: Largest distance of a point from the segment, in metres.
     """
     px = points[0]
     py = points[1]
@@ -141,8 +141,8 @@ def beside_a_segment(points: FloatArray, line: FloatArray, half_width_m: float) 
             sy = ly[j + 1] - ly[j]
             qx = px[i] - lx[j]
             qy = py[i] - ly[j]
-            # `along` and `across` are the point's distances from the start of the segment, along
-            # and across its direction, times the length of the segment.
+            # `seg_sq` is the squared length of the segment. `along` and `across` are the distances
+            # of the point from its start, along and across its direction, times its length.
             seg_sq = sx * sx + sy * sy
             along = qx * sx + qy * sy
             if 0.0 < along < seg_sq:

@@ -225,7 +225,8 @@ class SamplePairs:
         results = self._items_of_shard(self._results)
         truth = self._items_of_shard(self._truth)
         for result_item, truth_item in zip_longest(results, truth):
-            if result_item and truth_item and result_item[0] == truth_item[0]:
+            has_both = bool(result_item) and bool(truth_item)
+            if has_both and result_item[0] == truth_item[0]:  # one token
                 token, predictions, _ = result_item
                 yield self._pair(token, predictions, truth=truth_item[1])
                 continue
@@ -287,8 +288,8 @@ class SamplePairs:
             )
         if self._degenerate:
             notes.append(
-                f"{self._degenerate} ground truths have fewer than two points: they count, nothing "
-                "can match"
+                f"{self._degenerate} ground truths have fewer than two points: they count, but no "
+                "prediction can match them"
             )
         for name, number in sorted(ignored_predictions.items()):
             notes.append(f"{number} predictions of class {name!r} are not scored")

@@ -105,7 +105,8 @@ def checked_classes(classes: Iterable[str]) -> tuple[str, ...]:
         ValueError: If there is no name, or one text in place of several names.
     """
     names = tuple(classes)
-    if isinstance(classes, str) or not all(isinstance(name, str) for name in names) or not names:
+    are_texts = all(isinstance(name, str) for name in names)
+    if isinstance(classes, str) or not names or not are_texts:
         raise InputError(
             f"classes must be names, such as ('divider', 'boundary'), got {classes!r}."
         )
@@ -146,7 +147,7 @@ def ranked_predictions(
 ) -> IntArray:
     """Rank the predictions of one sample that count in a metric.
 
-    Lines of two points or more with a known class count.
+    Predictions of one point, or of an unknown class, are left out.
 
     Args:
         predictions: Elements with scores. N in number.
@@ -237,6 +238,8 @@ class MatchTable:
         shifts = starts[order] - sorted_starts
         rows_by_token = np.repeat(shifts, sorted_lengths) + np.arange(sorted_lengths.sum())
 
+        # Labels and scores are in the order of the tokens, and `places` are indices into them. Hits
+        # and quality stay in the order of the columns, and `rows` are indices into those.
         samples = np.repeat(np.arange(len(self)), sorted_lengths)
         labels = columns["labels"][rows_by_token]
         scores = columns["scores"][rows_by_token]

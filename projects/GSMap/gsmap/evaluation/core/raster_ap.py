@@ -193,13 +193,14 @@ def match_raster(
     padded_gt_index = np.append(gt_index, -1)
     padded_ious = np.full((len(rows), len(gt_index) + 1), fill_value=np.nan)
     padded_ious[:, :-1] = ious
+    loosest_match = matched[:, 0]  # at the smallest IoU, the first threshold
     return FrameMatches(
         token=token,
         pred_index=rows,
         labels=pred_labels,
         scores=predictions.confidence[rows],
         matched_gt=padded_gt_index[matched],
-        quality=padded_ious[np.arange(len(rows)), matched[:, 0]],
+        quality=padded_ious[np.arange(len(rows)), loosest_match],
         num_gts=np.bincount(gt_labels, minlength=num_classes),
         class_iou=kernels.class_ious(pred_masks, gt_masks, pred_labels, gt_labels, num_classes),
     )
@@ -218,8 +219,8 @@ def _class_figures(ranked: ClassDetections, ious: FloatArray) -> dict[str, float
     for limit in RECALL_LIMITS:
         figures[f"AR@{limit}"] = UNDEFINED
         if ranked.num_gts:
-            hits = ranked.hits[ranked.ranks < limit].sum(axis=0)
-            figures[f"AR@{limit}"] = _mean(hits / ranked.num_gts)
+            hits = ranked.hits[ranked.ranks < limit].sum(axis=0)  # (T,)
+            figures[f"AR@{limit}"] = _mean(hits / ranked.num_gts)  # mean over the thresholds
     figures["mIoU"] = _mean(ious[~np.isnan(ious)])
     return figures
 

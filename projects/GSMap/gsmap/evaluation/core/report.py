@@ -127,7 +127,8 @@ def format_table(report: MetricReport) -> str:
     for group in report.groups:
         lines += _group_lines(report, group)
     absent = [name for name, ranked in report.detections.items() if not ranked.num_gts]
-    if absent and len(absent) < len(report.detections) and not report.sample_aps:
+    some_are_absent = 0 < len(absent) < len(report.detections)
+    if some_are_absent and not report.sample_aps:  # AP per sample counts their predictions
         lines.append(f"without ground truth, and in no mean: {', '.join(absent)}")
     mean_ap = report.metrics[f"{report.name}/mAP"]
     lines.append(f"mAP_{report.name} = {mean_ap:.6f}")

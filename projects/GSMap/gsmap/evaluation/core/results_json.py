@@ -173,7 +173,8 @@ def read_vectors(
     Args:
         vectors: JSON objects of the elements.
         classes: Names of the classes; elements of other classes get the label -1.
-        ignored: Number of elements of each other class, and of samples with heights; modified.
+        ignored: Number of elements of each other class, and of samples with heights; updated in
+            place.
         scored: Whether each element must have a confidence.
         gaussians: Whether to read the Gaussians where all elements have them.
 
@@ -228,7 +229,8 @@ def _check_lengths(elements: MapElements) -> None:
     points = elements.points
     if not len(points):
         return
-    # Fast check: no two points are farther apart than the diagonal of the box of all points.
+    # Fast check: no two points are farther apart than the diagonal of the box of all points, so the
+    # product is a bound on the length of all lines.
     max_coordinate = np.abs(points).max()
     max_step = 2 * float(max_coordinate) * points.shape[1] ** 0.5
     if max_step * len(points) <= MAX_LENGTH_M:
@@ -236,7 +238,7 @@ def _check_lengths(elements: MapElements) -> None:
     # Length of the step to each vertex from the one before it, 0 for the first of a line.
     steps = np.linalg.norm(np.diff(points, axis=0, prepend=points[:1]), axis=1)
     starts = elements.offsets[:-1]
-    first_vertices = starts[starts < len(steps)]  # a last line may have no vertex
+    first_vertices = starts[starts < len(steps)]  # lines without vertices may be at the end
     steps[first_vertices] = 0.0
     total = steps.sum()
     if max_coordinate > MAX_LENGTH_M or total > MAX_LENGTH_M:

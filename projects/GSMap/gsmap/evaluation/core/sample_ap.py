@@ -8,7 +8,7 @@ Rules, equal to the public evaluation code of HDMapNet and BeMapNet:
   to the nearest pixel of the other.
 - The closest pair below the threshold matches first, whatever its score.
 - Predictions count in the order of *rising* score, and precision is taken at ten recalls.
-- A sample without predictions and ground truth of a class does not count for the class.
+- A sample that has neither predictions nor ground truth of a class is left out for the class.
 """
 
 from collections.abc import Mapping
@@ -345,7 +345,7 @@ def match_sample_ap(
         pred_mask = draw_numbers(confident_predictions, label=label, config=config)
         gt_mask = draw_numbers(ground_truth, label=label, config=config)
         distance, pred_rows, gts = line_distances(pred_mask, gt_mask, limit_m=limit_m)
-        preds = confident[pred_rows]
+        preds = confident[pred_rows]  # index in `predictions` of each row of `distance`
         matched = closest_pairs(distance, limit_m)  # column of each row of `distance`, or -1
         is_match = matched >= 0
         is_visible[preds] = True
@@ -376,7 +376,7 @@ def sample_aps(detections: ClassDetections) -> FloatArray:
         detections: Predictions of the class in all samples.
 
     Returns:
-        AP in [0, 1]; NaN for a sample without predictions and ground truth. (S, T)
+        AP in [0, 1]; NaN for a sample with neither predictions nor ground truth. (S, T)
     """
     num_gts = detections.gts_of_sample
     num_samples = len(num_gts)
@@ -406,8 +406,8 @@ def _mean(values: FloatArray) -> float:
 def sample_ap_reports(matches: MatchTable, config: SampleAP) -> list[MetricReport]:
     """Compute the mean of AP over the samples, for each report of the method.
 
-    Samples without predictions and ground truth of a class do not count for the class. A class
-    that occurs in no sample is left out of the means.
+    Samples that have neither predictions nor ground truth of a class are left out for the class. A
+    class that occurs in no sample is left out of the means.
 
     Args:
         matches: Matches of all samples by the rules of ``config``.

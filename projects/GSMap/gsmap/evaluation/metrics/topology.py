@@ -24,7 +24,7 @@ from gsmap.utils.errors import InputError
 _POINTS = 128  # points of an element, at equal distances
 _FOLD_CHORD_M = 2.0  # length of the chords before and after a fold
 _COUNTS = ("breaks", "false_joints", "folds", "num_gts", "num_preds")
-_FOLD_COS = -0.5  # cosine of the smallest angle between both chords, 120 degrees
+_FOLD_COS = -0.5  # cosine of 120 degrees, the smallest angle between both chords at a fold
 
 
 @register_metric
@@ -157,7 +157,7 @@ def _resample_flat(line: FloatArray) -> FloatArray:
 
 
 def count_folds(line: FloatArray, is_area: bool) -> int:
-    """Count the folds of a line; of an area, 1 if its outline crosses itself.
+    """Count the folds of a line. For an area, the count is 1 if its outline crosses itself, else 0.
 
     A line folds where its directions over 2 m before and after a point differ by more than 120
     degrees.
