@@ -131,6 +131,23 @@ def test_pickle_hands_on_the_path_and_checksums_alone(tmp_path: Path):
         ({"scene": "\x1b[2J"}, r"scene '\\x1b\[2J' .*control characters"),
         ({"cameras": [CameraRecord("", "x", 1, 1, INTRINSICS, np.eye(4))]}, "name '' .*is empty"),
         (
+            {"cameras": [CameraRecord(n, "x", 1, 1, INTRINSICS, np.eye(4)) for n in ("", "B")]},
+            "name '' .*is empty",
+        ),
+        (
+            {"cameras": [CameraRecord(p, p, 1, 1, INTRINSICS, np.eye(4)) for p in ("A", "", "B")]},
+            "name '' .*is empty",
+        ),
+        (
+            {
+                "cameras": [
+                    CameraRecord("A", "", 1, 1, INTRINSICS, np.eye(4)),
+                    CameraRecord("B", "b.jpg", 1, 1, INTRINSICS, np.eye(4)),
+                ]
+            },
+            "path must be relative .*got ''",
+        ),
+        (
             {"cameras": [CameraRecord("a/../../b", "x", 1, 1, INTRINSICS, np.eye(4))]},
             "name 'a/../../b' .*would lead out of a folder",
         ),

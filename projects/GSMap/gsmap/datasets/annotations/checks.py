@@ -84,7 +84,7 @@ class _BatchChecker:
             rule, text = _RULES[name]
             is_good = rule(array, rows, self.meta)
             if not is_good.all():
-                first_wrong = array[int(np.argmin(is_good))].as_py()
+                first_wrong = array[int(np.argmin(is_good))].as_py()  # argmin: the first False
                 problem = where + name + text.format(first_wrong, self.meta)
                 self.require(is_good, rows=rows, problem=problem)
 
@@ -125,11 +125,12 @@ def _are_inside(paths: pa.StringArray, *_: object) -> np.ndarray:
     """Test which paths are relative, inside the data root and without control characters."""
     _, offsets, data = paths.buffers()
     text = b"" if data is None else data.to_pybytes()
-    starts = np.frombuffer(offsets, dtype=np.int32, count=len(paths) + 1)[:-1]
+    bounds = np.frombuffer(offsets, dtype=np.int32, count=len(paths) + 1)
     # Fast path for nearly all files: a scan of the bytes instead of a regular expression.
-    letters = np.frombuffer(text + b"/", dtype=np.uint8)
+    letters = np.frombuffer(text, dtype=np.uint8)
     are_plain = b".." not in text and b"\\" not in text and (letters >= ord(" ")).all()
-    if are_plain and (letters[starts] != ord("/")).all():
+    are_filled = (np.diff(bounds) > 0).all()
+    if are_plain and are_filled and (letters[bounds[:-1]] != ord("/")).all():
         return np.ones(len(paths), dtype=bool)
     return ~pc.match_substring_regex(paths, _OUTSIDE).to_numpy(zero_copy_only=False)
 
