@@ -126,10 +126,12 @@ def _check_value(value: Any, name: str, known: set[str]) -> Any:
         return _check_mapping(value, name=name, known=known)
     if name.endswith(".type"):
         return _check_type(value, name=name, known=known)
-    if isinstance(value, str) and not (_TEXT.fullmatch(value) or value in known):
-        raise InputError(
-            f"{name} is {value!r:.60}, which is neither a plain word nor in the config"
-        )
+    if isinstance(value, str):
+        is_plain_word = _TEXT.fullmatch(value) is not None
+        if not is_plain_word and value not in known:
+            raise InputError(
+                f"{name} is {value!r:.60}, which is neither a plain word nor in the config"
+            )
     if isinstance(value, (int, float)) and not abs(value) <= _LARGEST:  # refuses NaN as well
         raise InputError(f"{name} is {value!r:.60}, not within {_LARGEST}")
     return value

@@ -170,6 +170,7 @@ def _draw_polylines(
     box = ax.get_window_extent()
     scale = np.sqrt(box.width * box.height) / ax.figure.dpi / _NOMINAL_SIZE_IN
     nearness = np.log(10 / np.maximum(depth_m, 0.1))  # 0 at 10 m
+    # Widths are proportional to depth to the power of -0.6, in steps of _WIDTH_STEP.
     width_level = np.rint(0.6 * nearness / _WIDTH_STEP).astype(int)
     # One path for each class and width.
     keys = np.c_[segment_labels[index], width_level]

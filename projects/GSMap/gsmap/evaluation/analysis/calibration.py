@@ -207,6 +207,7 @@ def uncertainty_figures(vertices: Vertices, law: str = "normal") -> dict[str, fl
         errors = vertices.errors[:, axis]
         sigmas = vertices.sigmas[:, axis]
         gaps = sparsification(errors, order=sigmas) - sparsification(errors, order=errors)
+        # The density of an error is the density of errors / sigmas, of variance 1, over sigma.
         log_densities = LAWS[law].logpdf(errors / sigmas)
         values = {
             "nll": (np.log(sigmas) - log_densities).mean(),
@@ -228,7 +229,7 @@ def uncertainty_figures(vertices: Vertices, law: str = "normal") -> dict[str, fl
 def uncertainty_report(
     vertices: Vertices, classes: Sequence[str], areas: Sequence[str], law: str = "normal"
 ) -> MetricReport:
-    """Compute the scores of each class and of all lines, in all and by distance from the vehicle.
+    """Compute the scores of each class and of all lines, overall and by distance from the vehicle.
 
     Args:
         vertices: Matched vertices.

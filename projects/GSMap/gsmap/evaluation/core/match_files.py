@@ -120,7 +120,7 @@ def report_shards(shards: Sequence[ShardFile]) -> tuple[list[MetricReport], list
             with np.load(shard.path) as file:
                 notes += file["notes"].tolist()
                 arrays = dict(file)
-            if len(arrays) > 1:
+            if len(arrays) > 1:  # more than the notes: the shard has samples
                 matches += _split_samples(arrays, evaluator)
         except (*_FAULTS, *DAMAGED_ZIP) as error:
             raise InputError(
