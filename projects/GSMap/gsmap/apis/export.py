@@ -442,6 +442,8 @@ def largest_differences(
                 continue
             distances[i, j] = np.abs(line - expected_line).max()
             if found.labels[i] in unfolded:
+                # Points may be in another order: each is compared with the nearest of the other
+                # line, in both directions.
                 between_points = np.abs(line[:, None] - expected_line).max(-1)  # (P, P)
                 to_line = between_points.min(0).max()
                 from_line = between_points.min(1).max()
@@ -472,8 +474,9 @@ def _operator_translations() -> dict[Any, Any]:
         one = op.Constant(value_ints=[1])
         num_bags = op.Shape(offsets)
         bag_size = op.Div(op.Shape(rows), op.Max(num_bags, one))  # Reshape to -1 fails for 0 bags
-        bags = op.Concat(num_bags, bag_size, axis=0)
+        bags = op.Concat(num_bags, bag_size, axis=0)  # shape of rows and weights, one row per bag
         weights = op.Unsqueeze(op.Reshape(weights, bags, allowzero=1), one)
+        # (bags, 1, rows of a bag) @ (bags, rows of a bag, C)
         sums = op.MatMul(weights, op.Gather(table, op.Reshape(rows, bags, allowzero=1)))
         # The operator has three more outputs, which serve its backward pass alone.
         return op.Squeeze(sums, one), offsets, offsets, offsets

@@ -256,7 +256,8 @@ class FastFrames:
             for buffer, value in zip(recording.inputs, inputs, strict=True):
                 buffer.copy_(value, non_blocking=True)
             recording.graph.replay()
-            # The GPU computes in the meantime. A graph is valid only for unchanged weights.
+            # While the GPU computes, the weights are compared with those of the recording. If they
+            # have changed, this result is dropped, and the loop records the frame again.
             if tensor_versions(self.frame.model) == recording.versions:
                 self._graphs.move_to_end(key)
                 return recording.output.cpu()

@@ -67,7 +67,9 @@ class ResultLog:
         return self
 
     def _resume(self) -> None:
-        """Record the frames in the file, and cut off an incomplete line or frames of another run.
+        """Read the finished frames of the file, and cut off what does not belong to this run.
+
+        An incomplete last line is cut off, and the frames of a run with other settings.
 
         The first line has the settings, every other line a frame. A killed run may leave an
         incomplete last line.
@@ -135,7 +137,7 @@ class ResultLog:
             read_vectors(vectors, classes or (), unknown, gaussians=True)
         except (ValueError, KeyError, TypeError, OverflowError):
             return False
-        return classes is None or not unknown.keys() - {THREE_D}
+        return classes is None or not unknown.keys() - {THREE_D}  # elements with heights are valid
 
     def _require(self, is_valid: bool, line_number: int) -> None:
         """Raise an error about a line that is not valid."""

@@ -26,7 +26,7 @@ _ROTATIONS = range(2, 9)  # orientations that need a rotation: 1 is upright, 0 i
 _MAX_PIXELS = 10**8  # a decoder allocates memory for the size in the header, whatever follows
 _MAX_JPEG_SCANS = 100  # each scan may take as much time as a whole image
 _SCAN = b"\xff\xda"
-_MIN_BRIGHTEST = 1 << 14  # a 16-bit image with less at its brightest pixel has 14 bits or fewer
+_MIN_BRIGHTEST = 1 << 14  # if all values of a 16-bit file are smaller, the image has <= 14 bits
 # Errors of pillow and simplejpeg for damaged files.
 _DAMAGE = (
     ValueError, OSError, SyntaxError, EOFError, LookupError, TypeError, AttributeError,

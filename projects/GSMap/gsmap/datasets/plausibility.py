@@ -85,7 +85,7 @@ def _height_warnings(height_m: float) -> Iterator[str]:
 
 def _view_warnings(name: str, pose: np.ndarray) -> Iterator[str]:
     """Yield warnings about the direction of a camera from its transform to the ground. (4, 4)"""
-    right = pose[:3, 0]  # axes of the camera, in the frame of the ground
+    right = pose[:3, 0]  # axes of the camera, in the frame of the ground, whose z axis points up
     down = pose[:3, 1]
     ahead = pose[:3, 2]
     up_deg = np.degrees(np.arcsin(np.clip(ahead[2], -1, 1)))

@@ -88,7 +88,7 @@ def usual_mount(frame: str, ground_z_m: float | None = None) -> np.ndarray:
     Returns:
         Transform in metres to the ground below the rear axle (x ahead, y left, z up). (4, 4)
     """
-    road_z_m = frame_view(frame, ground_z_m).ground[2]
+    road_z_m = frame_view(frame, ground_z_m).ground[2]  # z of the road in the annotation frame
     return _shift_up(-road_z_m) @ _NOMINAL[frame]
 
 
@@ -105,8 +105,8 @@ def ground_from_frame(sample: MapSample, frame: str, ground_z_m: float | None = 
     """
     if sample.ego_from_frame is None:
         return usual_mount(frame, ground_z_m)
-    road_z_m = frame_view(frame, ground_z_m).ego_ground_z_m
-    return _shift_up(-road_z_m) @ sample.ego_from_frame
+    road_in_ego_m = frame_view(frame, ground_z_m).ego_ground_z_m  # z of the road in the ego frame
+    return _shift_up(-road_in_ego_m) @ sample.ego_from_frame
 
 
 @dataclass(frozen=True)
@@ -134,8 +134,8 @@ class Mount:
     @property
     def ego_from_frame(self) -> np.ndarray:
         """Transform from the frame to the vehicle in metres. (4, 4)"""
-        road_z_m = frame_view(self.frame, self.ground_z_m).ego_ground_z_m
-        return _shift_up(road_z_m) @ self.matrix
+        road_in_ego_m = frame_view(self.frame, self.ground_z_m).ego_ground_z_m
+        return _shift_up(road_in_ego_m) @ self.matrix
 
     def suits(self, frame: str, ground_z_m: float | None) -> bool:
         """Test whether samples need no transformation for the model.

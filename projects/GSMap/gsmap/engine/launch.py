@@ -265,7 +265,7 @@ def check_config(cfg: Config) -> None:
 def _check_lengths(cfg: Config) -> None:
     """Require a training of one epoch or iteration at least, and valid settings of the loops.
 
-    mmengine trains nothing, without an error, for fewer epochs.
+    For 0 epochs, mmengine would train nothing and raise no error.
     """
     settings = cfg.get("train_cfg") or {}
     for name in ("max_epochs", "max_iters", "val_begin", "val_interval"):

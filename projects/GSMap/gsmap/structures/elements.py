@@ -223,7 +223,7 @@ class MapElements:
 
 
 def _require(valid: BoolArray, offsets: IntArray, fault: str) -> None:
-    """Raise ValueError with the first element that has an invalid vertex. (M,), (N + 1,)"""
+    """Raise ValueError naming the first element with an invalid vertex. (M,), (N + 1,)"""
     if not valid.all():
         first_invalid = valid.argmin()
         index = np.searchsorted(offsets, first_invalid, side="right") - 1

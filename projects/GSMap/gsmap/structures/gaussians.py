@@ -209,6 +209,7 @@ class GaussianSpace:
         products = (stretch[..., :, None] * turn[..., None, :]).flatten(-2)
         first = [(1, 0, 0, 0), (0, 0, x_per_y, 0)]
         second = [(0, 0, 0, 1), (0, -y_per_x, 0, 0)]
+        # The axis of a is the direction of travel: x for the first order, y for the second one.
         rows = [*first, *second] if along_x else [*second, *first]
         return (products @ constant(products, rows)).unflatten(-1, (2, 2))
 

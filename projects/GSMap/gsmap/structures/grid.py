@@ -145,7 +145,8 @@ class BEVGrid:
     def _front_axes(self) -> tuple[list[int], tuple[float, float], tuple[float, float]]:
         """Order of the axes, scale and shift that `front_from_metres` applies to [0, 1].
 
-        Order, scale and shift are their own inverses, so `metres_from_front` applies them too.
+        An exchange of the axes and t -> 1 - t are their own inverses, so `metres_from_front`
+        applies the same steps, in the reverse order.
         """
         if self.forward == "x":
             return [0, 1], (-1, -1), (1, 1)

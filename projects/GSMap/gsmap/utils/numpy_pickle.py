@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 _CODE = re.compile(r"b1|[iu][1248]|f[248]|c8|c16|[SU][1-9]\d{0,3}")
-_STATE_PARTS = {int, str, type(None)}
+_STATE_PARTS = {int, str, type(None)}  # types of the entries of the state of a plain dtype
 _MAX_DIMS = 8
 _MAX_EMPTY = 1000  # length along an axis of an array without values
 _MAX_INTEGER = {"b": 1, "U": 0x10FFFF}  # largest boolean and largest character

@@ -273,7 +273,7 @@ class MapVisualizer(Visualizer):
         tensors = []
         for values in (elements.points[:, :2], elements.scales, elements.rotations):
             flat = torch.as_tensor(values, dtype=torch.float32)  # of the vertices of all elements
-            tensors.append(flat.unflatten(0, (len(elements), -1)))
+            tensors.append(flat.unflatten(0, (len(elements), -1)))  # (N, P, 2) or (N, P)
         means, scales, rotations = tensors
         with torch.no_grad():
             masks = render_gaussians(means, scales=scales, rotations=rotations, grid=self.grid)

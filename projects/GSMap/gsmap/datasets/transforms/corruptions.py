@@ -181,8 +181,8 @@ def rain(image: Image, level: int, rng: np.random.Generator) -> Image:
     drops = has_drop.astype(np.float32)
     length = max(3, round(0.06 * height))
     streak = np.zeros((length, length), dtype=np.float32)
-    top = (length * 2 // 5, 0)
-    bottom = (length * 3 // 5, length - 1)  # nearly vertical
+    top = (length * 2 // 5, 0)  # (column, row)
+    bottom = (length * 3 // 5, length - 1)  # the streak is nearly vertical
     cv2.line(streak, top, bottom, color=(1.0,))
     streaks = cv2.filter2D(drops, ddepth=-1, kernel=streak)
     opacity = np.clip(streaks, 0, 1)[..., None] * _STREAK_OPACITY

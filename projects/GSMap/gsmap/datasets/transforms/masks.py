@@ -21,7 +21,7 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.settings import check_positive
 
 _NUM_PV_POINTS = 200  # resampled points of an element for its projection into the cameras
-_MIN_DEPTH = 1e-7
+_EPSILON = 1e-7  # added to depths before a division
 
 
 def bev_cells(instance: MapInstance, results: dict[str, Any], size: tuple[int, int]) -> np.ndarray:
@@ -223,16 +223,16 @@ class MakePVMask(BaseTransform):
                 u, v, depth = projected[:, :3].T
                 is_ahead = depth > 0
                 pixels = np.stack([u[is_ahead], v[is_ahead]], axis=-1)
-                pixels /= depth[is_ahead, None] + _MIN_DEPTH
+                pixels /= depth[is_ahead, None] + _EPSILON
                 if len(pixels):
-                    pixels = pixels.clip(-1e6, 1e6).astype(np.int32)
+                    pixels = pixels.clip(-1e6, 1e6).astype(np.int32)  # within int32
                     _draw_line(view_masks[channel], pixels, thickness_px=self.thickness_px)
         results["gt_pv_seg"] = torch.from_numpy(masks.astype(np.float32))
         return results
 
 
 def _draw_line(mask: np.ndarray, cells: np.ndarray, thickness_px: int) -> None:
-    """Draw an open line through cells (column, row) into a mask. (n, 2), (H, W)"""
+    """Draw an open line into a mask (H, W), through cells as (column, row). (n, 2)"""
     cv2.polylines(mask, [cells], isClosed=False, color=(1,), thickness=thickness_px)
 
 

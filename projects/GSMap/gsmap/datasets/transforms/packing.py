@@ -68,7 +68,7 @@ class PackMapInputs(BaseTransform):
         """Stack images with channels first. V x (H, W, 3) -> (V, 3, H, W)"""
         images = results["img"]
         if results.get("image_steps"):
-            # A view of the decoded images: the GPU copies to channels first.
+            # This is a strided view. The data preprocessor makes it contiguous on the GPU.
             return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2)
         height, width = images[0].shape[:2]
         stacked = np.empty((len(images), 3, height, width), dtype=images[0].dtype)

@@ -190,7 +190,7 @@ def _frame_entry(
     Args:
         sample: Sample of the annotation file.
         title: Title of the frame.
-        cameras: Plain values of the cameras (`cameras_of`).
+        cameras: Plain values of the cameras, in the rows in which they are drawn (`cameras_of`).
         scored: Results, whose predictions are added.
         layer: Changes of the map.
         view: Orientation of the annotation frame.
