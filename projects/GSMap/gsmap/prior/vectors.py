@@ -84,6 +84,7 @@ def _pieces_by_tile(
         is_area = settings.classes[label] in AREA_CLASSES and is_closed(points)
         # Bound on the number of pieces, before any of them takes memory.
         if is_area:
+            # 2: the area may begin and end in the middle of a tile.
             tiles_along_axes = np.ptp(points, axis=0) / settings.tile_m + 2
             most_pieces = tiles_along_axes.prod()
         else:

@@ -39,7 +39,8 @@ def make_kernel_folder() -> TemporaryDirectory | None:
         The folder, or None if numba has a cache folder.
     """
     try:
-        caching.CompileResultCacheImpl(make_kernel_folder)  # looks for a cache folder
+        # The constructor raises an error if it finds no cache folder for a function of this file.
+        caching.CompileResultCacheImpl(make_kernel_folder)
     except RuntimeError:
         folder = TemporaryDirectory(prefix="gsmap-kernels-")
         os.environ["NUMBA_CACHE_DIR"] = folder.name

@@ -40,5 +40,5 @@ def _send_error(queue: "queues.Queue[Any]", error: Exception, item: Any) -> None
         raise InputError(
             f"a worker could not hand over what it read ({error}): {_REMEDY}."
         ) from error
-    except ValueError:
+    except ValueError:  # ExceptionWrapper stores the exception that is being handled
         queue.put((index, ExceptionWrapper(where="in a data loader's worker")))

@@ -22,7 +22,8 @@ def _escape(match: re.Match[str]) -> str:
     """Escape the characters of a match that are not printable."""
     escaped = []
     for character in match[0]:
-        escaped.append(character if character.isprintable() else ascii(character)[1:-1])
+        without_quotes = ascii(character)[1:-1]
+        escaped.append(character if character.isprintable() else without_quotes)
     return "".join(escaped)
 
 

@@ -20,8 +20,8 @@ def _homogeneous_px(points: np.ndarray, img_from_frame: np.ndarray) -> np.ndarra
 def _frustum_values(points: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
     """Left sides of the five inequalities of the frustum, >= 0 inside. (n, 3) -> (5, n)"""
     width, height = size_px
-    u, v, w = points.T
-    return np.stack([w - NEAR_M, u, width * w - u, v, height * w - v])
+    uw, vw, w = points.T
+    return np.stack([w - NEAR_M, uw, width * w - uw, vw, height * w - vw])
 
 
 def project_segments(
@@ -85,6 +85,7 @@ def project_polygon(
         for start, end, start_value, end_value in zip(
             points, next_points, values, next_values, strict=True
         ):
+            # Vertices inside the plane remain, and each edge that crosses it gets a vertex there.
             if start_value >= 0:
                 cut_ring.append(start)
             if (start_value < 0) != (end_value < 0):
