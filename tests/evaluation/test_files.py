@@ -215,7 +215,7 @@ def test_heights_count_in_chamfer_if_asked_and_never_in_raster(tmp_path):
             '{"results": [{"sample_token": "t0", "vectors": [{"pts": ['
             + ", ".join(["[0, 0], [9e4, 0]"] * 3)
             + '], "cls_name": "divider", "confidence_level": 1}]}]}',
-            "t0.*a line of 4.5e\\+05 m",
+            "t0.*a line is 4.5e\\+05 m",
         ),
         (  # each line is short enough, all of them are too much
             '{"results": [{"sample_token": "t0", "vectors": ['

@@ -354,7 +354,7 @@ def test_bad_settings_are_refused(tmp_path):
         replace(RULES["thin"], min_score=1.5)
     with pytest.raises(ValueError, match=r"different names, got \['thin', 'thin'"):
         MapEvaluator(RULES["thin"], RULES["thin"])
-    with pytest.raises(ValueError, match="all have the same classes"):
+    with pytest.raises(ValueError, match="all metrics must have equal classes"):
         MapEvaluator(*DRAWN.metrics, ChamferConfig(("divider",)))
     with pytest.raises(ValueError, match="at least one metric"):
         MapEvaluator()

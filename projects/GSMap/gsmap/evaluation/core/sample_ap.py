@@ -1,6 +1,6 @@
 """AP per sample of older methods: lines are drawn to masks, and AP is averaged over samples.
 
-Rules, equal to the public evaluation code of HDMapNet and BeMapNet:
+Rules, equal to the public evaluation code of the methods that use this metric:
 
 - The lines of a class in a sample are drawn to one mask of 0.15 m pixels in the order of the file,
   so that a later line hides the pixels that it crosses.
