@@ -259,7 +259,10 @@ def test_other_files_and_an_absent_package_are_named(small, tmp_path, monkeypatc
         ("[]", "TypeError"),
         (json.dumps({"format": 1}), "KeyError"),
         (model.metadata_props[0].value.replace('"left"', "7"), "cameras must be names"),
-        (model.metadata_props[0].value.replace('["left", "right"]', '["left"]'), "its graph does not fit"),
+        (
+            model.metadata_props[0].value.replace('["left", "right"]', '["left"]'),
+            "its graph does not fit",
+        ),
         (model.metadata_props[0].value.replace("-15.0", "15.0"), "x_range must be"),
         (model.metadata_props[0].value.replace(" 5.0,", ' "5",'), "TypeError"),
     ):
