@@ -24,9 +24,10 @@ FASTMATH = {"reassoc", "contract", "nsz", "arcp"}
 def run_in_threads(kernel: Callable[..., None], pixels: int, *arguments: Any) -> None:
     """Run a kernel on slices of the instances, one slice per torch thread.
 
-    A thread computes each of its instances from start to end, so the result does not depend on the
-    number of threads. Threads live for one call. None survives into a forked process, and calls
-    from several Python threads, as of torch's autograd engine, do not share any.
+    One thread computes an instance from start to end, so the result does not depend on the number
+    of threads. Threads are started for each call and end with it. A forked process therefore never
+    inherits a dead thread pool, and callers in several Python threads, such as the threads of
+    torch's autograd engine, do not wait for a shared one.
 
     Args:
         kernel: Called as ``kernel(*arguments, first, last)`` for the instances ``first`` to

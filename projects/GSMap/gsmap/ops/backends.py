@@ -17,8 +17,9 @@ PACKAGES = {"cpu": "numba", "triton": "triton"}
 DEVICES = {"cpu": "cpu", "triton": "cuda"}
 INSTALLED = {backend: find_spec(package) is not None for backend, package in PACKAGES.items()}
 
-# Functions with a Triton kernel, and whether "auto" takes it on a GPU: only kernels that were equal
-# to the reference on a GPU. backend="triton" takes any of them.
+# Functions with a Triton kernel, and whether backend="auto" selects it for tensors on a GPU. It
+# does so only if the kernel was tested against the reference on a GPU. backend="triton" selects
+# any of them.
 TRITON_KERNELS = {
     "deformable_sample": True,
     "draw_polylines": True,
@@ -30,7 +31,8 @@ TRITON_KERNELS = {
     "soft_rasters": True,
 }
 SWITCH = "GSMAP_TRITON_KERNELS"  # environment variable: further kernels for "auto", or "all"
-UNORDERED = ("deformable_sample", "sample_kernels")  # atomics add their gradients in any order
+# Triton kernels that add gradients by atomics in any order, which is not deterministic.
+UNORDERED = ("deformable_sample", "sample_kernels")
 
 
 def triton_kernels(switch: str) -> set[str]:
@@ -87,8 +89,8 @@ def choose_backend(
         return backend
     unordered = kernel in UNORDERED and torch.are_deterministic_algorithms_enabled()
     if backend == "auto":
-        trusted = "triton" in fused and kernel in AUTO_KERNELS and not unordered
-        candidates = [name for name in fused if name != "triton" or trusted]
+        takes_triton = kernel in AUTO_KERNELS and not unordered
+        candidates = [name for name in fused if name != "triton" or takes_triton]
         return _automatic_backend(candidates, tensor)
     if tensor.dtype != torch.float32:
         raise InputError(
@@ -136,10 +138,10 @@ def fused_operator(
     (``retain_graph``). Differentiating a gradient raises a RuntimeError.
 
     Args:
-        name: ``<folder>.<function>``. The folder's modules, imported at their first use, define the
-            function, which returns a tensor. They also define ``<function>_backward``, which takes
-            the gradient of the output before the function's arguments and returns contiguous
-            gradients.
+        name: ``<folder>.<function>``. The modules ``numba.py`` and ``triton.py`` of the folder are
+            imported at their first use. They define the function, which returns a tensor. They also
+            define ``<function>_backward``. It takes the gradient of the output before the arguments
+            of the function, and returns a sequence of contiguous gradients.
         arguments: Arguments of the function in the syntax of a torch schema, tensors first. The
             operator takes the backend as a further, last argument.
         shape: Function from the arguments to the shape of the output.
@@ -156,6 +158,7 @@ def fused_operator(
         module = import_module(f"gsmap.ops.{folder}.{PACKAGES[backend]}")
         return getattr(module, function)
 
+    # The last one of `inputs` is the backend.
     def forward(*inputs: Any) -> Tensor:
         kernel = load_kernel(inputs[-1], function)
         return kernel(*inputs[:-1])

@@ -46,13 +46,14 @@ def modulated_deform_conv(
     tap_rows = torch.arange(weight.shape[2], device=images.device)
     tap_cols = torch.arange(weight.shape[3], device=images.device)
     taps = torch.meshgrid(tap_rows, tap_cols, indexing="ij")
-    coordinates = []
-    shapes = ((-1, 1), (1, -1))  # of rows and of columns, for broadcasting
+    coordinates = []  # of the rows, then of the columns
+    shapes = ((-1, 1), (1, -1))  # of `starts` along rows and along columns, for broadcasting
     for axis, (shift, tap) in enumerate(zip(shifts, taps, strict=True)):
         starts = torch.arange(out_size[axis], device=images.device) * stride[axis]
         starts = (starts - padding[axis]).view(shapes[axis])
         pixels = shift + starts + tap.reshape(-1, 1, 1) * dilation[axis]  # (B, G, K, h, w)
-        coordinates.append((2 * pixels + 1) / size[axis] - 1)  # [-1, 1] over the image
+        # [-1, 1] over the image, whose first pixel has its centre at (2 * 0 + 1) / size - 1.
+        coordinates.append((2 * pixels + 1) / size[axis] - 1)
     rows, cols = coordinates
     locations = torch.stack([cols, rows], dim=-1).flatten(0, 1).flatten(1, 2)  # (B G, K h, w, 2)
     parts = images.reshape(batch * deform_groups, -1, size[0], size[1])

@@ -112,10 +112,11 @@ def bev_pool_conv3x3(
     taps = weight.permute(1, 2, 3, 0).flatten(1)  # (C, 9 O)
     table = context.permute(0, 1, 3, 4, 2).flatten(0, 3) @ taps  # (B V h w, 9 O)
     table = table.view(-1, weight.shape[0])  # row = pixel * 9 + tap
-    starts = counts.flatten().cumsum(0).view_as(counts) - counts  # (B, H, W)
-    # The points of the nine neighbours of each cell, in the order of the filter, as ranges of the
-    # sorted points. `order` lists the points of all ranges: the number of a point among the listed
-    # ones, minus the number of the first one of its range, plus the start of the range.
+    starts = counts.flatten().cumsum(0).view_as(counts) - counts  # first point of each cell
+    # An output cell sums the points of its 3 x 3 neighbours. The points of a neighbour are a range
+    # of the sorted points, with a first point and a length, in the order of the filter's taps.
+    # `order` lists the points of all ranges. Its entry i is a point of a range that begins at entry
+    # `range_starts` of the list and at point `firsts`: point i - range_starts + firsts.
     lengths = _neighbours(counts)
     firsts = _neighbours(starts)
     total = int(lengths.sum())

@@ -1,4 +1,4 @@
-"""Sampling of a feature map at weighted locations: one weighted bag of table rows per output."""
+"""Sampling of a feature map at weighted locations, as weighted sums of the rows of a table."""
 
 import torch
 import torch.nn.functional as F
@@ -23,7 +23,7 @@ _deformable_sample = fused_operator(
 
 
 def has_kernel(value: Tensor) -> bool:
-    """Whether `deformable_sample` takes its Triton kernel for a map by default."""
+    """Whether ``backend="auto"`` of `deformable_sample` selects the Triton kernel for a map."""
     like = at_least_float32(value[:0])
     return choose_backend("auto", like, fused=("triton",), kernel="deformable_sample") == "triton"
 
@@ -37,7 +37,8 @@ def deformable_sample(
 ) -> Tensor:
     """Sum weighted bilinear samples of a feature map for each head (Deformable DETR Eq. 2).
 
-    Each output row is one weighted bag of table rows, without a tensor of all the samples.
+    The map is a table with one row of C channels per cell and head, and each output is a weighted
+    sum of its rows (`sum_rows`). There is no tensor of all the samples.
 
     Args:
         value: Flattened feature map, row-major, float32 or half precision. (B, H * W, heads, C)
@@ -45,7 +46,7 @@ def deformable_sample(
         locations: Sampling points (x, y), [0, 1] over the map. (B, Q, heads, S, 2)
         weights: Attention weights. (B, Q, heads, S)
         backend: A backend of `sum_rows`, or ``"triton"``: one kernel for the forward pass, and one
-            for the backward pass, which adds the gradient of the map in any order.
+            for the backward pass. The latter adds the gradient of the map in any order.
 
     Returns:
         Sums of all heads, concatenated, differentiable in ``value``, ``locations`` and
@@ -91,8 +92,7 @@ def bilinear_cells(
 
     Returns:
         Row-major indices of the cells, and their weights, both (..., 4 S). Cells outside of the map
-        have the index and the weight zero. The cells of a NaN location have valid indices and NaN
-        weights.
+        have index 0 and weight 0. The cells of a NaN location have index 0 and NaN weights.
     """
     height, width = shape
     x = locations[..., 0] * width - 0.5

@@ -20,7 +20,10 @@ OPTIONS = {"num_warps": 4, "enable_fp_fusion": True}
 
 @triton.jit
 def _locate_sample(locations, weights, sample, valid, height, width):
-    """Column and row of a sample's upper left cell, x and y distance from it, weight. (ROWS,)"""
+    """Column and row of a sample's upper left cell, x and y distance from it, weight. (ROWS,) each
+
+    The value of a cell lies at its centre.
+    """
     x = tl.load(locations + sample * 2, mask=valid, other=0.0) * width - 0.5
     y = tl.load(locations + sample * 2 + 1, mask=valid, other=0.0) * height - 0.5
     col = tl.floor(x)
@@ -117,7 +120,7 @@ def forward_kernel(
         left, top, dx, dy, weight = _locate_sample(
             locations, weights, sample=row * S + s, valid=valid, height=height, width=width
         )
-        for corner in tl.static_range(4):
+        for corner in tl.static_range(4):  # cells around the sample: 0 and 1 above, 2 and 3 below
             pixel_index, inside = find_corner(
                 left + corner % 2, top + corner // 2, valid=valid, height=height, width=width
             )
@@ -187,7 +190,7 @@ def backward_kernel(
         grad_weight = tl.zeros((ROWS,), dtype=tl.float32)
         grad_x = tl.zeros((ROWS,), dtype=tl.float32)
         grad_y = tl.zeros((ROWS,), dtype=tl.float32)
-        for corner in tl.static_range(4):
+        for corner in tl.static_range(4):  # cells around the sample: 0 and 1 above, 2 and 3 below
             pixel_index, inside = find_corner(
                 left + corner % 2, top + corner // 2, valid=valid, height=height, width=width
             )

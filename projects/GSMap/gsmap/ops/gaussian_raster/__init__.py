@@ -33,8 +33,9 @@ def render_gaussians(
 ) -> Tensor:
     r"""Render the 2D Gaussians of each map element to a soft occupancy raster.
 
-    A pixel :math:`p` takes :math:`1 - \prod_i (1 - G_i(p))` (GSMap Eq. 6), with :math:`G_i` from
-    Eq. 2. Computation is in the widest type of the inputs, at least float32, also under autocast.
+    A pixel :math:`p` takes :math:`1 - \prod_i (1 - G_i(p))` (GSMap Eq. 6), where :math:`G_i(p)` is
+    the density of Gaussian i (Eq. 2). Computation is in the widest type of the inputs, at least
+    float32, also under autocast.
 
     Args:
         means: Centres (x, y) in metres, in the frame of ``grid``. (..., P, 2)

@@ -8,15 +8,17 @@ computed, rounded up to whole blocks of ``LANES`` pixels. The neglected densitie
 change a pixel by less than P * 1e-8. The geometry of all rows of an ellipse is computed before
 their pixels.
 
-Along a row the exponent is a parabola. With the inverse covariance [[a, b], [b, c]] it is
-a (x - v)^2 + dy^2 det / a, whose vertex v = mu_x - dy b / a and constant are computed once per row
-in float64. Neither term can cancel, so float32 is precise enough for the inner loop
-R <- R + G (1 - R), which equals 1 - prod (1 - G) and is exact for small G.
+Along a row the exponent is a parabola. With the inverse covariance [[a, b], [b, c]], whose
+determinant is det, it is a t^2 + dy^2 det / a. Here t = x - x_0 is the distance of a pixel from the
+vertex x_0 = mu_x - dy b / a of the parabola. The vertex and the constant dy^2 det / a are computed
+once per row in float64. Both terms are positive and cannot cancel, so float32 is precise enough for
+the inner loop R <- R + G (1 - R), which equals 1 - prod (1 - G) and is exact for small G.
 
-The backward pass computes the transmittance T = prod (1 - G) of an instance again. For each
-Gaussian it sums w = dL/dR * T * G / (1 - G) as (sum w, sum w t, sum w t^2) per row in float32. In
-float64, the sums of all rows give the moments of w in the frame (u, v) of the Gaussian, and these
-give the gradients:
+The backward pass computes the transmittance T = prod (1 - G) of an instance again. As
+dR/dG = T / (1 - G), a pixel has the weight w = dL/dR * T * G / (1 - G) for a Gaussian. Sum w,
+sum w t and sum w t^2 are computed per row in float32. In float64, the sums of all rows give the
+moments of w in the frame (u, v) of the Gaussian, M_u = sum w u, M_uv = sum w u v and so on, and
+these give the gradients:
 
     dL/dsigma = (M_uu / s_u^3, M_vv / s_v^3),  dL/dmu = R(theta) (M_u / s_u^2, M_v / s_v^2),
     dL/dtheta = -M_uv (1 / s_u^2 - 1 / s_v^2).
@@ -34,7 +36,8 @@ from numba import njit
 from gsmap.ops._numba import FASTMATH, pixel_range, run_in_threads
 from gsmap.ops.gaussian_raster.reference import SQUARED_REACH
 
-# Coefficients of 2^x on [-0.5, 0.5], fitted at Chebyshev points: relative error about 1e-7
+# Coefficients of the polynomial C0 + C1 x + C2 x^2 + .. for 2^x on [-0.5, 0.5], fitted at Chebyshev
+# points: relative error about 1e-7
 C0, C1, C2, C3, C4, C5 = map(
     np.float32, (1.0000001, 0.69314694, 0.24022122, 0.055507425, 0.00967546, 0.0013266971)
 )
@@ -66,8 +69,8 @@ def _row_geometry(gaussian, frame, size, spans, parabolas):
         frame: Smallest x and y of the raster, and the size of a pixel along x and y, in metres.
         size: Height H and width of the raster in pixels.
         spans: Output for the first column and one past the last column in each row. (2, H)
-        parabolas: Output for the exponent along each row: its constant, t at the first column,
-            and its vertex (u, v) in the frame of the Gaussian. (4, H)
+        parabolas: Output for the exponent along each row: its constant in powers of two, t at the
+            first column, and its vertex (u, v) in the frame of the Gaussian. (4, H)
 
     Returns:
         First row, one past the last row, curvature of the parabolas, cosine and sine of the
@@ -85,6 +88,7 @@ def _row_geometry(gaussian, frame, size, spans, parabolas):
     slope = b / a
     mean_x = gaussian[0]
     mean_y = gaussian[1]
+    # The ellipse ends where the exponent at the vertex alone, dy^2 det / a, reaches SQUARED_REACH.
     half_height = math.sqrt(SQUARED_REACH / det_a)
     top, bottom = pixel_range(
         mean_y - half_height, mean_y + half_height, origin=y_min, step=step_y, size=height
@@ -104,6 +108,7 @@ def _row_geometry(gaussian, frame, size, spans, parabolas):
         parabolas[1, row] = x_min + (left + 0.5) * step_x - vertex
         parabolas[2, row] = cos * offset + sin * dy
         parabolas[3, row] = cos * dy - sin * offset
+    # Finite in float32, so that curvature * t * t is 0 at the vertex. Infinity would give NaN.
     curvature = np.float32(min(a * HALF_LOG2E, 1e30))
     return top, bottom, curvature, cos, sin
 
@@ -112,7 +117,9 @@ def _row_geometry(gaussian, frame, size, spans, parabolas):
 def _accumulate(gaussian, frame, steps, mask, spans, parabolas, through):
     """Add one Gaussian to a mask R or, if ``through``, multiply it into a transmittance T.
 
-    The mask (H, W + LANES) has a margin, so that the last block of a row may exceed W.
+    The mask (H, W + LANES) has a margin, so that the last block of a row may exceed W. ``steps``
+    contains 0, 1, 2, .. times the width of a pixel in metres, and ``spans`` and ``parabolas`` are
+    buffers for `_row_geometry`.
     """
     size = mask.shape[0], mask.shape[1] - LANES
     top, bottom, curvature, _, _ = _row_geometry(
@@ -132,7 +139,7 @@ def _accumulate(gaussian, frame, steps, mask, spans, parabolas, through):
 
 @njit(inline="always")
 def _row_sums(grad, steps, start, curvature, base):
-    """Sums of w, w t and w t^2 over pixels of a row."""
+    """Sums of w, w t and w t^2 over pixels of a row, where ``grad`` is dL/dR T."""
     sum_0 = ZERO
     sum_1 = ZERO
     sum_2 = ZERO
@@ -151,7 +158,10 @@ def _row_sums(grad, steps, start, curvature, base):
 # in the last bit.
 @njit(nogil=True, cache=True, fastmath=FASTMATH, error_model="numpy", forceinline=True)
 def _gaussian_gradient(gaussian, frame, steps, grad, spans, parabolas, out):
-    """Compute the gradient of one Gaussian (5,) from ``grad``, T dL/dR of its instance."""
+    """Compute the gradient of one Gaussian (5,) from ``grad``, dL/dR T of its instance.
+
+    The other arguments are described in `_accumulate`.
+    """
     size = grad.shape[0], grad.shape[1] - LANES
     top, bottom, curvature, cos, sin = _row_geometry(
         gaussian, frame, size=size, spans=spans, parabolas=parabolas
@@ -171,6 +181,7 @@ def _gaussian_gradient(gaussian, frame, steps, grad, spans, parabolas, out):
         s_0, s_1, s_2 = _row_sums(
             grad[row, left : left + num_pixels], steps, start=start, curvature=curvature, base=base
         )
+        # A pixel at t along the row is at (u + cos t, v - sin t) in the frame of the Gaussian.
         m_u += cos * s_1 + u * s_0
         m_v += v * s_0 - sin * s_1
         m_uu += cos * cos * s_2 + 2 * cos * u * s_1 + u * u * s_0
@@ -193,7 +204,7 @@ def _can_be_rendered(gaussians):
 
 @njit(nogil=True, cache=True)
 def _buffers(shape, step):
-    """Buffers of a thread: a mask with a margin, its columns in metres, geometry of its rows."""
+    """Buffers of a thread, as in `_accumulate`: a mask with a margin, steps, spans, parabolas."""
     width = shape[1] + LANES
     mask = np.empty((shape[0], width), np.float32)
     steps = (np.arange(width) * step).astype(np.float32)
@@ -210,7 +221,7 @@ def render_forward(gaussians, frame, masks, first, last):
         gaussians: Mean x, y, scales u, v and rotation, float64. (N, P, 5)
         frame: Smallest x and y of the raster, and the size of a pixel along x and y, in metres.
         masks: Output for the masks, float32; NaN for an instance with a parameter that is not
-            finite. (N, H, W)
+            finite, or with a scale of 0. (N, H, W)
         first: First instance.
         last: One past the last instance.
     """
@@ -244,7 +255,7 @@ def render_backward(gaussians, frame, grads, out, first, last):
         frame: Smallest x and y of the raster, and the size of a pixel along x and y, in metres.
         grads: Gradient of the masks, float32. (N, H, W)
         out: Output for the gradient of the Gaussians, float64; NaN for an instance with a parameter
-            that is not finite. (N, P, 5)
+            that is not finite, or with a scale of 0. (N, P, 5)
         first: First instance.
         last: One past the last instance.
     """
@@ -264,6 +275,7 @@ def render_backward(gaussians, frame, grads, out, first, last):
                 parabolas=parabolas,
                 through=True,
             )
+        # From here on, the buffer contains dL/dR T, which is 0 in the margin.
         for row in range(grads.shape[1]):
             for col in range(grads.shape[2]):
                 trans[row, col] *= grads[n, row, col]

@@ -3,25 +3,26 @@
 r"""Triton kernels: masks of 2D Gaussians, one program per tile of an instance.
 
 The raster of an instance is cut into tiles of TILE x TILE pixels. A program keeps the pixels of one
-tile in registers and loops over the P Gaussians of the instance. A Gaussian whose bounding box,
-outside of which its density is below the cut, misses the tile is skipped by a scalar branch. A NaN
-Gaussian is never skipped, so the mask becomes NaN. In the frame of a Gaussian,
-u = (c dx + s dy) / sigma_u, v = (c dy - s dx) / sigma_v and G = exp(-(u^2 + v^2) / 2). The mask is
-accumulated as R <- R + G (1 - R), which is 1 - prod (1 - G) and exact for small G.
+tile in registers and loops over the P Gaussians of the instance. Outside of the bounding box of a
+Gaussian, its density is below ``CUT`` of the reference. If the box misses the tile, a scalar branch
+skips the Gaussian. A NaN Gaussian is never skipped, so the mask becomes NaN. With c and s for the
+cosine and sine of its rotation, a Gaussian has u = (c dx + s dy) / sigma_u,
+v = (c dy - s dx) / sigma_v and G = exp(-(u^2 + v^2) / 2). The mask is accumulated as
+R <- R + G (1 - R), which is 1 - prod (1 - G) and exact for small G.
 
 The backward pass computes the transmittance T = prod (1 - G) of the tile again and reads dL/dR
-once. For each Gaussian that meets the tile it sums w u, w v, w u^2, w u v and w v^2, with
-w = dL/dR * T * G / (1 - G). Each program writes its sums to separate entries of a buffer
-(N, tiles, P, 5). There are no atomics, so repeated runs are equal to the bit. Torch adds the sums
-of all tiles and computes the gradients from them.
+once. As dR/dG = T / (1 - G), it sums w u, w v, w u^2, w u v and w v^2 for each Gaussian that meets
+the tile, with w = dL/dR * T * G / (1 - G). Each program writes its sums to separate entries of a
+buffer (N, tiles, P, 5). There are no atomics, so repeated runs are equal to the bit. Torch adds the
+sums of all tiles and computes the gradients from them.
 
 No launch waits for the device, nothing is autotuned, and TILE is the only size that is compiled in.
 
-There are two pairs of kernels. In the second one (``_in_warps``) a program is one warp with a
+There are two pairs of kernels. In the second pair (``warp_...``) a program is one warp with a
 smaller tile, and Gaussians that miss the tile are not visited: the boxes of 32 Gaussians are tested
-at once, one per lane, and the loop runs over the set bits of the result. Rows and columns share
-terms of u and v, which have the factor sqrt(log2(e) / 2), so that a density is a single power of
-two. A sum within a warp needs no barrier.
+at once, one per lane, and the loop runs over the set bits of the result. The term of u and v in x
+is computed once per column, and the term in y once per row. Here u and v have the factor
+sqrt(log2(e) / 2), so that a density is a single power of two. A sum within a warp needs no barrier.
 """
 
 import math
@@ -36,7 +37,7 @@ TILE = 32
 WARP_TILE = 16
 CHUNK = tl.constexpr(32)  # Gaussians whose boxes are tested at once: the bits of an integer
 POWER = math.sqrt(math.log2(math.e) / 2)  # exp(-x^2 / 2) = 2^-(POWER x)^2
-SIGMA = tl.constexpr(1 / POWER)
+SIGMA = tl.constexpr(1 / POWER)  # brings sums of POWER u and POWER v back to units of sigma
 WARP_OPTIONS = {"num_warps": 1, "enable_fp_fusion": True}
 MAX_DENSITY = tl.constexpr(1 - 1e-6)
 
@@ -63,7 +64,7 @@ def _touches(gaussian, left, right, low, high):
     half_y = tl.load(gaussian + 7)
     is_beside = (mean_x + half_x < left) | (mean_x - half_x > right)
     misses = is_beside | (mean_y + half_y < low) | (mean_y - half_y > high)
-    total = mean_x + mean_y + half_x + half_y  # NaN if one of them is
+    total = mean_x + mean_y + half_x + half_y  # NaN, which differs from itself, if one of them is
     return (total != total) | (misses == 0)
 
 
@@ -160,7 +161,7 @@ def backward_kernel(
         if _touches(gaussian, left, right=right, low=low, high=high):
             density, _, _ = _density(gaussian, x, y=y)
             trans *= 1 - tl.where(density > MAX_DENSITY, MAX_DENSITY, density)
-    grad = tl.load(grads + n * height * width + index, mask=valid, other=0.0) * trans
+    grad = tl.load(grads + n * height * width + index, mask=valid, other=0.0) * trans  # dL/dR T
     out = moments + (n * tl.num_programs(0) + tile) * count * 5
     for p in range(count):
         gaussian = gaussians + (n * count + p) * 8
@@ -199,8 +200,8 @@ def _find_hits(gaussians, first, count, left, right, low, high):
 @triton.jit
 def _lowest_bit(bits):
     """Index of the lowest set bit, read from the exponent of a float."""
-    power = (bits & -bits).to(tl.uint32).to(tl.float32)
-    return (power.to(tl.int32, bitcast=True) >> 23) - 127
+    power = (bits & -bits).to(tl.uint32).to(tl.float32)  # the lowest bit alone, a power of two
+    return (power.to(tl.int32, bitcast=True) >> 23) - 127  # 23 bits of mantissa, bias 127
 
 
 @triton.jit
@@ -249,7 +250,7 @@ def warp_forward_kernel(
             density, _, _ = _warp_density(instance + p * 8, x, y=y)
             density = tl.where(density > MAX_DENSITY, MAX_DENSITY, density)
             mask += density * (1 - mask)
-            bits = bits & (bits - 1)
+            bits = bits & (bits - 1)  # clears the lowest bit
     tl.store(masks + n * height * width + index, mask, mask=valid)
 
 
@@ -325,7 +326,11 @@ def _num_tiles(height, width, tile):
 
 
 def _prepare(gaussians):
-    """Compute mean, cos, sin, 1 / sigma and half the box of Gaussians. (N, P, 5) -> (N, P, 8)"""
+    """Compute the parameters that the kernels read. (N, P, 5) -> (N, P, 8)
+
+    They are mean x and y (0, 1), cosine and sine of the rotation (2, 3), 1 / sigma along u and v
+    (4, 5), and half the width and half the height of the bounding box (6, 7).
+    """
     means, scales, rotations = gaussians.split((2, 2, 1), -1)
     reach = math.sqrt(SQUARED_REACH)
     cos = rotations.cos()
@@ -381,7 +386,7 @@ def render_gaussians_backward(grads, gaussians, frame, height, width):
         width: Columns W of the raster.
 
     Returns:
-        Gradient of the Gaussians, float32. (N, P, 5)
+        Tuple with one entry, the gradient of the Gaussians, float32. (N, P, 5)
     """
     instances, count, _ = gaussians.shape
     if not gaussians.numel():
@@ -409,7 +414,11 @@ def render_gaussians_backward(grads, gaussians, frame, height, width):
 
 
 def _gradients(moments, gaussians, prepared):
-    """Compute the gradient of Gaussians (N, P, 5) from moments (N, tiles, P, 5)."""
+    """Compute the gradient of Gaussians (N, P, 5) from moments (N, tiles, P, 5).
+
+    The equations are in the docstring of ``numba.py``. Its moments M_u, M_v, M_uu, M_uv and M_vv
+    are in metres: one factor sigma per index larger than the moments here.
+    """
     cos, sin, inv_u, inv_v = prepared[..., 2:6].unbind(-1)
     scale_u, scale_v = gaussians[..., 2:4].unbind(-1)
     m_u, m_v, m_uu, m_uv, m_vv = moments.sum(1).unbind(-1)  # in units of sigma
@@ -422,7 +431,11 @@ def _gradients(moments, gaussians, prepared):
 
 
 def _warp_parameters(prepared):
-    """Compute mean, axes u and v times POWER / sigma, half the box. (N, P, 8) -> (N, P, 8)"""
+    """Compute the parameters that the kernels in warps read. (N, P, 8) -> (N, P, 8)
+
+    They are mean x and y (0, 1), the direction (x, y) of u times POWER / sigma_u (2, 3), the
+    direction of v times POWER / sigma_v (4, 5), and half the width and height of the box (6, 7).
+    """
     means, cos, sin, inverse, box = prepared.split((2, 1, 1, 2, 2), -1)
     inv_u, inv_v = (POWER * inverse).split(1, -1)
     return torch.cat([means, cos * inv_u, sin * inv_u, -sin * inv_v, cos * inv_v, box], dim=-1)
@@ -473,7 +486,7 @@ def render_gaussians_in_warps_backward(grads, gaussians, frame, height, width):
         width: Columns W of the raster.
 
     Returns:
-        Gradient of the Gaussians, float32. (N, P, 5)
+        Tuple with one entry, the gradient of the Gaussians, float32. (N, P, 5)
     """
     instances, count, _ = gaussians.shape
     if not gaussians.numel():

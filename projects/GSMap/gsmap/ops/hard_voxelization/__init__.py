@@ -40,10 +40,10 @@ def hard_voxelize(
     _, group, counts = sorted_cells.unique_consecutive(return_inverse=True, return_counts=True)
     starts = counts.cumsum(0) - counts
     firsts, by_first = order[starts].sort()  # groups in the order of their first points
-    rank = torch.empty_like(by_first)
+    rank = torch.empty_like(by_first)  # number of the voxel of each group: inverse of `by_first`
     rank[by_first] = torch.arange(len(by_first), device=points.device)
-    voxel = rank[group]
-    slot = torch.arange(len(order), device=points.device) - starts[group]  # place in the voxel
+    voxel = rank[group]  # voxel of each sorted point
+    slot = torch.arange(len(order), device=points.device) - starts[group]  # index in the voxel
     fits = (voxel < max_voxels) & (slot < max_points)
     num_voxels = min(max_voxels, len(firsts))
     voxels = points.new_zeros(num_voxels, max_points, points.shape[1])

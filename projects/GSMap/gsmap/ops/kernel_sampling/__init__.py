@@ -18,7 +18,7 @@ _sample_kernels = fused_operator(
 
 
 def has_kernel(value: Tensor) -> bool:
-    """Whether `sample_kernels` takes its Triton kernel for a map by default."""
+    """Whether ``backend="auto"`` of `sample_kernels` selects the Triton kernel for a map."""
     like = at_least_float32(value[:0])
     return choose_backend("auto", like, fused=("triton",), kernel="sample_kernels") == "triton"
 
@@ -35,9 +35,9 @@ def sample_kernels(
 ) -> Tensor:
     """Sum weighted pixels around the projections of each BEV cell in the cameras.
 
-    Each output row is one bag of V * S pixels, with weight zero for cameras to which the cell is
-    not visible. No size of a tensor depends on values, so the operation can be captured in a CUDA
-    graph.
+    Each output is the sum of V * S weighted pixels. The weight is zero for cameras to which the
+    cell is not visible. No size of a tensor depends on values, so the operation can be captured in
+    a CUDA graph.
 
     Args:
         value: Flattened feature maps, row-major, float32 or half precision.
@@ -48,10 +48,11 @@ def sample_kernels(
         visible_cells: Whether a cell is visible to a camera, bool. (B, V, Q)
         weights: Weights of the pixels. (B, Q, heads, S)
         offsets: Offsets (dx, dy) of the pixels from the projection, in pixels. (S, 2)
-        bilinear: Interpolate between pixels, which are zero outside of the map, instead of rounding
-            to the nearest pixel of the map.
-        backend: ``"reference"``, ``"triton"`` (one kernel for the forward pass, and one for the
-            backward pass, which adds the gradient of the maps in any order) or ``"auto"``.
+        bilinear: Interpolate between pixels, with zeros outside of the map, instead of rounding to
+            the nearest pixel of the map.
+        backend: ``"reference"``, ``"triton"`` or ``"auto"``. ``"triton"`` has one kernel for the
+            forward pass, and one for the backward pass. The latter adds the gradient of the maps in
+            any order.
 
     Returns:
         Sums, differentiable in ``value``, ``weights`` and, if bilinear, ``uv``. They have the wider

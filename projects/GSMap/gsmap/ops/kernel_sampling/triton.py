@@ -111,12 +111,13 @@ def forward_kernel(
             uv_offset = (projection_index * heads + head) * 2
             x = tl.load(uv + uv_offset, mask=visible, other=0.0) * width
             y = tl.load(uv + uv_offset + 1, mask=visible, other=0.0) * height
+            # Offset in `value` of the head's first channel at the first pixel of the camera's map.
             head_offset = ((first_image + view) * height * width * heads + head) * C
             for s in range(S):
                 weight = tl.load(weights + row * S + s, mask=visible, other=0.0)
                 at_x = x + tl.load(offsets + 2 * s).to(tl.float32)
                 at_y = y + tl.load(offsets + 2 * s + 1).to(tl.float32)
-                if BILINEAR:
+                if BILINEAR:  # the four pixels around the point: 0 and 1 above, 2 and 3 below
                     at_x = at_x - 0.5
                     at_y = at_y - 0.5
                     left = tl.floor(at_x)
@@ -140,6 +141,7 @@ def forward_kernel(
                         pixel = tl.load(value + channel_offsets, mask=mask, other=0.0).to(
                             tl.float32
                         )
+                        # A product instead of tl.where keeps a NaN weight outside of the map.
                         total += pixel * (corner_weight * inside.to(tl.float32))[:, None]
                 else:
                     pixel_index = _nearest(at_y, height) * width + _nearest(at_x, width)
@@ -218,6 +220,7 @@ def backward_kernel(
             uv_offset = (projection_index * heads + head) * 2
             x = tl.load(uv + uv_offset, mask=visible, other=0.0) * width
             y = tl.load(uv + uv_offset + 1, mask=visible, other=0.0) * height
+            # Offset in `value` of the head's first channel at the first pixel of the camera's map.
             head_offset = ((first_image + view) * height * width * heads + head) * C
             grad_x = tl.zeros((ROWS,), dtype=tl.float32)
             grad_y = tl.zeros((ROWS,), dtype=tl.float32)
@@ -226,7 +229,7 @@ def backward_kernel(
                 at_x = x + tl.load(offsets + 2 * s).to(tl.float32)
                 at_y = y + tl.load(offsets + 2 * s + 1).to(tl.float32)
                 grad_weight = tl.zeros((ROWS,), dtype=tl.float32)
-                if BILINEAR:
+                if BILINEAR:  # the four pixels around the point: 0 and 1 above, 2 and 3 below
                     at_x = at_x - 0.5
                     at_y = at_y - 0.5
                     left = tl.floor(at_x)
@@ -270,6 +273,7 @@ def backward_kernel(
                         grad_value + channel_offsets, pixel_grad, mask=mask, sem="relaxed"
                     )
                     grad_weight += tl.sum(grad * pixel, axis=1)
+                # Add to column s, which cannot be indexed in a tensor of registers.
                 weight_grads += tl.where(samples[None, :] == s, grad_weight[:, None], 0.0)
             if BILINEAR:  # a rounded position has no gradient
                 tl.store(grad_uv + uv_offset, grad_x * width, mask=visible)

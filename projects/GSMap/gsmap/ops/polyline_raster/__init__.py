@@ -9,7 +9,8 @@ from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32
 from gsmap.utils.errors import InputError
 
-# Shift of a line's way back, which closes the line to a polygon, as in the code of Zhang et al.
+# A line is rendered as a thin closed polygon, along the line and back. The way back is shifted by
+# this distance along x and y, as in the code of Zhang et al. (MapVR).
 LANE_GAP_PX = 0.01
 DISTANCES = ("squared", "plain")
 _draw = fused_operator(
@@ -40,9 +41,10 @@ def draw_polylines(
     Args:
         polylines: Vertices in metres, in the frame of ``grid``. (K, P, 2)
         grid: Extent of the raster in metres and its size in pixels, H rows and W columns.
-        width_m: Width of a line in metres, > 0; AP_raster draws 5 pixels of 0.125 m.
-        filled: Whether a polyline is filled as a polygon, up to its vertices and without the width
-            of a line, bool; None to draw all as lines. (K,)
+        width_m: Width of a line in metres, > 0. (The metric AP_raster draws lines that are 5 pixels
+            of 0.125 m wide.)
+        filled: Whether a polyline is filled as a polygon, bool; None to draw all as lines. The
+            border of a polygon has no width. (K,)
         backend: Backend, see `choose_backend`.
 
     Returns:
@@ -106,8 +108,8 @@ def soft_rasters(
         is_polygon: Whether an element is a filled polygon, bool; None for lines only. (n,)
         line_softness: :math:`\tau` of lines, > 0, in the unit of D.
         polygon_softness: :math:`\tau` of polygons, > 0, in the unit of D.
-        distance: ``"squared"`` for D in square pixels, as in the released rasterizer, or
-            ``"plain"`` for D in pixels, as in its equations.
+        distance: ``"squared"`` for D in square pixels, as in the rasterizer that Zhang et al.
+            released, or ``"plain"`` for D in pixels, as in their equations.
         backend: Backend, see `choose_backend`.
 
     Returns:
@@ -129,7 +131,7 @@ def soft_rasters(
     plain = distance == "plain"
     with torch.autocast(vertices.device.type, enabled=False):
         vertices = at_least_float32(vertices)
-        # Differs from Eqs. (2-3) by default: D is squared, as in its released rasterizer.
+        # Differs from Zhang et al.'s Eqs. (2-3) by default: D is squared, as in their rasterizer.
         back = vertices.flip(1) + LANE_GAP_PX
         stay = vertices[:, -1:].expand_as(vertices)  # pads a polygon with its last vertex
         second_half = torch.where(flags[:, None, None], stay, back)

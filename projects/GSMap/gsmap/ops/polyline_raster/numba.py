@@ -54,7 +54,9 @@ def _visit_edge(start, end, index, frame, reach, eps, columns, distances, edge_i
         offset_y = y_min + (row + 0.5) * step_y - y0
         left_x = low_x
         right_x = high_x
-        if abs(edge_y) > 1e-6 * length:  # part of the row in the strip along the edge
+        # Unless the edge is nearly horizontal, only a part of the row is within the reach of the
+        # infinite line through the edge: `half` to both sides of the crossing with this line.
+        if abs(edge_y) > 1e-6 * length:
             crossing = x0 + offset_y * edge_x / edge_y
             half = reach * length / abs(edge_y)
             left_x = max(left_x, crossing - half)
@@ -97,7 +99,8 @@ def _fill_inside(ring, frame, inside):
             if (y0 > y) == (y1 > y):
                 continue
             crossing = (x1 - x0) * (y - y0) / (y1 - y0) + x0
-            position = (crossing - x_min) / step_x - 0.5
+            position = (crossing - x_min) / step_x - 0.5  # in columns
+            # The edge is to the right of these pixels: it changes them between outside and inside.
             for col in range(math.ceil(min(max(position, 0.0), inside.shape[1]))):
                 inside[row, col] ^= 1
 
@@ -114,9 +117,11 @@ def _buffers(shape):
 
 @njit(nogil=True, cache=True)
 def _nearest_edges(ring, closed, filled, frame, reach, eps, buffers):
-    """Compute squared distances, infinite beyond the reach, nearest edges and the inside if filled.
+    """Compute the distances, nearest edges and inside of `_buffers` for one polyline or ring.
 
-    Returns False, and leaves the buffers as they are, if a vertex is not finite.
+    Beyond the reach, squared distances are infinite and indices of edges -1. The inside is computed
+    only if ``filled``. If a vertex is not finite, the buffers stay as they are, and the function
+    returns False.
     """
     if not np.isfinite(ring).all():
         return False
@@ -167,7 +172,7 @@ def soft_forward(rings, polygons, reach, softness, min_distance, masks, first, l
     buffers = _buffers(masks.shape[1:])
     _, distances, edge_indices, inside = buffers
     for n in range(first, last):
-        kind = int(polygons[n])
+        kind = int(polygons[n])  # 0 for a line, 1 for a polygon
         is_finite = _nearest_edges(
             rings[n],
             closed=True,
@@ -186,7 +191,7 @@ def soft_forward(rings, polygons, reach, softness, min_distance, masks, first, l
                 if edge_indices[row, col] >= 0:
                     distance = _clamped_distance(distances[row, col], min_distance)
                     fade = math.exp(-distance / softness[kind])
-                if kind:
+                if kind:  # sigmoid(D / s) = 1 / (1 + fade), sigmoid(-D / s) = fade / (1 + fade)
                     fade = (1.0 if inside[row, col] else fade) / (1 + fade)
                 masks[n, row, col] = fade
 
@@ -240,7 +245,7 @@ def soft_backward(rings, polygons, reach, softness, min_distance, grads, out, fi
     _, distances, edge_indices, inside = buffers
     for n in range(first, last):
         ring = rings[n]
-        kind = int(polygons[n])
+        kind = int(polygons[n])  # 0 for a line, 1 for a polygon
         out[n] = 0
         is_finite = _nearest_edges(
             ring,
@@ -260,11 +265,11 @@ def soft_backward(rings, polygons, reach, softness, min_distance, grads, out, fi
                     continue
                 distance = _clamped_distance(distances[row, col], min_distance)
                 fade = math.exp(-distance / softness[kind])
-                slope = -fade
+                slope = -fade  # derivative of the mask by D / s
                 if kind:
                     slope = (1.0 if inside[row, col] else -1.0) * fade / (1 + fade) ** 2
-                weight = grads[n, row, col] * slope / softness[kind]
-                if min_distance > 0:
+                weight = grads[n, row, col] * slope / softness[kind]  # gradient of D
+                if min_distance > 0:  # gradient of the squared distance, whose root is D
                     weight *= 0.5 / distance if distance > min_distance else 0.0
                 _scatter(ring, edge_indices[row, col], x=col, y=row, weight=weight, out=out[n])
 
@@ -287,7 +292,7 @@ def draw(polylines, filled, frame, half_width, pixel, masks, first, last):
     buffers = _buffers(masks.shape[1:])
     _, distances, _, inside = buffers
     for n in range(first, last):
-        kind = filled[n]
+        kind = filled[n]  # whether it is a filled polygon
         reach = pixel if kind else half_width + pixel
         is_finite = _nearest_edges(
             polylines[n],

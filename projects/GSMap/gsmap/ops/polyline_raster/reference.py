@@ -17,8 +17,8 @@ def _edge_distances(pixels: Tensor, starts: Tensor, ends: Tensor, eps: float = 0
     """Squared distances to the nearest edge. (H, W, 2), (K, E, 2), (K, E, 2) -> (K, H, W)
 
     The search for the nearest edge has no gradient and takes a block of edges at a time, so memory
-    does not grow with E. Distances are differentiable in the ends of the nearest edge. ``eps`` is
-    added to the squared length of an edge.
+    does not grow with E. The distance to the edge found is then computed again, and is
+    differentiable in the ends of this edge. ``eps`` is added to the squared length of an edge.
     """
     shape = (len(starts), *pixels.shape[:2])
     with torch.no_grad():
@@ -60,11 +60,13 @@ def _inside_polygon(pixels: Tensor, vertices: Tensor) -> Tensor:
     shape = (len(vertices), *pixels.shape[:2])
     crossings = torch.zeros(shape, dtype=torch.long, device=vertices.device)
     x, y = pixels.unbind(-1)
+    # Count the edges that the ray from a pixel towards larger x crosses: a pixel is inside if their
+    # number is odd.
     for _, start, end in _edge_blocks(shape, vertices, ends=vertices.roll(-1, 1)):
         x0, y0 = start.unbind(-1)
         x1, y1 = end.unbind(-1)
         straddles = (y0 > y) != (y1 > y)
-        rise = torch.where(y1 == y0, torch.ones_like(y0), y1 - y0)
+        rise = torch.where(y1 == y0, torch.ones_like(y0), y1 - y0)  # no division by 0
         crossing_x = (x1 - x0) * (y - y0) / rise + x0
         crossings += (straddles & (x < crossing_x)).sum(1)
     return crossings % 2 == 1
@@ -95,7 +97,7 @@ def soft_rasters_reference(
     y = torch.arange(height, device=rings.device, dtype=rings.dtype)
     pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
     distances = _edge_distances(pixels, rings, ends=rings.roll(-1, 1), eps=LENGTH_EPS)
-    if plain:  # no gradient on an edge, where the distance has a kink
+    if plain:  # the clamp has no gradient on an edge, where the distance has a kink
         distances = distances.clamp(min=DISTANCE_EPS**2).sqrt()
     signed = torch.where(_inside_polygon(pixels, rings.detach()), distances, -distances)
     lines = torch.exp(-distances / softness[0])
@@ -126,6 +128,7 @@ def draw_reference(
     high = (to_line + half_width) / pixel
     low = (to_line - half_width) / pixel
     lines = (high.clamp(max=0.5) - low.clamp(min=-0.5)).clamp(min=0)
+    # The edge of a polygon cuts the pixel at the signed distance from its centre.
     to_edge = torch.minimum(to_line, to_closing) / pixel
     areas = (0.5 + torch.where(inside, to_edge, -to_edge)).clamp(0, 1)
     return torch.where(filled[:, None, None], areas, lines)

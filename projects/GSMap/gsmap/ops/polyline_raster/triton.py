@@ -73,15 +73,17 @@ def _nearest_edges(ring, edges, count, x, y, eps, TILE: tl.constexpr):
         closer = squared < nearest
         nearest = tl.where(closer, squared, nearest)
         edge_index = tl.where(closer, edge, edge_index)
+        # The ray from the pixel towards larger x crosses the edge: it changes between outside and
+        # inside (even-odd rule). Offsets are relative to the start of the edge.
         straddles = (offset_y < 0) != (offset_y < edge_y)
-        rise = tl.where(edge_y == 0, 1.0, edge_y)
+        rise = tl.where(edge_y == 0, 1.0, edge_y)  # no division by 0
         inside ^= (straddles & (offset_x < edge_x * offset_y / rise)).to(tl.int32)
     return nearest, edge_index, inside != 0, poison
 
 
 @triton.jit
 def _distance(squared, min_distance, PLAIN: tl.constexpr):
-    """D: the squared distance or, if ``PLAIN``, the distance but at least ``min_distance``."""
+    """D from the squared distance: unchanged, or its root, at least ``min_distance``, if PLAIN."""
     if PLAIN:
         squared = tl.maximum(tl.sqrt(squared), min_distance)
     return squared
@@ -124,6 +126,7 @@ def soft_forward_kernel(
     filled = tl.load(polygons + n) != 0
     softness = tl.where(filled, polygon_softness, line_softness)
     fade = tl.exp(-_distance(squared, min_distance, PLAIN=PLAIN) / softness)
+    # sigmoid(D / s) = 1 / (1 + fade) inside, and sigmoid(-D / s) = fade / (1 + fade) outside.
     area = tl.where(inside, 1.0, fade) / (1 + fade)
     mask = tl.where(filled, area, fade) + poison
     tl.store(masks + n * height * width + index, mask, mask=valid)
@@ -177,20 +180,22 @@ def soft_backward_kernel(
     softness = tl.where(filled, polygon_softness, line_softness)
     distance = _distance(squared, min_distance, PLAIN=PLAIN)
     fade = tl.exp(-distance / softness)
-    area = tl.where(inside, fade, -fade) / ((1 + fade) * (1 + fade))
+    area_slope = tl.where(inside, fade, -fade) / ((1 + fade) * (1 + fade))  # of the sigmoid
     grad = tl.load(grads + n * height * width + index, mask=valid, other=0.0)
-    weight = grad * tl.where(filled, area, -fade) / softness  # gradient of D
-    if PLAIN:
-        weight *= tl.where(distance > min_distance, 0.5 / distance, 0.0)  # of D squared
+    weight = grad * tl.where(filled, area_slope, -fade) / softness  # gradient of D
+    if PLAIN:  # gradient of the squared distance, whose root is D
+        weight *= tl.where(distance > min_distance, 0.5 / distance, 0.0)
     out = sums + (n * tl.num_programs(0) + tl.program_id(0)) * count * 4
     for first in range(0, count, CHUNK):
         bit = edge_index - first
         in_chunk = (weight != 0) & (bit >= 0) & (bit < CHUNK)
+        # One bit for the nearest edge of each pixel; no shift by a number outside of 0 to 31.
         pixel_bits = tl.where(in_chunk, 1 << tl.where(in_chunk, bit, 0), 0)
         row_bits = tl.reduce(pixel_bits, 1, combine_fn=_or)
         bits = tl.reduce(row_bits, 0, combine_fn=_or)
         while bits != 0:
             lowest = (bits & -bits).to(tl.uint32).to(tl.float32)  # a power of two
+            # The exponent of a float32 follows 23 bits of mantissa and has the bias 127.
             edge = first + (lowest.to(tl.int32, bitcast=True) >> 23) - 127
             x0, y0, edge_x, edge_y = _ends(ring, edge, count=count)
             length2 = edge_x * edge_x + edge_y * edge_y + EPS
@@ -200,8 +205,9 @@ def soft_backward_kernel(
             t = tl.minimum(tl.maximum(along, 0.0), 1.0)
             dx = offset_x - t * edge_x
             dy = offset_y - t * edge_y
-            # EPS and rounding move t off the nearest point of the edge, so t has a gradient between
-            # the ends. Computed from (dx, dy) instead of EPS, the slip also covers rounding.
+            # The gradient is derived in `_scatter` of ``numba.py``. EPS and rounding move t off the
+            # nearest point of the edge, so the derivative by t is not 0 between the ends. The slip
+            # is computed from (dx, dy) instead of EPS, so that it also covers rounding.
             between = (along >= 0) & (along <= 1)
             slip = tl.where(between, 2 * (dx * edge_x + dy * edge_y) / length2, 0.0)
             share = tl.where(edge_index == edge, weight, 0.0)
@@ -211,7 +217,7 @@ def soft_backward_kernel(
             tl.store(out + edge * 4 + 1, tl.sum(share * (slip * edge_y - 2 * dy - end_y)))
             tl.store(out + edge * 4 + 2, tl.sum(share * end_x))
             tl.store(out + edge * 4 + 3, tl.sum(share * end_y))
-            bits = bits & (bits - 1)
+            bits = bits & (bits - 1)  # clears the lowest bit
 
 
 @triton.jit
@@ -252,10 +258,12 @@ def draw_kernel(
     x = x_min + (cols + 0.5) * step_x
     y = y_min + (rows + 0.5) * step_y
     closed = (tl.load(filled + n) != 0).to(tl.int32)
+    edges = count - 1 + closed  # the last to the first vertex of a filled polygon is an edge, too
     squared, _, inside, poison = _nearest_edges(
-        polylines + n * count * 2, count - 1 + closed, count=count, x=x, y=y, eps=0.0, TILE=TILE
+        polylines + n * count * 2, edges, count=count, x=x, y=y, eps=0.0, TILE=TILE
     )
     distance = tl.sqrt(squared)
+    # The edge of a polygon cuts the pixel at the signed distance from its centre.
     area = tl.minimum(0.5 + tl.where(inside, distance, -distance) / pixel, 1.0)
     # Overlap of two intervals across the line, in pixels: the line, `half_width` to both sides of
     # `distance`, and the pixel, -0.5 to 0.5.
@@ -320,7 +328,8 @@ def soft_rasters_backward(grads, rings, is_polygon, height, width, softness, pla
         plain: Whether D is the distance to the nearest edge instead of its square.
 
     Returns:
-        Gradient of the rings, float32; NaN for a ring with a vertex that is not finite. (n, V, 2)
+        Tuple with one entry, the gradient of the rings, float32; NaN for a ring with a vertex that
+        is not finite. (n, V, 2)
     """
     if not grads.numel():
         return (torch.zeros_like(rings, memory_format=torch.contiguous_format),)
@@ -347,6 +356,7 @@ def soft_rasters_backward(grads, rings, is_polygon, height, width, softness, pla
         )
     starts, ends = sums.sum(1).split(2, -1)
     poison = (rings - rings).sum((1, 2), keepdim=True)  # NaN if a vertex is not finite
+    # Edge i goes from vertex i to vertex i + 1, whose index is 0 for the last edge.
     return (starts + ends.roll(1, 1) + poison,)
 
 

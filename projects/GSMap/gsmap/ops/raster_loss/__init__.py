@@ -11,8 +11,10 @@ from gsmap.ops.raster_loss.reference import gaussian_window, raster_loss_sums_re
 from gsmap.utils.errors import InputError
 
 NORMALIZATIONS = ("both", "foreground", "pixels")
-MIN_FOREGROUND = 0.005  # "foreground": a smaller ground truth counts as this share of the raster
-AT_ONCE = 512  # masks per step of the reference, whose intermediate values take 30 times as much
+# Smallest share of the raster by which the sums are divided with ``normalize="foreground"``.
+MIN_FOREGROUND = 0.005
+# Masks per step of the reference, whose intermediate values take 30 times the memory of the masks.
+AT_ONCE = 512
 _EPS = 1e-6
 _raster_loss_sums = fused_operator(
     "raster_loss.raster_loss_sums",
@@ -40,11 +42,12 @@ def raster_loss(
 
     * ``"both"``: :math:`D_w = \sum w |R - R^*| / \sum w (R + R^*)`, and D-SSIM is the mean over the
       pixels whose window covers part of either mask. A miss costs about 1 for any size of the
-      element and of the raster. The gradient grows small Gaussians that lie metres off their line
-      until they reach it, and does not shrink them (`python -m benchmarks masks`).
+      element and of the raster. If small Gaussians lie metres off their line, the gradient makes
+      them larger until they reach it, not smaller (`python -m benchmarks masks`).
     * ``"foreground"``: :math:`D_w` is divided by :math:`\sum w R^*`, and D-SSIM by the number of
-      pixels whose window covers part of R*, both at least 0.5 % of the raster. The gradient shrinks
-      Gaussians that lie 2 m off their line.
+      pixels whose window covers part of R*. Both divisors are at least the values of a mask that
+      fills 0.5 % of the raster. If Gaussians lie 2 m off their line, the gradient makes them
+      smaller.
     * ``"pixels"``: means over the raster, weighted by w.
 
     Only the masks are saved for the backward pass; the other values are computed again.
@@ -104,10 +107,10 @@ def raster_loss(
             l1 = l1 / (predicted + foreground).clamp(min=_EPS)
             dissimilarity = dissimilarity / near_either.clamp(min=1)
         elif normalize == "foreground":
-            floor = MIN_FOREGROUND * pixels
+            floor = MIN_FOREGROUND * pixels  # in pixels, whose w is the foreground weight
             l1 = l1 / foreground.clamp(min=foreground_weight * floor)
             dissimilarity = dissimilarity / near_target.clamp(min=floor)
         else:
-            l1 = l1 / (pixels + excess)
+            l1 = l1 / (pixels + excess)  # sum of w, as `excess` is the sum of w - 1
             dissimilarity = dissimilarity / pixels
         return alpha * l1 + (1 - alpha) * dissimilarity

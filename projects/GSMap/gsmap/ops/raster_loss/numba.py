@@ -10,8 +10,9 @@ blurred map is stored.
 
 Only the two masks are saved for the backward pass. It computes the four blurred maps (p, t,
 p^2 + t^2, p t) again and, from them, the derivatives of SSIM with respect to the blurred p, p^2 and
-p t. These are blurred once more, since the blur with a symmetric window equals its transpose. Sums
-run in a fixed order in one thread, so repeated runs are equal to the bit.
+p t. The gradient with respect to a map before its blur is the transposed blur of the derivative. As
+the window is symmetric, the transposed blur equals the blur: the derivatives are blurred once more.
+Sums run in a fixed order in one thread, so repeated runs are equal to the bit.
 """
 
 import numpy as np
@@ -51,6 +52,7 @@ def _find_spans(preds, targets, radius, spans):
             right = max(right, np.int32(col + 1) if nonzero else np.int32(0))
         spans[0, row, 0] = left
         spans[0, row, 1] = max(left, right)  # an empty row has the span (width, width)
+    # A blur extends the spans of all rows within the radius by the radius to the left and right.
     for step in range(2):
         for row in range(height):
             left = np.int32(width)
@@ -67,8 +69,11 @@ def _find_spans(preds, targets, radius, spans):
 
 @njit(nogil=True, cache=True, fastmath=FASTMATH)
 def _convolve(source, first, stride, window, out, size):
-    """Compute out[k] = sum_j window[j] source[first + k + j stride] for k < size."""
-    # Unsigned indices need no test for a negative one, which counts from the end.
+    """Compute out[k] = sum_j window[j] source[first + k + j stride] for k < size.
+
+    The number of weights in ``window`` is a multiple of ``TAPS`` (6).
+    """
+    # With signed indices, numba would test whether an index is negative and counts from the end.
     s_1 = np.uint64(stride)
     s_2 = np.uint64(2 * stride)
     s_3 = np.uint64(3 * stride)
@@ -92,23 +97,26 @@ def _convolve(source, first, stride, window, out, size):
 
 @njit(nogil=True, cache=True)
 def _blur_row(images, channels, row, span, window, line, out):
-    """Blur a span of one row of padded images (H + taps, (W + taps) channels).
+    """Blur a span of one row of padded images, first across the rows, then along the row.
 
     Args:
-        images: Images with interleaved channels and a margin of the window's radius.
+        images: Images with a margin of the window's radius. All channels of a pixel follow each
+            other in a row. (H + taps, (W + taps) * channels)
         channels: Number of channels.
         row: Row of the images without margin.
         span: First column and one past the last column. (2,)
         window: Weights of the window. (taps,)
-        line: Buffer for a blurred row. (4 (W + taps),)
-        out: Output for the blurred span. (4 (W + taps),)
+        line: Buffer for the span, blurred across the rows. (4 * (W + taps),)
+        out: Output for the blurred span. (4 * (W + taps),)
 
     Returns:
         Number of pixels of the span.
     """
     pitch = images.shape[1]
     pixels = span[1] - span[0]
-    first = row * pitch + span[0] * channels  # top left of the window, because of the margin
+    # Because of the margin, these are not the row and column of the first pixel, but of the top
+    # left of its window.
+    first = row * pitch + span[0] * channels
     size = (pixels + len(window)) * channels
     _convolve(images.reshape(images.size), first, stride=pitch, window=window, out=line, size=size)
     _convolve(line, 0, stride=channels, window=window, out=out, size=pixels * channels)
@@ -140,7 +148,7 @@ def _dissimilarity(maps, pixels):
             p, t, squares=maps[4 * k + 2], product=maps[4 * k + 3]
         )
         total += ONE - (top_mean * top_cov) / (low_mean * low_var)
-        near_target += 1.0 if t > 0 else 0.0
+        near_target += 1.0 if t > 0 else 0.0  # t is blurred: > 0 if the window covers a target
         near_either += 1.0 if max(p, t) > COVERAGE else 0.0
     return total, near_target, near_either
 
@@ -150,7 +158,9 @@ def _derivatives(maps, pixels, out):
     """Compute the derivatives of SSIM with respect to the blurred p, p^2 and p t of a row.
 
     ``maps`` contains the blurred p, t, p^2 + t^2 and p t of one pixel after another, and ``out``
-    receives three derivatives per pixel.
+    receives three derivatives per pixel. With A, B, C and D for the results of `_ssim_terms`, SSIM
+    is A B / (C D). The blurred p is in all four of them, the blurred p^2 only in D, and the blurred
+    p t only in B.
     """
     for k in range(pixels):
         p = maps[4 * k]
@@ -199,7 +209,8 @@ def _prepare_instance(preds, targets, weight, radius, products, spans, sums):
         right = spans[0, row, 1]
         pred = preds[row, left:right]
         target = targets[row, left:right]
-        out = products[row + radius, 4 * (left + radius) :]  # behind the margin, 4 channels
+        # Four channels of the row, from the first pixel of the span, behind the margin.
+        out = products[row + radius, 4 * (left + radius) :]
         l1, predicted, foreground, excess = _fill_products(pred, target, weight=weight, out=out)
         sums[0] += l1
         sums[1] += predicted
@@ -262,7 +273,8 @@ def _row_gradient(pred, target, maps, weight, factors, grad):
     for k in range(len(grad)):
         p = pred[k]
         t = target[k]
-        slope = factors[0] * np.sign(p - t) + factors[1]
+        slope = factors[0] * np.sign(p - t) + factors[1]  # of the sums of w |p - t| and w p
+        # Chain rule: `maps` contains the gradients with respect to p, p^2 and p t.
         ssim = maps[3 * k] + TWO * p * maps[3 * k + 1] + t * maps[3 * k + 2]
         grad[k] = (ONE + (weight - ONE) * t) * slope - factors[2] * ssim
 
@@ -285,7 +297,8 @@ def loss_backward(preds, targets, window, radius, weight, factors, grads, first,
     products, slopes, line, maps, spans = _buffers(preds.shape[1:], len(window))
     unused = np.zeros(7)
     for n in range(first, last):
-        grads[n] = factors[n, 1]  # outside the spans w is 1 and only the sum of w p depends on p
+        # Outside the spans, w is 1, and of the three sums only the sum of w p depends on p.
+        grads[n] = factors[n, 1]
         _prepare_instance(
             preds[n],
             targets[n],
@@ -300,7 +313,7 @@ def loss_backward(preds, targets, window, radius, weight, factors, grads, first,
             pixels = _blur_row(
                 products, 4, row=row, span=spans[1, row], window=window, line=line, out=maps
             )
-            # Behind the margin, 3 channels.
+            # Three channels of the row, from the first pixel of the span, behind the margin.
             out = slopes[row + radius, 3 * (spans[1, row, 0] + radius) :]
             _derivatives(maps, pixels, out=out)
         for row in range(preds.shape[1]):

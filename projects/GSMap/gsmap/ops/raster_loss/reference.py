@@ -6,10 +6,10 @@ from torch.nn import functional as F
 
 SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2  # the usual constants for values in [0, 1]
-# A window counts as covering part of a mask if the weighted mean of the mask in it is larger.
-# D-SSIM of a miss is then 0.94 to 1.03 for elements of 4 to 60 m and rasters of 128 x 64 to
-# 256 x 128. With 0 it is 0.59 to 0.93, because windows count that cover almost nothing of the mask,
-# and with 1e-2 it is 1.09 to 1.38.
+# A window covers part of either mask if the weighted mean of a mask in the window is larger than
+# this. If a prediction misses its element, D-SSIM is then 0.94 to 1.03 for elements of 4 to 60 m
+# and rasters of 128 x 64 to 256 x 128. With 0 it would be 0.59 to 0.93, because the mean would
+# include windows that cover almost nothing of the mask. With 1e-2 it would be 1.09 to 1.38.
 MIN_COVERAGE = 1e-3
 
 
@@ -70,8 +70,9 @@ def raster_loss_sums_reference(
         weight: Weight of a foreground pixel, relative to a background pixel.
 
     Returns:
-        With w = 1 + (weight - 1) t: sum w |p - t|, sum w p, sum (1 - SSIM), sum w t, sum (w - 1),
-        the number of pixels whose window covers part of the target, and of either mask. (n, 7)
+        Seven values of each mask, with w = 1 + (weight - 1) t: sum w |p - t|, sum w p,
+        sum (1 - SSIM), sum w t, sum (w - 1), the number of pixels whose window covers part of the
+        target, and the number of pixels whose window covers part of either mask. (n, 7)
     """
     excess = (weight - 1) * targets
     weights = 1 + excess

@@ -6,9 +6,10 @@ A program computes ``BLOCK`` consecutive pixels of one instance. In the forward 
 blurs p, t, p^2 + t^2 and p t along rows. The next one blurs them along columns, computes SSIM, and
 writes the sums of its block to separate entries of a buffer (n, blocks, 7). There are no atomics,
 so repeated runs are equal to the bit. The backward pass computes the blurs again and, from them,
-the derivatives of SSIM with respect to the blurred p, p^2 and p t. These are blurred once more,
-since the blur with a symmetric window equals its transpose. Neighbours are read from the cache,
-once for each tap of the window.
+the derivatives of SSIM with respect to the blurred p, p^2 and p t. The gradient with respect to a
+map before its blur is the transposed blur of the derivative. As the window is symmetric, the
+transposed blur equals the blur: the derivatives are blurred once more. Neighbours are read from the
+cache, once for each tap of the window.
 """
 
 import torch
@@ -19,7 +20,8 @@ from gsmap.ops.raster_loss.reference import MIN_COVERAGE, SSIM_C1, SSIM_C2
 
 BLOCK = 256
 OPTIONS = {"num_warps": 4, "enable_fp_fusion": True}
-# With fusion, a - b * c is the rounding error of b * c where it must be 0, as for empty masks.
+# With fused multiply-adds, a - b * c is the rounding error of b * c where a is the rounded product.
+# It must be 0 there, as in the windows of empty masks.
 EXACT_OPTIONS = {**OPTIONS, "enable_fp_fusion": False}
 C1 = tl.constexpr(SSIM_C1)
 C2 = tl.constexpr(SSIM_C2)
@@ -142,7 +144,7 @@ def sums_kernel(
     mean_p, mean_t, top_mean, top_cov, low_mean, low_var = _ssim_terms(
         maps, window, n=n, index=index, pixels=pixels, width=width, TAPS=TAPS, BLOCK=BLOCK
     )
-    low = low_mean * low_var
+    low = low_mean * low_var  # denominator of SSIM
     dissimilarity = (low - top_mean * top_cov) / low  # exactly 0 where both masks are empty
     p = tl.load(preds + n * pixels + index, mask=ok, other=0.0)
     t = tl.load(targets + n * pixels + index, mask=ok, other=0.0)
@@ -153,6 +155,7 @@ def sums_kernel(
     tl.store(out + 2, tl.sum(tl.where(ok, dissimilarity, 0.0)))
     tl.store(out + 3, tl.sum((1 + excess) * t))
     tl.store(out + 4, tl.sum(excess))
+    # The window covers part of the target where the blurred target is > 0.
     tl.store(out + 5, tl.sum((ok & (mean_t > 0)).to(tl.float32)))
     either = (mean_p > COVERAGE) | (mean_t > COVERAGE)
     tl.store(out + 6, tl.sum((ok & either).to(tl.float32)))
@@ -175,6 +178,8 @@ def slopes_kernel(window, maps, slopes, height, width, TAPS: tl.constexpr, BLOCK
     p, t, top_mean, top_cov, low_mean, low_var = _ssim_terms(
         maps, window, n=n, index=index, pixels=pixels, width=width, TAPS=TAPS, BLOCK=BLOCK
     )
+    # SSIM = A B / (C D) with the four terms A, B, C and D in this order. The blurred p is in all
+    # of them, the blurred p^2 only in D, and the blurred p t only in B.
     scale = 1 / (low_mean * low_var)
     ssim = top_mean * top_cov * scale
     change = t * (top_cov - top_mean) + p * ssim * (low_mean - low_var)
@@ -188,7 +193,7 @@ def slopes_kernel(window, maps, slopes, height, width, TAPS: tl.constexpr, BLOCK
 def slope_rows_kernel(
     window, slopes, blurred, height, width, TAPS: tl.constexpr, BLOCK: tl.constexpr
 ):
-    """Blur derivatives along rows; the second axis of the grid counts maps.
+    """Blur derivatives along rows. The grid of programs is (blocks, n * 3).
 
     Args:
         window: Weights of SSIM's window, float32. (TAPS,)
@@ -253,7 +258,9 @@ def gradient_kernel(
     p = tl.load(preds + n * pixels + index, mask=index < pixels, other=0.0)
     t = tl.load(targets + n * pixels + index, mask=index < pixels, other=0.0)
     sign = (p > t).to(tl.float32) - (p < t).to(tl.float32)
+    # Gradient of the sums of w |p - t| and w p, without the factor w.
     slope = tl.load(grads + n * 7) * sign + tl.load(grads + n * 7 + 1)
+    # Chain rule for SSIM, from the gradients with respect to p, p^2 and p t.
     ssim = by_mean + 2 * p * by_square + t * by_product
     total = (1 + (weight - 1) * t) * slope - tl.load(grads + n * 7 + 2) * ssim
     tl.store(out + n * pixels + index, total, mask=index < pixels)
@@ -329,7 +336,7 @@ def raster_loss_sums_backward(grads, preds, targets, window, weight):
         weight: Weight of a foreground pixel, relative to a background pixel.
 
     Returns:
-        Gradient of the predicted masks, float32. (n, H, W)
+        Tuple with one entry, the gradient of the predicted masks, float32. (n, H, W)
     """
     preds = preds.contiguous()
     targets = targets.contiguous()
@@ -343,7 +350,8 @@ def raster_loss_sums_backward(grads, preds, targets, window, weight):
     with torch.cuda.device_of(preds):
         maps = _blur_products(preds, targets, window=window)
         slopes_kernel[blocks, instances](window, maps, slopes=slopes, **sizes, **OPTIONS)
-        blurred = maps.view(-1)[: slopes.numel()]  # the memory of the maps is free by now
+        # The maps are not needed any more: their memory becomes the output of the next kernel.
+        blurred = maps.view(-1)[: slopes.numel()]
         slope_rows_kernel[blocks, 3 * instances](
             window, slopes, blurred=blurred, **sizes, **OPTIONS
         )
