@@ -1,4 +1,4 @@
-"""Network parts: detectors, BEV encoders, the frame of all heads, and a folder for each method."""
+"""Networks: the detector, BEV encoders, base classes of heads, and a folder for each map model."""
 
 from gsmap.utils.lazy import lazy_names
 

@@ -63,7 +63,10 @@ class MapDataPreprocessor(Det3DDataPreprocessor):
         return run_image_steps(images, steps)
 
     def normalise(self, images: Tensor) -> Tensor:
-        """Convert the channels, normalise and pad. (..., 3, H, W) -> (..., 3, H', W') float32"""
+        """Convert images to float32, normalise and pad them. (..., 3, H, W) -> (..., 3, H', W')
+
+        With ``bgr_to_rgb`` or ``rgb_to_bgr``, the order of the channels is reversed before.
+        """
         if self._channel_conversion:
             images = images.flip(dims=(-3,))
         images = images.float()
@@ -104,7 +107,12 @@ def run_image_steps(images: Tensor, steps: Sequence[Sequence[Any]]) -> Tensor:
 
 
 def _join_steps(steps: Sequence[Sequence[Any]]) -> list[Any] | None:
-    """Join the steps of all samples to steps of the batch; None if they do not fit together."""
+    """Join the steps of all samples to steps of the batch.
+
+    Returns:
+        A step of the batch for each number, or None if samples differ in the number or in the kinds
+        of their steps.
+    """
     num_steps = len(steps[0])
     for sample_steps in steps:
         if len(sample_steps) != num_steps:

@@ -57,7 +57,7 @@ class MapDetector(Base3DDetector):
         allow_untrained: Accept checkpoints without the weights of modules that start without
             effect, for example the Gaussians of GSMap in a checkpoint of MapTR. Trainings accept
             them, all other commands only on request. All other weights must be present, with the
-            names of this package or of the release, and there must be no further ones.
+            names of this package or of the published model, and there must be no further ones.
         autocast: ``"bfloat16"``: backbone, neck and encoders, with nearly all arithmetic, use
             this type in training. Head, matching and losses run in float32, and no loss scale is
             needed. A ResNet with fixed batch norms is computed as fused convolutions
@@ -66,8 +66,8 @@ class MapDetector(Base3DDetector):
             a minute or more. True, or a mode of ``torch.compile``; ``"reduce-overhead"`` also
             captures CUDA graphs.
         cuda_graphs: Record the operations of a training step up to the predictions once, on a GPU,
-            and replay them, forward and backward (`StepGraphs`). With ``autocast``, their float32
-            matrix products are computed in TF32.
+            and replay them, forward and backward (`StepGraphs`). With ``autocast``, matrix products
+            of float32 tensors among these operations are computed in TF32.
 
     Raises:
         ValueError: If there is no encoder, two encoders without a fusion, another ``autocast``, or
@@ -179,7 +179,8 @@ class MapDetector(Base3DDetector):
 
     def _fuses_frozen_norms(self, images: Tensor) -> bool:
         """Whether the backbone runs as fused convolutions: in half precision, on a GPU."""
-        if not (self.training and self.autocast and images.is_cuda and self.channels_last):
+        trains_in_half = self.training and bool(self.autocast)
+        if not (trains_in_half and images.is_cuda and self.channels_last):
             return False
         is_compiled = getattr(self.img_backbone, "_compiled_call_impl", None) is not None
         return has_frozen_norms(self.img_backbone) and not is_compiled
@@ -227,7 +228,7 @@ class MapDetector(Base3DDetector):
             if self.bev_fuser is not None:
                 feats = self.bev_fuser(outputs["bev_feats"], feats)
             outputs = {**outputs, "bev_feats": feats}
-        if self.prior is not None:
+        if self.prior is not None:  # which only models with cameras have
             outputs = self.prior.fuse(outputs, metas, img_shape=tuple(imgs.shape[-2:]))
         return outputs
 

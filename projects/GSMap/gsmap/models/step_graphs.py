@@ -89,6 +89,8 @@ class StaticStep(nn.Module):
         arrays = dict(zip(self.names, calibration, strict=True))
         outputs = self.model.encode_images(images, arrays)
         layers = self.model.map_head(outputs)
+        # A function of tensors cannot return objects: their fields are returned instead, and
+        # `restore` builds them again.
         fields = [(layer.scores, vars(layer.decoded)) for layer in layers]
         self._kinds = [type(layer.decoded) for layer in layers]
         tensors, self._structure = tree_flatten((outputs, fields))
@@ -223,6 +225,7 @@ class _Replay(torch.autograd.Function):
         param_grads = []
         for grad in recording.param_grads:
             param_grads.append(None if grad is None else grad.detach())
+        # None for the recording, the number of inputs, and the inputs.
         return (None, None, *[None] * ctx.num_inputs, *param_grads)
 
 
@@ -248,6 +251,7 @@ def _record(model: Any, inputs: Sequence[Tensor], params: Sequence[Tensor]) -> _
 
     forward = torch.cuda.CUDAGraph()
     backward = torch.cuda.CUDAGraph()
+    # The backward graph reads tensors of the forward graph, so both use one pool of memory.
     pool = torch.cuda.graph_pool_handle()
 
     def capture(graph: torch.cuda.CUDAGraph) -> AbstractContextManager[None]:
@@ -259,6 +263,7 @@ def _record(model: Any, inputs: Sequence[Tensor], params: Sequence[Tensor]) -> _
         _unchanged_state(model, device),
         matrix_products(in_tf32=model.autocast is not None),
     ):
+        # As PyTorch demands, the steps before a recording run on another stream.
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream):

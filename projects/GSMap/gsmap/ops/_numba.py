@@ -51,7 +51,7 @@ def run_in_threads(kernel: Callable[..., None], pixels: int, *arguments: Any) ->
     bounds = [round(i * count / workers) for i in range(workers + 1)]
     with ThreadPoolExecutor(workers - 1) as pool:
         jobs = [pool.submit(run, bounds[i], bounds[i + 1]) for i in range(1, workers)]
-        run(bounds[0], bounds[1])
+        run(bounds[0], bounds[1])  # the first slice, in the calling thread
         for job in jobs:
             job.result()
 

@@ -42,6 +42,7 @@ def modulated_deform_conv(
     batch, _, *size = images.shape
     out_size = offset.shape[2:]  # (h, w)
     num_taps = weight.shape[2] * weight.shape[3]
+    # Along rows and along columns, (B, G, K, h, w) each, with G = deform_groups.
     shifts = offset.unflatten(1, (deform_groups, num_taps, 2)).unbind(3)
     tap_rows = torch.arange(weight.shape[2], device=images.device)
     tap_cols = torch.arange(weight.shape[3], device=images.device)

@@ -1,1 +1,1 @@
-"""The frame of all map heads: queries, decoder, matching, losses, detections."""
+"""Base classes and shared parts of map heads: queries, decoder, matching, losses, detections."""

@@ -213,6 +213,8 @@ class BEVDeformableAttention(SamplingAttention):
         table = at_least_float32(tokens).reshape(-1, tokens.shape[-1])
         rows = sample * tokens.shape[1] + cells  # `table` has the cells of all samples in turn
         sampled = sum_rows(table, rows, cell_weights)
+        # The projection of a weighted sum of cells has the bias times the sum of their weights,
+        # which is less than 1 for samples at the border of the map.
         weight = self.value_proj.weight.unflatten(0, (self.num_heads, -1))  # (heads, C / heads, C)
         bias = self.value_proj.bias.view(self.num_heads, -1)
         projected = torch.einsum("bqhc,hdc->bqhd", sampled, weight)

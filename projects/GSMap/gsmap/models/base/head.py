@@ -181,8 +181,8 @@ class MapHead(LossHead):
         if unknown:
             raise InputError(
                 f"coder.{unknown[0]} is no setting of {kind.__name__}, the coder of "
-                f"{type(self.reference).__name__}: leave it out, or take a head whose reference "
-                "has a coder with it."
+                f"{type(self.reference).__name__}: leave it out, or take a head whose coder has "
+                "this setting."
             )
         coder: MapCoder = kind(grid=self.grid, **settings)
         return coder
@@ -265,8 +265,9 @@ class MapHead(LossHead):
     def fit_state(self, state: dict[str, Tensor], prefix: str) -> None:
         """Adapt the number of instance queries in a checkpoint to the model, in place.
 
-        The queries that predict are loaded. Of the further ones, surplus queries are dropped and
-        missing ones keep their initial values, with a warning in the log.
+        The queries of the first group, which predicts, are loaded. The number of queries of the
+        other groups may differ: surplus queries are dropped, and missing ones keep their initial
+        values, with a warning in the log.
 
         Args:
             state: Tensors of the checkpoint, by name. Instance queries are (N, 2 C).
@@ -276,7 +277,9 @@ class MapHead(LossHead):
         loaded = state.get(key)
         initial = self.instance_embedding.weight
         num_predicting = self.query_groups[0].num
-        if loaded is None or len(loaded) < num_predicting or loaded.shape == initial.shape:
+        if loaded is None or loaded.shape == initial.shape:
+            return
+        if len(loaded) < num_predicting:  # the state stays as it is, and does not fit the model
             return
         common = loaded[: len(initial)]
         missing = initial.detach()[len(common) :].to(common)

@@ -220,6 +220,7 @@ class LossHead(DetectionHead):
             values = self.loss_cls(pairs)
         else:
             values = plain_class_loss(self.loss_cls, scores, labels=pairs.query_labels())
+        # (B, L * N, classes) -> (L, B, N * classes)
         by_layer = values.view(len(scores), pairs.num_layers, -1).transpose(0, 1)
         return by_layer.flatten(1).sum(1) / pairs.avg_factor
 

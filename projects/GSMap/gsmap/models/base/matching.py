@@ -46,7 +46,7 @@ class MapAssigner:
             raise InputError("match_costs must hold at least one cost.")
         self.match_costs = [TASK_UTILS.build(cost) for cost in match_costs]
         self.names = [type(cost).__name__ for cost in self.match_costs]
-        points_cost = PointsCost()
+        points_cost = PointsCost()  # unless the configs have one
         for cost in self.match_costs:
             if isinstance(cost, PointsCost):
                 points_cost = cost
@@ -85,7 +85,8 @@ class MapAssigner:
         for sample_costs, meta in zip(host_costs.samples, metas, strict=True):
             queries = []
             gts = []
-            for costs in sample_costs.unflatten(1, (num_layers, num_queries)).unbind(1):
+            layer_costs = sample_costs.unflatten(1, (num_layers, num_queries)).unbind(1)
+            for costs in layer_costs:  # (n, N, K) each
                 rows, cols = solve_assignment(costs, self.names, img_meta=meta, repeats=repeats)
                 queries.append(rows)
                 gts.append(cols)
@@ -158,7 +159,7 @@ class MapAssigner:
             gt_inds=gt_inds,
             rows=rows,
             order_inds=distances.sum((-1, -2)).argmin(-1),  # (L, M)
-            host_labels=labels[host_indices[-1]],
+            host_labels=labels[host_indices[-1]],  # the last entry of `indices` is `row`
             counts=counts,
         )
 
@@ -177,12 +178,14 @@ class MapAssigner:
         """
         class_costs = self._class_costs(predictions)
         num_rows = predictions.scores.shape[1]
+        # Tensors in the order: for each sample, its matrix of each cost, or a sum of its scores if
+        # it has no ground truth; then the labels. They are copied as one vector, and split again.
         blocks: list[Tensor] = []
         for index, count in enumerate(truths.counts):
             pred = predictions.sample(index)
             truth = truths.sample(index)
             if not count:
-                blocks.append((pred.scores * 0).sum(0))  # NaN if a score is not finite
+                blocks.append((pred.scores * 0).sum(0))  # 0, or NaN if a score is not finite
                 continue
             for cost, by_class in zip(self.match_costs, class_costs, strict=True):
                 if by_class is None:

@@ -226,8 +226,8 @@ class MapMatches(NamedTuple):
 class MatchedPairs:
     """Matched pairs of a batch: M pairs of L layers in all, layer after layer.
 
-    Each layer has M / L pairs, sorted by sample and query. Attributes are computed on first access
-    and cached.
+    Each layer has M / L pairs, sorted by sample and query (in `MapMatches`, M is the number of one
+    layer). Attributes are computed on first access and cached.
 
     Args:
         predictions: Predictions of the layers, of one query group.
@@ -257,7 +257,7 @@ class MatchedPairs:
         self.truths = truths
         self.avg_factor = avg_factor
         self.num_layers = len(predictions.layers)
-        self.counts = matches.counts * self.num_layers
+        self.counts = matches.counts * self.num_layers  # the list, once for each layer
         self.samples = matches.samples.flatten()
         self.query_inds = matches.joined_inds.flatten()
         self.gt_inds = matches.gt_inds.flatten()
@@ -279,6 +279,7 @@ class MatchedPairs:
         if number not in self._layer_pairs:
             self._layer_pairs[number] = self._select_layer(number)
         layer_pairs = self._layer_pairs[number]
+        # `vars` holds the values of cached properties that have been computed.
         for name, values in vars(self).items():
             is_cached = isinstance(getattr(type(self), name, None), cached_property)
             if is_cached and name not in vars(layer_pairs):

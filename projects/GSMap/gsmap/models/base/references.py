@@ -34,7 +34,9 @@ class Reference:
 
 
 class RefinedReference(Reference):
-    """References that decoder layers refine, n per query: 1 of a point, P of an instance.
+    """References that decoder layers refine.
+
+    A query has n references: n = 1 for the query of a point, n = P for the query of an instance.
 
     Attributes:
         coords: Number of coordinates of a point, which are the first entries of a reference: 2 or

@@ -52,9 +52,9 @@ class Curve(nn.Module):
         weights = []
         for number in range(1, pieces + 1):
             if to_end:
-                last = number * SAMPLES - 1
+                last = number * SAMPLES - 1  # last sample of the last piece in use
                 steps = torch.linspace(0, last, steps=SAMPLES).round().long()
-            else:
+            else:  # every number-th sample
                 steps = torch.arange(SAMPLES) * number
             weights.append(sample_weights[steps])
         self.register_buffer("weights", torch.stack(weights), persistent=False)

@@ -85,7 +85,8 @@ class BezierHead(LineHead):
         **kwargs: Any,
     ) -> None:
         check_curves(degrees, pieces)
-        if not len(queries) == len(degrees) == len(classes) or min(queries) < 1:
+        has_all_classes = len(queries) == len(degrees) == len(classes)
+        if not has_all_classes or min(queries) < 1:
             raise InputError(
                 f"queries (>= 1), degrees and pieces must be one for each of {list(classes)}, got "
                 f"{list(queries)}, {list(degrees)} and {list(pieces)}."
@@ -134,6 +135,7 @@ class BezierHead(LineHead):
             layer: Lines of all classes from one decoder layer, as one entry.
             mean: Mean feature of the map's coordinates. (D,)
         """
+        # The decoder has one kind of lines, of one point each, for all classes together.
         ((states, logits, masks),) = layer
         numbers = list(self.queries)
         class_states = states[:, :, 0].split(numbers, dim=1)
@@ -244,7 +246,7 @@ class BezierHead(LineHead):
             controls = controls * curve.control_mask(pieces)[..., None]
             curves = curve(controls, pieces)
             if self.losses.redrawn_in_px:
-                size = constant(curves, self.mask_size).flip(0)
+                size = constant(curves, self.mask_size).flip(0)  # (columns, rows), as points (x, y)
                 is_redrawn = instances.redrawn[is_class, None, None]
                 curves = torch.where(is_redrawn, curves * size, curves)
             class_truth = TrueCurves(

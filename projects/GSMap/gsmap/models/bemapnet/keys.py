@@ -53,7 +53,7 @@ def _projection_rules() -> Rules:
     return tuple(rules)
 
 
-# The release names the paths the other way round.
+# The release calls our path "down" its "up", and our path "up" its "down".
 _NECK_RULES = (
     *_path_rules("down", release_path="up", number=1, levels=(6, 5, 4, 3)),
     *_path_rules("up", release_path="down", number=2, levels=(4, 5, 6, 7)),
@@ -95,7 +95,8 @@ BEMAPNET = KeyMap(
     ),
     unused=CLASS_WEIGHTS,
     markers=((_NECK, "img_neck.rounds."),),
-    ignored_pattern=r"bev_decoder\.bev_encoder\.tgt_pos_embed_layer\.",  # aliases in the release
+    # The release saves the weights of `src_pos_embed_layer` a second time under this name.
+    ignored_pattern=r"bev_decoder\.bev_encoder\.tgt_pos_embed_layer\.",
     upstream_prefix=LINE_DECODER,
 )
 

@@ -107,7 +107,7 @@ class BezierLosses(LineLosses):
             with torch.no_grad():
                 points = get_uncertain_point_coords_with_randomness(
                     masks,
-                    labels=masks,
+                    labels=masks,  # not read for masks of one channel
                     num_points=self.mask_points,
                     oversample_ratio=OVERSAMPLING,
                     importance_sample_ratio=UNCERTAIN,

@@ -15,6 +15,7 @@ class BeMapNetAP(SampleAP):
 
     name: ClassVar[str] = "bemapnet"
     line_px: ClassVar[int] = 1
+    # Largest distances of a match in metres, by the name of the report.
     report_thresholds: ClassVar[Mapping[str, tuple[float, ...]]] = {
         "bemapnet": (0.5, 1.0, 1.5),
         "bemapnet_hard": (0.2, 0.5, 1.0),

@@ -21,9 +21,10 @@ class FormatBezierTargets(FormatLineTargets):
     The fields of the targets and the other settings are described in `FormatLineTargets`.
 
     Args:
-        degrees: Degree of the pieces of each class, 1 to 5. A config sets it in the head.
-        pieces: Largest number of pieces of each class, >= 1. A config sets it in the head. As in
-            the released code, further pieces of a line are dropped.
+        degrees: Degree of the pieces of each class, 1 to 5. Configs set ``degrees`` of the head,
+            and the head's `target_settings` set it here.
+        pieces: Largest number of pieces of each class, >= 1, set by the head like ``degrees``. As
+            in the released code, further pieces of a line are dropped.
         max_error_m: Largest mean deviation of a piece from its line, in metres.
 
     Raises:
@@ -55,7 +56,7 @@ class FormatBezierTargets(FormatLineTargets):
         return curve_points(points, self.degrees[label])
 
     def points(self, line: Points, label: int, grid: BEVGrid) -> Points:
-        """Fit the control points of a line, from its rear end to the front.
+        """Fit the control points of a line, from its front end to its rear end.
 
         Args:
             line: Points (from the front, from the left) in [0, 1]. (n, 2)

@@ -20,9 +20,10 @@ from gsmap.utils.errors import InputError
 class BEVSelfAttention(BEVDeformableAttention):
     """Temporal self-attention of BEVFormer, for a model without history.
 
-    Without history both entries of the temporal queue are the current queries. Their values
-    coincide, so the average of the two outputs equals one attention over the samples of both
-    entries at half the weight.
+    BEVFormer attends to a queue of two entries, the BEV features of the previous frame and the
+    current queries, and averages the two outputs. Without history both entries are the current
+    queries. The average then equals one attention over the samples of both entries at half the
+    weight.
 
     Args:
         embed_dims: Channels C.
@@ -236,6 +237,7 @@ class BEVQueryEncoder(CameraEncoder):
         if isinstance(feats, Tensor):
             tokens: Any = feats + codes[0]
         else:
+            # There are codes of four levels, and `feats` may have fewer.
             tokens = [level + code for level, code in zip(feats, codes, strict=False)]
         bev_shape = (self.grid.height, self.grid.width)
         query = self.bev_embedding.weight.expand(len(first), -1, -1)  # (B, Q, C)

@@ -70,7 +70,8 @@ class SpatialCrossAttention(SamplingAttention):
         for feats, offset, weight in zip(levels, offsets, weights, strict=True):
             height, width = feats.shape[-2:]
             offset = offset / constant(query, [width, height])
-            value = self.values(feats.flatten(3).transpose(2, 3)).float()  # (B, V, hw, heads, C')
+            # Shape (B, V, h * w, heads, C / heads).
+            value = self.values(feats.flatten(3).transpose(2, 3)).float()
             if self.fixed_sizes:
                 summed = summed + _sample_all_pairs(
                     value,
@@ -98,7 +99,7 @@ class SpatialCrossAttention(SamplingAttention):
 
 
 def _visible_cells(visible: Tensor) -> list[Tensor]:
-    """Indices of the cells that each camera sees, with a single wait for a GPU.
+    """Indices of the visible cells of each camera, with a single synchronisation.
 
     Args:
         visible: Whether a cell is visible in a camera. (B, V, Q)

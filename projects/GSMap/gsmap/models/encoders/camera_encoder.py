@@ -11,7 +11,7 @@ from gsmap.structures.calibration import stack_calibration_arrays
 from gsmap.structures.tensors import exclude_from_compile, upload
 
 
-@exclude_from_compile  # numpy's float64 is not for compilers
+@exclude_from_compile  # it computes with float64 arrays of numpy
 def stack_calibration(
     img_metas: Sequence[dict[str, Any]], names: Sequence[str], device: torch.device
 ) -> dict[str, Tensor]:

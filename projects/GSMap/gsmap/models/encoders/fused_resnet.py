@@ -213,12 +213,12 @@ class _ConvolveReLU(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         x, weight, output = ctx.saved_tensors
         needed = ctx.needs_input_grad
-        grad = torch.ops.aten.threshold_backward(grad, output, 0)
+        grad = torch.ops.aten.threshold_backward(grad, output, 0)  # of the ReLU
         x_grad, weight_grad, bias_grad = torch.ops.aten.convolution_backward(
             grad,
             x,
             weight,
-            [len(weight)],
+            [len(weight)],  # shape of the bias
             transposed=False,
             output_padding=[0, 0],
             output_mask=list(needed[:3]),

@@ -37,8 +37,8 @@ class GeometryKernelAttention(nn.Module):
     Args:
         embed_dims: Channels C.
         num_heads: Number of heads; head m attends to pillar height m.
-        kernel_size: Rows and columns of the kernel. An even size needs ``bilinear``; its kernel is
-            shifted half a pixel to the left or up of the projection.
+        kernel_size: Rows and columns of the kernel, odd unless ``bilinear``. The centre of a kernel
+            with an even size lies half a pixel to the left of the projection, or above it.
         bilinear: Interpolate between pixels, which are zero outside the map, instead of rounding
             to the nearest pixel.
         released_cells: Use the visible cells of the first sample of the batch for all samples, as

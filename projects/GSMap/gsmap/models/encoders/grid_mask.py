@@ -46,4 +46,4 @@ class GridMask(nn.Module):
         row, col = torch.randint(period, (2,)).tolist()
         in_row = (torch.arange(height) + row) % period < side
         in_col = (torch.arange(width) + col) % period < side
-        return (in_row[:, None] | in_col).float()
+        return (in_row[:, None] | in_col).float()  # 0 where neither stripe is visible

@@ -1,4 +1,4 @@
-"""State keys of the GeMap release and their names here."""
+"""State keys of the released GeMap and their names here."""
 
 import torch
 

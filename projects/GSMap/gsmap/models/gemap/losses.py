@@ -95,7 +95,7 @@ def euclidean_relation_loss(pred: Tensor, target: Tensor, counts: Sequence[int])
     check_same_shape(pred=pred, target=target)
     if sum(counts) != pred.shape[-3]:
         raise InputError(f"counts must add up to {pred.shape[-3]} matches, got {list(counts)}.")
-    pairs = [torch.zeros(2, 0, dtype=torch.long)]
+    pairs = [torch.zeros(2, 0, dtype=torch.long)]  # for a batch without samples
     weights: list[float] = []
     first = 0
     for count in counts:
@@ -109,6 +109,7 @@ def euclidean_relation_loss(pred: Tensor, target: Tensor, counts: Sequence[int])
     pred_relations = relation_features(pred, pair_indices)
     target_relations = relation_features(target, pair_indices)
     distances = (pred_relations - target_relations).abs()  # (3, ..., R, P, P)
+    # The mean over pairs of points divides by P^2, and the weight of a pair of elements by n^2.
     return distances.sum(0).mean((-2, -1)) @ pair_weights
 
 

@@ -14,8 +14,9 @@ class GaussianCoder(MapCoder):
 
     Args:
         grid: Extent of the map.
-        sigma_power: Exponent >= 0. The odds of a score are divided by this power of sigma, which is
-            the smaller sigma of each point in metres, averaged geometrically over the points.
+        sigma_power: Exponent >= 0. The odds of a score are divided by sigma to this power. Here
+            sigma is the smaller of the two sigmas of a point in metres, averaged geometrically over
+            the points of the element.
         kwargs: Further arguments of `MapCoder`.
 
     Raises:

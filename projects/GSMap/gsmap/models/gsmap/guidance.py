@@ -47,6 +47,7 @@ class GaussianGuidance(Guidance, AddsWeights):
         self.space = space
         self.sampling = sampling
         self.invariant = invariant
+        # The input has the six features of a Gaussian from `GaussianSpace.describe`.
         self.embedding = mlp(6, hidden_dims, embed_dims) if embedding else None
         self.init_weights()
 

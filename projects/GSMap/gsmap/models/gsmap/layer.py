@@ -50,6 +50,8 @@ def add_guidance(decoder: PartConfig) -> PartConfig:
     has_own_layers = False
     if kind is not None and issubclass(kind, MapDecoder):
         has_own_layers = kind.layer_class is not MapDecoderLayer
+    # A decoder of `MapDecoderLayer` gets the guided layer class. Layers of another class get the
+    # guidance as their part.
     if not has_own_layers:
         return {**decoder, "layer": with_defaults(layer, type=GaussianDecoderLayer)}
     guidance = layer.get("guidance", {})

@@ -50,6 +50,7 @@ class GaussianMasks(ElementMasks):
         """
         if self.source != "gaussians":
             return super().draw(polylines, labels, grid)
+        # The integral of a Gaussian of height 1 is sqrt(2 pi) sigma, here the width of the line.
         across_m = self.line_width_m / math.sqrt(2 * math.pi)
         gaussians = gaussians_along(polylines[..., :2].float(), across_m)
         return render_gaussians(

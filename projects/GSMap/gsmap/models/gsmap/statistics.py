@@ -36,6 +36,7 @@ def gaussian_statistics(
     """
     if not len(labels):
         return {}
+    # Sort the pairs by class, so that a split by the counts has one part for each class.
     counts = labels.bincount(minlength=len(class_names)).tolist()
     (order,) = upload([labels.argsort(stable=True)], rendered.device)
     iou = soft_iou(rendered, masks)[order].split(counts)

@@ -82,7 +82,7 @@ class ErrorReference(GaussianReference):
             The refined references. (..., Q * n, D)
         """
         points = reference[..., : self.coords]
-        gaussians = reference[..., -3:]
+        gaussians = reference[..., -3:]  # sigmas and angle of the rendered Gaussian
         without_errors = torch.cat([points, gaussians], dim=-1)  # (..., Q * n, D - 2)
         refined = super().refine(layer, point_states, reference=without_errors)
         states = point_states.repeat_interleave(self.points_per_state, dim=-2)
@@ -104,7 +104,7 @@ class ErrorReference(GaussianReference):
             Points as centres, sigmas in metres, and angles of the line in radians. (..., P)
         """
         means = self.space.decode(references).means
-        scales = self.error_space.scales(references[..., -5:-3])
+        scales = self.error_space.scales(references[..., -5:-3])  # the sigmas of the error
         return Gaussians(means, scales, angles_of_line(means))
 
 
@@ -153,6 +153,7 @@ class GaussianNLLLoss(MapLoss):
         errors = line_errors(points, pairs.gt_pts_m[..., :2])  # along, across (M, P, 2)
         distribution: Laplace | Normal
         if self.laplace:
+            # A Laplace distribution of scale b has the standard deviation sqrt(2) b.
             distribution = Laplace(0, sigma / 2**0.5, validate_args=False)
         else:
             distribution = Normal(0, sigma, validate_args=False)

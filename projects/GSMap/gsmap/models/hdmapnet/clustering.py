@@ -39,6 +39,7 @@ def dense_clusters(points: Points, eps: float, min_neighbours: int) -> Indices:
     high = np.searchsorted(points[0], points[0] + eps, side="right")
     seeds = np.argsort(order)  # position of each given point in the sorted order
     labels = np.empty(len(order), dtype=np.int64)
+    # Labels of the sorted points, written to the positions of the given points.
     labels[order] = _clusters(points, seeds, low, high, eps**2, min_neighbours)
     return labels
 
@@ -57,7 +58,8 @@ def _clusters(
     Args:
         points: Sorted points. (E, n)
         seeds: Points in the order in which clusters start from them. (n,)
-        low: First candidate neighbour of each point. (n,)
+        low: First candidate neighbour of each point: along the first axis, it is not more than the
+            largest distance away. (n,)
         high: End (exclusive) of the candidate neighbours of each point. (n,)
         eps2: Largest squared distance of two neighbours.
         min_neighbours: Smallest number of neighbours of a core point, itself included.
@@ -71,7 +73,9 @@ def _clusters(
         is_core[i] = _is_core(points, i, low[i], high[i], eps2, min_neighbours)
     labels = np.full(count, _NOISE)
     stack = np.empty(count, np.int64)  # points whose neighbours are still to be visited
-    unlabelled = np.arange(count + 1)  # jumps from each point towards the next unlabelled one
+    # Jumps from each point towards the next unlabelled one. An unlabelled point jumps to itself, as
+    # does the last entry, which stands for the end of the points.
+    unlabelled = np.arange(count + 1)
     num_clusters = 0
     for seed in seeds:
         if not is_core[seed] or labels[seed] != _NOISE:
@@ -84,7 +88,7 @@ def _clusters(
             depth -= 1
             point = stack[depth]
             other = _follow_jumps(unlabelled, low[point])
-            while other < high[point]:
+            while other < high[point]:  # for all unlabelled candidates
                 if _are_neighbours(points, point, other, eps2):
                     labels[other] = num_clusters
                     unlabelled[other] = other + 1
@@ -101,7 +105,7 @@ def _is_core(
     points: Points, point: int, low: int, high: int, eps2: float, min_neighbours: int
 ) -> bool:
     """Check whether a point has enough neighbours; candidates are tested from the nearest on."""
-    number = 1
+    number = 1  # the point itself
     for step in range(1, max(point - low, high - 1 - point) + 1):
         if point - step >= low:
             number += _are_neighbours(points, point, point - step, eps2)

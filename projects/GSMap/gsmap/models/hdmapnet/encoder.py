@@ -112,9 +112,9 @@ class ViewTransformEncoder(CameraEncoder):
         self.view_size = (2 * num_rows // 5, 2 * num_columns // 5)
         if min(self.feature_size + self.view_size) < 1:
             raise InputError(
-                f"image_size {tuple(image_size)} by stride {stride} makes {self.feature_size} "
-                f"feature pixels, and the map a camera's map of {self.view_size} cells: neither "
-                "may be empty."
+                f"image_size {tuple(image_size)} and stride {stride} give {self.feature_size} "
+                f"feature pixels, and the size of the map gives camera maps of {self.view_size} "
+                "cells: neither may be empty."
             )
         num_inputs = self.feature_size[0] * self.feature_size[1]
         num_cells = self.view_size[0] * self.view_size[1]
@@ -186,12 +186,14 @@ class ViewTransformEncoder(CameraEncoder):
         with torch.autocast(cam_from_ground.device.type, enabled=False):
             matrices = cam_from_ground.float()
             cells = self.cell_coordinates(matrices.device)
-            rotations = matrices[..., [0, 2], :2]  # right and forward axis of the camera
+            # Right and forward axis of the camera (rows) for points with z = 0 on the ground.
+            rotations = matrices[..., [0, 2], :2]
             rotated_cells = torch.einsum("bvij,hwj->bvhwi", rotations, cells)
             unit = 1.0 if self.released_units else self.view_pixel_m
             offsets = matrices[..., [0, 2], 3] / unit  # (B, V, 2)
             right, depth = (rotated_cells + offsets[:, :, None, None]).unbind(dim=-1)
         height, width = self.view_size
+        # Column 0 is an eighth of the length ahead of the camera, which is in the middle row.
         return torch.stack([depth - width / 8, right + height / 2], dim=-1)
 
     def cell_coordinates(self, device: torch.device) -> Tensor:

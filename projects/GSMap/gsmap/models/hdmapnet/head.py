@@ -79,7 +79,8 @@ class HDMapNetHead(DetectionHead):
         if self.vectorizing.degrees != degrees:
             raise InputError(
                 f"vectorizing.degrees is {self.vectorizing.degrees}, but {num_directions} "
-                f"directions are {degrees} degrees apart: leave it out, num_directions decides it."
+                f"directions are {degrees} degrees apart: leave it out, as it follows from "
+                "num_directions."
             )
         self.decoder = LineMapDecoder(
             embed_dims=embed_dims,
@@ -188,6 +189,7 @@ class HDMapNetHead(DetectionHead):
         )
         lines = [line for line in traced_lines if len(line.pixels) > 1]
         lines.sort(key=lambda line: -line.score)
+        # The centre of pixel (column, row) is at (column + 0.5, row + 0.5).
         pts = pad_lines([metres_from_pixels(line.pixels + 0.5, self.grid) for line in lines])
         instances = InstanceData(
             scores_3d=torch.tensor([line.score for line in lines]),

@@ -19,6 +19,7 @@ HDMAPNET = KeyMap(
         *efficientnet_rules(_TRUNK, "img_backbone."),
         ("camencode.up1.conv.", "img_neck.joined."),
         (f"{_VIEWS}{{i}}.", "bev_encoder.views.{i}."),
+        # Pairs "released=ours" of the rest of the keys after both prefixes.
         *rules_of(
             _BEV,
             _OURS,
@@ -31,7 +32,8 @@ HDMAPNET = KeyMap(
     ),
     unused={
         **unused_classifier(_TRUNK),
-        # an unused first block of the directions, which share the block of the embeddings
+        # The release has a first block of the directions, but never calls it: the directions use
+        # the block of the embeddings. Conversion to the release writes zeros of these shapes.
         **zeros(
             f"{_BEV}up1_direction.conv.",
             {

@@ -21,8 +21,9 @@ def orient_forward(feats: Tensor, grid: BEVGrid) -> Tensor:
 
     (..., H, W) -> (..., rows, columns)
     """
-    if grid.forward == "x":
+    if grid.forward == "x":  # y points to the left: row 0 is at the right already
         return feats
+    # x points to the right: columns along y, and row 0 at the largest x.
     return feats.transpose(-1, -2).flip(-2)
 
 
@@ -36,6 +37,7 @@ def pixels_from_metres(points: NDArray[Any], grid: BEVGrid) -> NDArray[np.float6
     pixels = (points.astype(np.float64) - low) * scale
     if grid.forward == "x":
         return pixels
+    # Columns along y, and rows from the largest x, as in `orient_forward`.
     return np.stack([pixels[..., 1], grid.width - pixels[..., 0]], axis=-1)
 
 

@@ -90,7 +90,7 @@ class LineMapLosses:
         pixels = embedding[:, is_instance].T  # (n, E)
         _, index, counts = numbers[is_instance].unique(return_inverse=True, return_counts=True)
         if not len(counts):
-            return embedding.sum() * 0, embedding.sum() * 0
+            return embedding.sum() * 0, embedding.sum() * 0  # 0 with a gradient of 0
         sums = pixels.new_zeros(len(counts), len(embedding)).index_add(0, index, pixels)
         means = sums / counts[:, None]  # (instances, E)
         distance = (pixels - means[index]).norm(dim=1)
@@ -115,6 +115,8 @@ def direction_loss(logits: Tensor, directions: Tensor) -> Tensor:
         Unweighted scalar.
     """
     num_classes = logits.shape[1]
+    # The forward and the backward direction have the probability 1/2 each. Both are 0 beside lines,
+    # so the channel of no direction has the probability 1 there and 0 on lines.
     counts = F.one_hot(directions, num_classes).sum(dim=1).movedim(-1, 1)  # (B, 1 + K, H, W)
     target = counts.to(logits) / 2
     is_line = 1 - target[:, :1]

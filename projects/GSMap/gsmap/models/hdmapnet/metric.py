@@ -15,4 +15,5 @@ class HDMapNetAP(SampleAP):
 
     name: ClassVar[str] = "hdmapnet"
     line_px: ClassVar[int] = 5
+    # Largest distances of a match in metres, by the name of the report.
     report_thresholds: ClassVar[Mapping[str, tuple[float, ...]]] = {"hdmapnet": (2.0, 4.0, 6.0)}

@@ -32,11 +32,12 @@ class MakeLineMaps(BaseTransform):
 
     Args:
         num_classes: Number of classes.
-        pixel_m: Side of a pixel in metres. A config sets it in the head.
+        pixel_m: Side of a pixel in metres. Configs set ``pixel_m`` of the head, and the head's
+            `target_settings` set it here.
         thickness_px: Width of the lines, in pixels.
         gap_px: Width around a line in which lines of earlier classes are erased, in pixels.
         step_m: Distance at which lines are sampled before they are drawn, in metres.
-        num_directions: Number K of directions, a divisor of 360. A config sets it in the head.
+        num_directions: Number K of directions, a divisor of 360, set by the head like ``pixel_m``.
         forward: Axis of the direction of travel, by default the longer side, as in `BEVGrid`.
 
     Raises:
@@ -97,6 +98,7 @@ class MakeLineMaps(BaseTransform):
             cv2.polylines(gap, pts=[line], isClosed=False, color=(1,), thickness=self.gap_px)
             numbers[:label, gap > 0] = 0
             directions[:, :label, gap > 0] = 0
+        # Erasing has left at most one class with a direction at each pixel.
         return numbers, directions.max(axis=1)
 
     def draw_directions(self, raster: NDArray[np.int16], points: Pixels) -> None:
@@ -108,8 +110,8 @@ class MakeLineMaps(BaseTransform):
         """
         for start, end in zip(points[:-1].tolist(), points[1:].tolist(), strict=True):
             angle = np.degrees(np.arctan2(end[1] - start[1], end[0] - start[0])) % 360
-            step = int(angle / (360 / self.num_directions) + 0.5)
-            direction = step % self.num_directions + 1
+            step = int(angle / (360 / self.num_directions) + 0.5)  # rounded
+            direction = step % self.num_directions + 1  # 1 to K, as 0 means no line
             cv2.line(raster, start, end, color=(direction,), thickness=self.thickness_px)
 
     def lines(self, instances: Any, grid: BEVGrid) -> Iterator[tuple[int, Pixels]]:

@@ -246,9 +246,10 @@ def _ridge(probs: FloatArray, pixels: IntArray, tolerance: Float32) -> BoolArray
 
 @njit(cache=True)
 def _mean(values: FloatArray, row: int, column: int, num_rows: int, num_columns: int) -> Float32:
-    """Average the rows and columns around a pixel, with zeros beyond the map.
+    """Average the values around a pixel, with zeros beyond the map.
 
-    The sum is computed in the order of the released code.
+    There are ``num_rows`` rows on each side of the pixel's row, and ``num_columns`` columns on each
+    side of its column. The sum is computed in the order of the released code.
     """
     total = Float32(0)
     for i in range(max(row - num_rows, 0), min(row + num_rows + 1, values.shape[0])):
@@ -302,21 +303,21 @@ def _order(points: IntArray) -> IntArray:
     count = 1
     for step in range(len(points) - 1):
         nearest = -1
-        gap = 0
+        squared_gap = 0
         for i in range(len(points)):
             if is_free[i]:
                 distance = _squared_distance(points[i], points[order[count - 1]])
-                if nearest < 0 or distance < gap:
+                if nearest < 0 or distance < squared_gap:
                     nearest = i
-                    gap = distance
+                    squared_gap = distance
         is_free[nearest] = False
         is_covered = False
-        if gap > 3**2:
+        if squared_gap > 3**2:
             for i in order[:count]:
                 is_covered |= _squared_distance(points[i], points[nearest]) < 5**2
         if is_covered:
             continue
-        if gap > 10**2 and step > 0.9 * len(points):
+        if squared_gap > 10**2 and step > 0.9 * len(points):
             break
         order[count] = nearest
         count += 1
@@ -359,6 +360,7 @@ def _walk(
     """Yield the points after the last one, and mark their directions as used in place."""
     remaining = points
     while True:
+        # Each round uses up a direction of the last point, with or without a step to a new point.
         column, row = last
         free = np.flatnonzero(~is_used[row, column])
         if not len(free):
@@ -389,7 +391,7 @@ def _walk(
         turn = np.abs(config.degrees * directions[row, column] - back_angle)
         back_way = np.minimum(turn, 360 - turn).argmin()
         is_used[row, column, back_way] = True
-        yield last
+        yield last  # pixel (column, row)
 
 
 def _distances(points: IntArray, point: FloatArray | IntArray) -> FloatArray:

@@ -7,7 +7,7 @@ from gsmap.models.maptrv2.keys import LIFTED_MARKER, LIFTED_UNUSED, MAPTRV2
 _BEV_LAYER = "prior.bev.layer."
 _MAP_LAYER = TRANSFORMER + "map_encoder.layers.{i}."
 _LABELS = (HEAD + "label_encoder.", "prior.queries.label_encoder.")
-# Of the modules that MapTRv2 does not use, the BEV layer uses these.
+# The MapTRv2 release has modules that it never calls. The BEV layer of HRMapNet calls these three.
 _USED_AGAIN = ("positional_encoding.", "transformer.level_embeds", "transformer.cams_embeds")
 _UNUSED = {
     key: value

@@ -1,1 +1,1 @@
-"""Heads of lines with masks, with separate queries for each class: shared by two methods."""
+"""Heads of lines with masks, with separate queries for each class, for BeMapNet and PivotNet."""

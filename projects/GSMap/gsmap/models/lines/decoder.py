@@ -35,7 +35,7 @@ class AttentionLayer(nn.Module):
         num_heads: Heads of each attention.
         ffn_dims: Hidden channels of the feed-forward network.
         dropout: Probability to drop a value in training.
-        to_memory: Add cross-attention to a memory.
+        to_memory: Add cross-attention to further features, the memory of `nn.Transformer`.
         memory_first: Apply the cross-attention before the self-attention.
     """
 
@@ -138,7 +138,7 @@ class PointLineDecoder(BaseModule):
         total = sum(self.points_per_class)
         self.query = nn.Embedding(total, embed_dims)
         self.query_pos = nn.Embedding(total, embed_dims)
-        self.level = nn.Embedding(1, embed_dims)
+        self.level = nn.Embedding(1, embed_dims)  # embedding of the only level of BEV features
         self.position = SinePositionalEncoding(embed_dims // 2, normalize=True)
         self.layers = nn.ModuleList(
             AttentionLayer(embed_dims, num_heads, ffn_dims=ffn_dims, memory_first=True)
@@ -176,6 +176,7 @@ class PointLineDecoder(BaseModule):
         for layer in self.layers:
             mask = None
             if self.line_masks:
+                # Masks of nn.MultiheadAttention are (B * heads, Q, S), head after head of a sample.
                 mask = self.attention_mask(outputs[-1]).repeat_interleave(self.num_heads, 0)
             states = layer(states, self.query_pos.weight, key=key, memory=memory, attn_mask=mask)
             outputs.append(self.lines(states, bev))
@@ -212,6 +213,6 @@ class PointLineDecoder(BaseModule):
         masks = []
         for (_, p), class_lines in zip(self.queries, lines, strict=True):
             blocked = class_lines.masks.detach().flatten(2) < 0  # (B, n, S)
-            blocked &= ~blocked.all(-1, keepdim=True)
+            blocked &= ~blocked.all(-1, keepdim=True)  # no cell of a line with an empty mask
             masks.append(blocked.repeat_interleave(p, 1))
         return torch.cat(masks, dim=1)

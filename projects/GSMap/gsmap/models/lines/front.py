@@ -1,4 +1,4 @@
-"""Rasters in the order of the line methods: rows from the front, columns from the left."""
+"""Rasters in the order of BeMapNet and PivotNet: rows from the front, columns from the left."""
 
 from collections.abc import Sequence
 
@@ -18,7 +18,7 @@ def front_size(grid: BEVGrid) -> tuple[int, int]:
 def turn_raster(feats: Tensor, grid: BEVGrid) -> Tensor:
     """Convert a raster between row 0 at the smallest y and row 0 at the front.
 
-    The conversion is its inverse.
+    Applied twice, the conversion returns the given raster.
 
     Args:
         feats: Raster. (..., H, W)

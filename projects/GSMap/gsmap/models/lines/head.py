@@ -49,7 +49,7 @@ def class_scores(logits: Sequence[Tensor]) -> Tensor:
     scores = []
     for label, class_logits in enumerate(logits):
         score = class_logits[..., LINE, None] - class_logits[..., 1 - LINE, None]
-        padding = (label, len(logits) - 1 - label)
+        padding = (label, len(logits) - 1 - label)  # classes before and after this one
         scores.append(F.pad(score, padding, value=-torch.inf))
     return torch.cat(scores, dim=1)
 

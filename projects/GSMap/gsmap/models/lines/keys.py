@@ -1,22 +1,22 @@
-"""State keys that the releases of line methods have in common, and their names here."""
+"""State keys that the released BeMapNet and PivotNet have in common, and their names here."""
 
 import torch
 
 from gsmap.checkpoints.key_rules import Rules, rules_of
 
 LINE_DECODER = "ins_decoder.bev_decoder."
-"""Prefix of keys in these releases only."""
+"""Key prefix of these two released models, which no key of this project has."""
 
 BEV = "bev_decoder.bev_encoder."
 LINEAR = "linear1.=ffn.layers.0.0. linear2.=ffn.layers.1. "
-_MLP = ((0, 0), (1, 2), (2, 4))  # index of each matrix of an MLP: in the releases, here
+_MLP = ((0, 0), (1, 2), (2, 4))  # index of each linear layer of an MLP: in the release, here
 
 
 def mlps(theirs: str, ours: str) -> Rules:
     """Rules of the keys of an MLP.
 
     Args:
-        theirs: Prefix of its keys in a release.
+        theirs: Prefix of its keys in the release.
         ours: Prefix of its keys here.
     """
     rules = []

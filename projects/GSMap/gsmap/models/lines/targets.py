@@ -36,11 +36,12 @@ def orient_line(line: Points, tolerance: float, sort_rings: bool = False) -> Poi
         The ordered points. (n, 2)
     """
     if sort_rings and is_closed(line):
-        rearmost = int(line[:-1, 0].argmax())
+        rearmost = int(line[:-1, 0].argmax())  # u increases to the rear
         ring = np.roll(line[:-1], -rearmost, axis=0)
         ring = np.concatenate([ring, ring[:1]])
-        u = ring[:, 0]  # increases to the rear
+        u = ring[:, 0]
         v = ring[:, 1]  # increases to the right
+        # The shoelace formula with x = v and y = -u gives twice the area, here > 0 if clockwise.
         doubled_areas = v[:-1] * u[1:] - v[1:] * u[:-1]
         is_clockwise = doubled_areas.sum() > 0
         return ring if is_clockwise else ring[::-1]
@@ -89,7 +90,8 @@ class FormatLineTargets(BaseTransform):
 
     Args:
         edge_classes: Indices of classes whose rings are replaced by their two longest edges.
-        pixel_m: Side of a pixel of the masks in metres. In configs it is set in the head.
+        pixel_m: Side of a pixel of the masks in metres. Configs set ``mask_pixel_m`` of the head,
+            and the head's `target_settings` set it here.
         thickness_px: Width of the lines in the masks in pixels.
         step_m: Distance of the samples of a line, from which its key points are computed.
         sort_rings: Let rings start at their rearmost vertex and run clockwise. Otherwise they keep
@@ -249,7 +251,7 @@ class FormatLineTargets(BaseTransform):
         labels = np.array(part_labels, dtype=int)
         masks = draw_lines(lines, size, thickness_px=self.thickness_px)
         for index, mask in enumerate(masks):
-            earlier_masks = masks[:index]
+            earlier_masks = masks[:index]  # a view: the masks are changed in place
             has_equal_class = labels[:index] == labels[index]
             earlier_masks[has_equal_class] &= ~mask
         is_empty = ~masks.any(axis=(1, 2))

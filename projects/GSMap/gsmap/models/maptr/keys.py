@@ -1,4 +1,4 @@
-"""State keys of the MapTR release and their names here, with rules that other methods use."""
+"""State keys of the released MapTR and their names here, with rules that other models use."""
 
 import torch
 
@@ -13,6 +13,8 @@ DECODER_LAYER = "pts_bbox_head.transformer.decoder.layers.{i}."
 OUR_ENCODER_LAYER = "bev_encoder.layers.{i}."
 LAYER = "map_head.decoder.layers.{i}."
 
+# A rule is a pair of key prefixes (released, here). The texts contain pairs ``released=here`` of
+# the rest of the prefixes, or one name for both.
 COMMON_RULES = (
     *rules_of("", "", "img_backbone. img_neck."),
     *rules_of(HEAD, "map_head.", "instance_embedding. pts_embedding. cls_branches."),
@@ -34,9 +36,10 @@ _BEV_QUERY_RULES = (
         ENCODER_LAYER, OUR_ENCODER_LAYER, "attentions.1.output_proj.=cross_attn.output_proj."
     ),
 )
-CODE_WEIGHTS = {HEAD + "code_weights": torch.ones(4)}  # of box coordinates: a loss of weight 0
+# Weights of box coordinates in a loss that the releases switch off.
+CODE_WEIGHTS = {HEAD + "code_weights": torch.ones(4)}
 
-# the fixed offsets of the kernel, a buffer of the code that MapTR's weights were published with
+# Fixed offsets of the kernel of the cross-attention, which MapTR's released code saves as a buffer.
 GRID_OFFSETS = (
     r"pts_bbox_head\.transformer\.encoder\.layers\.\d+\.attentions\.1\.attention\.grid_offsets"
 )

@@ -70,7 +70,9 @@ class PointReference(nn.Module, RefinedReference):
         points_per_state: int = 1,
     ) -> None:
         super().__init__()
-        if coords not in (2, 3) or (coords == 3) != (z_range is not None):
+        has_height = coords == 3
+        has_range = z_range is not None
+        if coords not in (2, 3) or has_height != has_range:
             raise InputError(
                 f"coords must be 2, or 3 with a z_range, got coords={coords}, z_range={z_range}."
             )
@@ -195,7 +197,8 @@ class PointReference(nn.Module, RefinedReference):
             Normalised points. (B, ..., coords)
         """
         points_m = self.metres(points.to(motion))
-        # With two coordinates only the motion in the plane applies.
+        # With two coordinates only the motion in the plane applies. Points are rows, so they are
+        # multiplied by the transposed rotation from the right.
         rotation = motion[:, : self.coords, : self.coords].transpose(1, 2)
         translation = motion[:, None, : self.coords, 3]
         transformed_m = points_m.flatten(1, -2) @ rotation + translation

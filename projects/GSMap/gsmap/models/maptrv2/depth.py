@@ -34,7 +34,8 @@ def depth_bins(depth_m: Tensor, stride: int, depth_range: tuple[float, float, fl
     blocks = blocks.unflatten(dim=-3, sizes=(-1, stride))  # (..., h, s, w, s)
     returns = torch.where(blocks == 0, torch.inf, blocks)
     nearest = returns.amin((-3, -1))  # (..., h, w)
-    position = (nearest - (low - step)) / step  # in bins; bin 0 is from 1 to 2
+    # Position in bins, counted from one bin before the first: bin i is from i + 1 to i + 2.
+    position = (nearest - (low - step)) / step
     valid = (position >= 1) & (position < num_depth_bins(depth_range) + 1)
     return torch.where(valid, position, 0).long() - 1
 

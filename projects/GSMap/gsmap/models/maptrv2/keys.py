@@ -1,4 +1,4 @@
-"""State keys of the MapTRv2 release and their names here."""
+"""State keys of the released MapTRv2 and their names here."""
 
 import torch
 from torch import Tensor
@@ -13,6 +13,7 @@ MASK_WEIGHTS = {
     HEAD + "loss_pv_seg.loss_fn.pos_weight": torch.tensor((1.0,)),
 }
 
+# Rules of models whose BEV encoder lifts image features along predicted depth (`LSSEncoder`).
 LIFTED_RULES = (
     *COMMON_RULES,
     *MASK_RULES,
@@ -20,7 +21,8 @@ LIFTED_RULES = (
 )
 LIFTED_UNUSED: dict[str, Tensor | None] = {
     **CODE_WEIGHTS,
-    # Modules of the encoder with learned BEV queries, not used by depth lifting.
+    # Modules of another encoder, with learned BEV queries. The release has them but never calls
+    # them. Conversion to the release writes zeros of these shapes.
     **zeros(
         HEAD,
         {

@@ -94,9 +94,10 @@ class MGMapDecoder(MapDecoder):
         super().__init__(layer, embed_dims=embed_dims, **kwargs)
         if not 0 <= refinements <= len(self.layers):
             raise InputError(
-                f"refinements use the branches of layers, each one, got {refinements} and "
-                f"{len(self.layers)} layers."
+                f"each refinement stage uses the branches of a layer, but there are {refinements} "
+                f"stages and {len(self.layers)} layers: set refinements to 0 to {len(self.layers)}."
             )
+        # The outputs are those of the layers, then of the stages, with the last branches again.
         first_shared = len(self.layers) - refinements
         self.branches = self.branches + self.branches[first_shared:]
         self.num_masks = num_masks

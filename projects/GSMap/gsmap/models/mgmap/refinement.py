@@ -45,6 +45,7 @@ def crop_patches(feats: Tensor, centres: Tensor) -> Tensor:
     locations = (samples_on_map + 0.5) / size
     values = feats.float().flatten(2).transpose(1, 2)  # (B, H * W, C)
     values = values[:, :, None]  # (B, H * W, 1, C)
+    # A bin is the mean of its sampling points, of which points outside the map are 0.
     patches = deformable_sample(
         values, (height, width), locations=locations, weights=inside / SAMPLES**2
     )

@@ -48,7 +48,8 @@ class PerPointSampling(SamplingAttention):
     ) -> None:
         self.sample_shape = (num_levels, num_points, num_samples)
         self.points_per_instance = num_points
-        # the parent counts samples as points, and every point of every level as a part
+        # `SamplingAttention` calls the K samples of a point "points". Every point on every level is
+        # one of its "parts", which have equal initial offsets.
         super().__init__(num_points=num_samples, num_parts=num_levels * num_points, **kwargs)
 
     def forward(
@@ -133,7 +134,7 @@ class PerPointSampling(SamplingAttention):
         logits = at_least_float32(self.attention_weights(query))
         logits = logits.unflatten(-1, (self.num_heads, *self.sample_shape))
         point_weights = logits.softmax(dim=-1)
-        weights = logits.flatten(-3).softmax(dim=-1)  # over levels, P and K
+        weights = logits.flatten(-3).softmax(dim=-1)  # over levels, P and K together
         weights = weights.unflatten(-1, self.sample_shape)
         order = (0, 1, 4, 3, 2, 5)  # (B, N, heads, levels, P, K) -> (B, N, P, levels, heads, K)
         return Samples(
@@ -270,7 +271,8 @@ class MultiGranularityAttention(PerPointSampling):
         points = self.attend_to_instances(
             points, point_code, instances=instances, instance_code=instance_code
         )
-        # Differs from the poster, which sums the points: the released model concatenates them.
+        # Differs from the poster of the paper, which sums the points: the released model
+        # concatenates them.
         instances = state.instances + self.dropout(self.instance_mlp(points.flatten(2)))
         points = self.dropout(self.output_proj(points))
         if state.points is not None:
@@ -280,9 +282,11 @@ class MultiGranularityAttention(PerPointSampling):
     def aggregate(self, feats: Sequence[Tensor], samples: Samples) -> tuple[Tensor, Tensor]:
         """Aggregate the sampled features to instance queries and point queries.
 
-        Summed over K, the weights for instances give the share of each point and level. The weight
-        of a sample is this share times its weight for the point query. An instance query is
-        therefore the sum of the point features, weighted by their shares.
+        Both kinds of weights are softmax functions of equal logits, over different axes. The sum
+        over K of the weights for instances is the share of a point and level. The weight of a
+        sample for its instance is this share times the weight for its point. An instance query is
+        therefore the sum of the point features, weighted by their shares, and the features are
+        sampled only once.
 
         Args:
             feats: Levels of BEV features, the finest first. (B, C, H, W) each

@@ -8,6 +8,7 @@ _INTERACTION = (
     "cross_attn.=attn. linear1.=ffn.layers.0.0. linear2.=ffn.layers.1. norm1.=norms.0. "
     "norm3.=norms.1."
 )
+# Pairs of key prefixes (released, ours), and names of parameters that the release never uses.
 _DOWN_SAMPLING = (TRANSFORMER + "bev_downsample.", "map_head.decoder.bev_pyramid.merges.0.")
 _IDLE = "attentions.1.output_proj_instance"
 _NORM = ("weight", "bias", "running_mean", "running_var")

@@ -52,7 +52,7 @@ class InstanceMaskLoss(MapLoss):
         dice_weight: Weight of the dice loss.
         pairing: ``"matched"`` compares each query with the mask of its ground truth.
             ``"released"`` compares the i-th matched query with the i-th ground truth, as in the
-            released code, which is correct only if the matching happens to be sorted.
+            released code. This is correct only if the matched ground truths happen to be sorted.
         last_layer_only: Flag of `MapLoss`.
         first_group_only: Flag of `MapLoss`.
 
@@ -97,6 +97,7 @@ class InstanceMaskLoss(MapLoss):
             sample_indices = pairs.gt_inds.split(pairs.counts)
             sorted_masks = []
             for matched_masks, indices in zip(sample_masks, sample_indices, strict=True):
+                # Masks in the order of the ground truth, while queries keep their order.
                 sorted_masks.append(matched_masks[indices.argsort()])
             masks = torch.cat(sorted_masks)
         if masks.shape != logits.shape and len(masks):

@@ -207,7 +207,8 @@ class PivotBEVEncoder(CameraEncoder):
         if shapes != self.shapes:
             raise InputError(
                 f"the cameras side by side must have {self.shapes} feature pixels, not {shapes}; "
-                "set image_size, strides and num_cams of PivotBEVEncoder to those of the images."
+                "set image_size, strides and num_cams of PivotBEVEncoder to the values of the "
+                "images."
             )
         pixels = []
         for project, level in zip(self.input_proj, levels, strict=True):
@@ -237,7 +238,7 @@ class PivotBEVEncoder(CameraEncoder):
         points = F.pad(points, (0, 1), value=1.0)  # (Q, 4)
         uv, visible = project_pillars(points[:, None], matrices, img_shape=img_shape)
         score = torch.einsum("bvd,qd->bvq", matrices[:, :, 2], points)  # the depth
-        if self.camera_by == "angle":
+        if self.camera_by == "angle":  # depth / distance is the cosine of the angle
             positions = torch.linalg.inv(matrices)[..., :3, 3]  # of the cameras (B, V, 3)
             ground = points[None, :, :3].expand(len(positions), -1, -1)
             score = score / torch.cdist(positions, ground)
@@ -246,7 +247,7 @@ class PivotBEVEncoder(CameraEncoder):
         u = u_by_camera.gather(1, camera)[:, 0]
         v = v_by_camera.gather(1, camera)[:, 0]
         num_cams = matrices.shape[1]
-        u = (u + camera[:, 0]) / num_cams
+        u = (u + camera[:, 0]) / num_cams  # from one image to all images side by side
         is_inside = visible.gather(1, camera)[:, 0]
         return torch.stack([u, v], dim=-1), is_inside
 

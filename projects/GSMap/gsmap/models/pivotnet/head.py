@@ -47,7 +47,8 @@ class PivotReference(Reference):
         order = sort_keys.argsort(dim=-1)
         num_pivots = (~is_dropped).sum(dim=-1)
         last_pivot = num_pivots[:, None] - 1
-        order = order.gather(1, index.minimum(last_pivot))  # repeats the last pivot
+        # Each line has a pivot, because its ends are pivots. The last pivot is repeated.
+        order = order.gather(1, index.minimum(last_pivot))
         points = references[..., :2].gather(1, order[..., None].expand(-1, -1, 2))
         return {"pts": self.grid.metres_from_front(points), "num_pts": num_pivots}
 
@@ -64,6 +65,7 @@ def pack_lines(lines: list[Lines]) -> LinePredictions:
         pivot = torch.cat([ends, pivot[:, :, 1:-1], ends], dim=2)  # (B, n, p, 1)
         reference = torch.cat([class_lines.points, pivot], dim=-1)  # (B, n, p, 3)
         num_missing = longest - reference.shape[2]
+        # The logit -1 of the filling is not that of a pivot, so `decode` drops these points.
         references.append(F.pad(reference, (0, 0, 0, num_missing), value=-1.0))
         logits.append(class_lines.logits)
     return LinePredictions(

@@ -76,7 +76,7 @@ class PivotLosses(LineLosses):
             points (n, K, P, p), pivots (K, P, 2) and their numbers (K,).
         """
         pivots = case.truth.pivots
-        offsets = pivots[None, :, :, None] - case.lines.points[:, None, None]
+        offsets = pivots[None, :, :, None] - case.lines.points[:, None, None]  # (n, K, P, p, 2)
         differences = offsets.abs().sum(dim=-1)
         return self.line_costs(case), differences, pivots, case.truth.numbers
 
@@ -98,6 +98,7 @@ class PivotLosses(LineLosses):
             line = pivots[col, : counts[col]]
             path = match_pivots(differences[row, col, : len(line)])
             is_pivot[pair, path] = True
+            # The targets of the points between two pivots are spaced evenly between them.
             u = np.interp(points, path, line[:, 0])
             v = np.interp(points, path, line[:, 1])
             target_points[pair] = torch.from_numpy(np.stack([u, v], axis=-1))

@@ -23,6 +23,7 @@ def path_costs(costs: Floats) -> Floats:
     table = np.full(costs.shape, fill_value=np.inf)
     table[..., 0, 0] = costs[..., 0, 0]
     for row in range(1, costs.shape[-2]):
+        # The pivot before is matched with any earlier point, at the lowest cost of these.
         best_before = np.minimum.accumulate(table[..., row - 1, :-1], axis=-1)
         table[..., row, 1:] = best_before + costs[..., row, 1:]
     return table
@@ -64,6 +65,7 @@ def match_pivots(costs: Floats) -> NDArray[np.int64]:
         raise InputError(f"{num_pivots} pivots cannot be matched with {num_points} points.")
     table = path_costs(costs)
     path = np.full(num_pivots, fill_value=num_points - 1)
+    # The last pivot has the last point. Go back: the pivot before has the best earlier point.
     for row in range(num_pivots - 1, 0, -1):
         path[row - 1] = table[row - 1, : path[row]].argmin()
     return path

@@ -35,6 +35,7 @@ def significances(points: Points) -> NDArray[np.float64]:
         position = next_position or int(np.argmin(areas[remaining]))
         smallest = areas[remaining.pop(position)]
         next_position = 0
+        # After the removal, the neighbours of the point are at its position and at the one before.
         for neighbour in (position, position - 1):
             if not 0 < neighbour < len(remaining) - 1:
                 continue

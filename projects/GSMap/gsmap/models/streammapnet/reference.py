@@ -36,6 +36,7 @@ class LineReference(PointReference):
         z_range: Sequence[float] | None = None,
         points_per_state: int = 1,
     ) -> None:
+        # The networks of the base class are replaced below: it creates them as small as possible.
         super().__init__(
             grid,
             embed_dims=1,

@@ -107,7 +107,7 @@ class BEVMemory(nn.Module, AddsWeights):
             Locations for ``grid_sample``, [-1, 1] over the map. (B, H, W, 2)
         """
         cells = self.cells(height, width).to(motion)
-        rotation = motion[:, :2, :2].transpose(1, 2)
+        rotation = motion[:, :2, :2].transpose(1, 2)  # cells are rows: multiplied from the right
         previous = cells.flatten(0, 1) @ rotation + motion[:, None, :2, 3]
         norm = self.grid.norm_from_metres(previous.unflatten(1, (height, width)))
         return 2 * norm - 1
@@ -155,7 +155,7 @@ class BEVMemory(nn.Module, AddsWeights):
         update = self.convz(inputs).sigmoid()
         reset = self.convr(inputs).sigmoid()
         candidate = self.convq(torch.cat([reset * hidden, feats], dim=1))
-        fused = torch.lerp(hidden, candidate, update)
+        fused = torch.lerp(hidden, candidate, update)  # (1 - z) h + z q
         fused = self.ln(fused.permute(0, 2, 3, 1))  # (B, H, W, C)
         return fused.permute(0, 3, 1, 2)
 

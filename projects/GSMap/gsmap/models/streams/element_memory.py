@@ -111,6 +111,7 @@ class ElementMemory:
             known_labels=labels[exists],
             gate_m=self.gate_m,
         )
+        # Confident detections get the updated Gaussians, and points keep their heights.
         means = gaussians.means.index_put((is_confident,), updated.means)
         result = detections.clone()
         result.pts = torch.cat([means, detections.pts[..., 2:]], dim=-1)

@@ -143,7 +143,9 @@ class Propagation(FlowHook):
     def __init__(self, memory: QueryMemory, past: Past) -> None:
         self.memory = memory
         self.past = past
-        self.propagated: Queries | None = None  # grouped by instance (B, K, rows, ...)
+        # Grouped by instance, with P rows for each state of points and one for a state of the
+        # instance. (B, K, rows, ...)
+        self.propagated: Queries | None = None
         self.last: Queries | None = None  # after the last layer
         self.num_queries = 0  # N
         self.best_inds: Tensor | None = None  # (B, K)
@@ -198,6 +200,8 @@ class Propagation(FlowHook):
         with torch.no_grad():
             scores = head.cls_branches[0](decoded.instance_states[:, :group_size]).amax(-1)
         order = self.order(scores, total)
+        # A state may be a nested tuple. Its leaves are tensors, except for numbers such as 0.0 in
+        # place of a tensor, which need no memory.
         leaves, form = tree_flatten(queries)
         remembered = []
         for name, leaf in zip(leaf_names(len(leaves)), leaves, strict=True):
@@ -226,6 +230,7 @@ class Propagation(FlowHook):
         """
         num = self.memory.num
         group_size = scores.shape[1]
+        # Indices below `num` are of propagated queries, so current query i has the index num + i.
         survivors = scores.topk(group_size - num).indices + num
         propagated = torch.arange(num, device=scores.device).expand(len(scores), -1)
         unchanged = torch.arange(num, num + group_size, device=scores.device)
@@ -296,7 +301,7 @@ class Propagation(FlowHook):
         )
         pred = pred[..., : previous.shape[-1]].reshape(previous.shape)
         target = head.reference.transform_points(previous, self.past.now_from_then)
-        has_target = (previous.flatten(2) != 0).any(-1)  # (B, K)
+        has_target = (previous.flatten(2) != 0).any(-1)  # unmatched queries have zeros (B, K)
         weight = has_target & self.past.continues[:, None]
         distances = F.smooth_l1_loss(pred, target, reduction="none", beta=self.memory.beta)
         total = (distances.sum((-1, -2)) * weight).sum() / previous.shape[-2]

@@ -33,7 +33,7 @@ class Canvas:
     def __post_init__(self) -> None:
         if self.margin_m < 0:
             raise InputError(f"margin_m must be >= 0, got {self.margin_m}.")
-        self.grid.rasterized(self.pixel_m)
+        self.grid.rasterized(self.pixel_m)  # raises an error if the pixels do not divide the extent
 
     @cached_property
     def size(self) -> tuple[int, int]:

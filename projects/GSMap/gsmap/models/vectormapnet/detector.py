@@ -268,6 +268,7 @@ class KeyPointHead(DetectionHead):
         """
         scores = output.scores.float()
         boxes = output.references.float().flatten(2)
+        # In mmdet's focal loss, the number of classes is the label of the background.
         labels = torch.full_like(scores[..., 0], len(self.classes), dtype=torch.long)
         num_matches = 0
         distances = []
@@ -281,7 +282,8 @@ class KeyPointHead(DetectionHead):
             distances.append(distance)
         number = max(num_matches, 1)
         loss_cls = self.loss_cls(scores.flatten(0, 1), labels.flatten(), avg_factor=number)
-        loss_box = self.box_weight * torch.stack(distances).sum() / (2 * _CORNERS * number)
+        num_coordinates = 2 * _CORNERS * number  # x and y of each corner
+        loss_box = self.box_weight * torch.stack(distances).sum() / num_coordinates
         return loss_cls, loss_box
 
     @torch.no_grad()

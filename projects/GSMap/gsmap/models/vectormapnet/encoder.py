@@ -144,6 +144,7 @@ class HeightPlanesEncoder(CameraEncoder):
         num_planes, height, width = self.planes.shape[1:]
         visible = projection.visible  # (B, V, Q)
         uv = 2 * projection.uv[..., 0, :] - 1  # [-1, 1] over the image, (B, V, Q, 2)
+        # Projections of invisible points may have any value, also NaN. -2 is beyond the image.
         uv = uv.where(visible[..., None], -2.0)
         total = feats.new_zeros(())
         for view in range(feats.shape[1]):

@@ -42,7 +42,7 @@ class PolylineGenerator(BaseModule):
         top_p: Tokens are sampled from the smallest set of most likely tokens with at least this
             total probability, in [0, 1]. 0 takes the most likely token.
         max_points: Largest number of points of a generated line, >= 2.
-        redraw: Whether every step samples all earlier tokens again, as in the released code. The
+        redraw: Whether every step samples all earlier tokens again. The released code does so. The
             new samples are inputs of the first layer only; the line keeps the first samples.
         noise_share: Share in [0, 1] of the coordinates that receive noise in training.
         noise_px: Standard deviations of the noise along x and y, in pixels.
@@ -126,7 +126,7 @@ class PolylineGenerator(BaseModule):
 
     def embed_condition(self, elements: Elements) -> Tensor:
         """Embed classes and boxes as the first tokens of the lines. (n, 5, C)"""
-        number = torch.arange(4, device=elements.boxes.device)  # of x0, y0, x1, y1
+        number = torch.arange(4, device=elements.boxes.device)  # 0 to 3 for x0, y0, x1, y1
         corners = self.corner(number // 2)
         axes = self.axis(number % 2)
         boxes = self.vertex(elements.boxes) + corners + axes  # (n, 4, C)
@@ -158,6 +158,7 @@ class PolylineGenerator(BaseModule):
         Returns:
             Logits with -1e9 for forbidden tokens. (n, T, tokens)
         """
+        # The last pixel along an axis of `size` pixels has the token `size`.
         token = torch.arange(self.canvas.num_tokens, device=logits.device)
         forbidden_x = token > self.canvas.size[0]
         forbidden_y = token > self.canvas.size[1]
@@ -294,7 +295,7 @@ class PolylineGenerator(BaseModule):
         active = torch.arange(len(tokens), device=tokens.device)  # rows of unfinished lines
         caches: list[Cache | None] = [None] * len(self.layers)
         all_probs = condition.new_zeros(len(tokens), 0, self.canvas.num_tokens)
-        states = condition
+        states = condition  # new inputs of a step: the condition, then the previous token
         for step in range(num_steps):
             for i, layer in enumerate(self.layers):
                 cache = append_cache(caches[i], layer.keys_values(states))
@@ -306,7 +307,7 @@ class PolylineGenerator(BaseModule):
             samples = draw(all_probs)
             new_tokens = samples[:, -1]
             tokens[active, step] = new_tokens
-            is_active = new_tokens > 0  # of the rows in active
+            is_active = new_tokens > 0  # an entry for each row in `active`
             if not is_active.any() or step == num_steps - 1:
                 break
             active = active[is_active]

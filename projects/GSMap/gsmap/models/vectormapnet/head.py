@@ -41,9 +41,9 @@ class VectorMapNetHead(DetectionHead):
 
     transforms = ("FormatPolylineTargets",)
     not_exported = (
-        "polylines are generated point after point, as many times as the longest one has "
-        "coordinates, with random numbers: no graph of fixed steps. Export a model whose map_head "
-        "is the detector alone"
+        "polylines are generated coordinate by coordinate with random numbers, until the longest "
+        "one ends, so the number of steps is not fixed. Export a model whose map_head is the "
+        "detector alone"
     )
 
     def __init__(

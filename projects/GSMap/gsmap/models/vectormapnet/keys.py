@@ -7,6 +7,7 @@ from gsmap.checkpoints.key_rules import KeyMap, rules_of, zeros
 _ELEMENTS = "head.det_net."
 _ELEMENT_LAYER = "head.det_net.transformer.decoder.layers.{i}."
 _LINES = "head.gen_net."
+# Coordinates z, y and x of the sampled planes, which the release saves as a buffer.
 _PLANES = torch.meshgrid(
     torch.tensor((-1.1, 0.0, 0.5, 1.1)),
     torch.linspace(-15.0, 15.0, 100),
@@ -51,7 +52,7 @@ VECTORMAPNET = KeyMap(
         ),
     ),
     unused={
-        # settings: points of the planes, pixels of the canvas, and two settings of the noise
+        # settings: points (x, y, z) of the planes, pixels of the canvas, two settings of the noise
         "backbone.bev_planes": torch.stack((_PLANES[2], _PLANES[1], _PLANES[0]), -1),
         _ELEMENTS + "canvas_size": torch.tensor((200, 100)),
         _LINES + "canvas_size": torch.tensor((200, 100)),

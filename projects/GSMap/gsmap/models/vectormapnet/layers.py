@@ -16,6 +16,7 @@ class CachedAttention(nn.MultiheadAttention):
     def keys_values(self, tokens: Tensor) -> Cache:
         """Compute the keys and values of tokens. (n, S, C)"""
         C = self.embed_dim
+        # The rows of `in_proj_weight` project to queries, keys and values, C rows each.
         keys_and_values = F.linear(tokens, self.in_proj_weight[C:], self.in_proj_bias[C:])
         keys, values = keys_and_values.chunk(2, dim=-1)
         return self.split_heads(keys), self.split_heads(values)
@@ -96,6 +97,7 @@ class GatedLayer(nn.Module):
         """
         attention_output = self.self_attn(self.norms[0](states), cache, mask=mask)
         states = states + self.gates[0] * self.dropout(attention_output)
+        # As the memory is shared, the tokens of all lines attend to it as one sequence.
         query = self.norms[1](states).flatten(0, 1)[None]  # (1, n * T, C)
         attention_output = self.cross_attn(query, memory).view(states.shape)
         states = states + self.gates[1] * self.dropout(attention_output)
@@ -125,7 +127,8 @@ def keep_most_likely(logits: Tensor, share: float) -> Tensor:
     """
     sorted_logits, index = logits.sort(dim=-1, descending=True)
     probs = sorted_logits.softmax(dim=-1)
-    is_tail = probs.cumsum(dim=-1) - probs > share
+    mass_before = probs.cumsum(dim=-1) - probs  # of the more likely tokens
+    is_tail = mass_before > share
     is_tail[..., 0] = False
-    ranks = index.argsort(dim=-1)
+    ranks = index.argsort(dim=-1)  # position of each token in the sorted order
     return logits.masked_fill(is_tail.gather(-1, ranks), -1e9)

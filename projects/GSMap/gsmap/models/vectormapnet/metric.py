@@ -24,7 +24,7 @@ class VectorMapNetAP(ChamferConfig):
     """
 
     name: ClassVar[str] = "vectormapnet"
-    companions: ClassVar[tuple[str, ...]] = ("chamfer",)
+    companions: ClassVar[tuple[str, ...]] = ("chamfer",)  # metrics that are reported with it
 
     @classmethod
     def from_settings(cls, settings: MetricSettings) -> "VectorMapNetAP":

@@ -55,10 +55,11 @@ def edge_weights(line: Floats) -> Floats:
     (n, 2) -> (2 n + 1,)
     """
     edges = np.linalg.norm(np.diff(line, axis=0), axis=1)
+    # The first and the last point have one edge, which counts twice.
     edge_before = np.append(edges[:1], edges)
     edge_after = np.append(edges, edges[-1:])
     means = (edge_before + edge_after) / 2
-    shares = means / max(means.sum(), np.finfo(float).eps) / 2
+    shares = means / max(means.sum(), np.finfo(float).eps) / 2  # half for x, half for y
     return np.append(np.repeat(shares, 2), 1 / (2 * len(line)))
 
 
@@ -94,7 +95,7 @@ class FormatPolylineTargets(BaseTransform):
     edge_classes: Sequence[int] = (2,)
 
     def __post_init__(self) -> None:
-        if min(self.tolerance_m, self.smallest_box, self.border_px, *self.edge_classes, 0) < 0:
+        if min(self.tolerance_m, self.smallest_box, self.border_px, *self.edge_classes) < 0:
             raise InputError(f"settings of FormatPolylineTargets must not be negative: {self}.")
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
@@ -106,7 +107,7 @@ class FormatPolylineTargets(BaseTransform):
         elements = ground_truth_elements(results, self)
         grid = BEVGrid(results["x_range"], results["y_range"])
         canvas = Canvas(grid, self.pixel_m, margin_m=self.margin_m)
-        low, high = np.transpose([grid.x_range, grid.y_range])
+        low, high = np.transpose([grid.x_range, grid.y_range])  # (x, y) each
         labels = []
         counts = []
         lines_m = []

@@ -67,6 +67,7 @@ def render_gaussians(
         batch_shape = means.shape[:-2]
         flat = gaussians.reshape(math.prod(batch_shape), means.shape[-2], 5)
         frame = [grid.x_range[0], grid.y_range[0], *grid.pixel_size_m]
+        # The second Triton kernel replaces the first one if the user has enabled it.
         in_warps = backend == "triton" and "render_gaussians_in_warps" in backends.AUTO_KERNELS
         render = _render_in_warps if in_warps else _render
         masks = render(flat, frame, height=grid.height, width=grid.width, backend=backend)
