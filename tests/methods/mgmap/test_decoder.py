@@ -105,7 +105,7 @@ def test_bad_settings_are_refused_when_the_head_is_built():
         mgmap(decoder={"refinements": 3})
     with pytest.raises(ValueError, match="got -1 and 2 layers"):
         mgmap(decoder={"refinements": -1}, losses=HEAD["losses"])
-    with pytest.raises(ValueError, match="num_masks is 3, and there are 4 queries"):
+    with pytest.raises(ValueError, match="num_masks is 3, and there are 4 queries: set both"):
         mgmap(decoder={"num_masks": 3})
     with pytest.raises(ValueError, match="ForegroundLoss needs a refinement"):
         mgmap(decoder={"refinements": 0})

@@ -119,8 +119,8 @@ def test_a_step_of_training_is_seen_by_the_next_validation(fused):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"queries": ((3, 4),)}, "queries must be lines"),
-        ({"queries": ((3, 4), (2, 1))}, "queries must be lines"),
+        ({"queries": ((3, 4),)}, "queries must be two numbers for each class"),
+        ({"queries": ((3, 4), (2, 1))}, "queries must be two numbers for each class"),
         ({"decoder": {**HEAD["decoder"], "num_layers": 7}}, "num_layers must be 1 to 6"),
     ],
 )

@@ -346,7 +346,7 @@ def test_a_memory_that_does_not_fit_is_refused():
     head = build_head(HEAD)
     with pytest.raises(ValueError, match="bev=dict"):
         StreamMemory(head)
-    with pytest.raises(ValueError, match="a memory of 4 queries does not fit a head of 4"):
+    with pytest.raises(ValueError, match="a memory of 4 queries does not fit a head of 4 queries"):
         StreamMemory(head, queries={"num": 4})
     with pytest.raises(ValueError, match=r"kept_dims must be 1 to 16, .* got 17"):
         StreamMemory(head, bev={"kept_dims": 17}, embed_dims=16)

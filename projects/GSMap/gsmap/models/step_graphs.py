@@ -44,7 +44,7 @@ def reason_against_recording(model: Any) -> str:
     if model.prior is not None:
         return "it reads a map of earlier drives (prior)"
     if not isinstance(head, MapHead) or type(head).forward is not MapHead.forward:
-        return f"{type(head).__name__} has a flow of its own"
+        return f"{type(head).__name__} has another forward pass than MapHead"
     if head.flow_parts:
         return f"it adds queries in training ({', '.join(head.flow_parts)})"
     if model.compiled:
@@ -166,7 +166,8 @@ class StepGraphs:
                 around the model.
         """
         if torch.is_autocast_enabled(images.device.type):
-            # Its cache would hand the weights of the recorded step to all later ones.
+            # The cache of autocast holds cast weights: all later steps would use those of the
+            # recorded step.
             raise InputError(
                 f"{SWITCH}=True does not go with --amp: leave it out, and set "
                 "model.autocast=bfloat16."
@@ -178,8 +179,9 @@ class StepGraphs:
         params = [param for param in model.parameters() if param.requires_grad]
         if any(param.grad is not None for param in params):
             raise InputError(
-                f"{SWITCH}=True writes the gradients of a step into the memory of the one before: "
-                "set optim_wrapper.accumulative_counts=1, or leave out the switch."
+                f"{SWITCH}=True writes the gradients of a step into the memory of the gradients of "
+                "the previous step: set optim_wrapper.accumulative_counts=1, or leave out the "
+                "switch."
             )
         key = (len(params), *((tensor.shape, tensor.dtype) for tensor in inputs))
         recording = self._recordings.get(key)

@@ -238,7 +238,7 @@ class BezierHead(LineHead):
                 raise InputError(
                     f"lines of class {label} have {counts.tolist()} control points, but the head "
                     f"has pieces of degree {curve.degree} and at most {largest} points: set "
-                    "degrees and pieces of FormatBezierTargets to those of the head."
+                    "degrees and pieces of FormatBezierTargets to the values of the head."
                 )
             pieces = (counts - 1) // curve.degree - 1  # number of pieces less one
             num_missing = max(largest - points.shape[1], 0)

@@ -36,7 +36,8 @@ def _path_rules(path: str, release_path: str, number: int, levels: Sequence[int]
     """
     rules: list[tuple[str, str]] = []
     for i, level in enumerate(levels):
-        # {{i}} is the placeholder of a key for the number of the round; {i} is the level's place.
+        # {{i}} becomes the placeholder {i} of a rule, for the number of the round. {i} inserts the
+        # position of the level on the path.
         theirs = f"{_NECK}{{i}}."
         ours = f"img_neck.rounds.{{i}}.{path}.{i}."
         rules += rules_of(f"{theirs}conv{level}_{release_path}.", ours, names=_CONVS)

@@ -24,8 +24,8 @@ def _projection(inputs: int, outputs: int) -> nn.Sequential:
 def downsample(feats: Tensor) -> Tensor:
     """Max-pool a map with a 3x3 kernel and stride 2, padded with zeros.
 
-    An axis of even size is padded by one cell after the last one, an axis of odd size also by one
-    before the first, so that ``(n + 1) // 2`` cells remain. (B, C, h, w)
+    An axis of even size is padded by one cell after the last cell. An axis of odd size is also
+    padded by one cell before the first cell. Of n cells, ``(n + 1) // 2`` remain. (B, C, h, w)
     """
     # Concatenation, not F.pad: ONNX Runtime (1.31) merges padding into the pooling, which pads with
     # -inf instead of zeros.

@@ -230,7 +230,8 @@ class BEVQueryEncoder(CameraEncoder):
         first = feats if isinstance(feats, Tensor) else feats[0]
         if first.shape[1] != len(self.cams_embeds):
             raise InputError(
-                f"the encoder is built for {len(self.cams_embeds)} cameras, got {first.shape[1]}."
+                f"the encoder is built for {len(self.cams_embeds)} cameras, got {first.shape[1]}: "
+                "set num_cams of the encoder."
             )
         codes = self.cams_embeds + self.level_embeds[:, None]  # (4, V, C)
         codes = codes[..., None, None].to(first.dtype)

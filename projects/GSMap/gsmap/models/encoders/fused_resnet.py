@@ -148,7 +148,8 @@ class FrozenNorms:
 
     def _scale_and_shift(self, norm: Any) -> tuple[Tensor, Tensor]:
         """Scale and shift of a norm with fixed statistics. (C,) each"""
-        # A recorded step reads the norm's tensors, which may be loaded anew, at each replay.
+        # At each replay, a recorded step reads the tensors of the norm. A checkpoint may have been
+        # loaded into them since the recording.
         if norm.weight.requires_grad or is_recording(norm.weight.device.type):
             return _scale_and_shift(norm)
         versions = tensor_versions(norm)
@@ -179,7 +180,7 @@ def _scale_and_shift(norm: Any) -> tuple[Tensor, Tensor]:
 
 
 class _ConvolveReLU(torch.autograd.Function):
-    """Convolution, bias, optional residual and ReLU, of which only the output is kept."""
+    """Convolution, bias, optional residual and ReLU in one, without the values before the ReLU."""
 
     @staticmethod
     def forward(

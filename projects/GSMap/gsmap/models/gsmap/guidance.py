@@ -75,8 +75,8 @@ class GaussianGuidance(Guidance, AddsWeights):
 
         Args:
             reference: References. (B, Q, D)
-            feats: Sampled feature map (B, C, H, W), or maps, of which the first has the cells of
-                the offsets.
+            feats: Sampled feature map (B, C, H, W), or several maps. Offsets are in cells of the
+                first map.
 
         Returns:
             Matrices that multiply offsets (x, y) in cells from the left, or None. (B, Q, 2, 2)

@@ -167,7 +167,7 @@ class ViewTransformEncoder(CameraEncoder):
             raise InputError(
                 f"the encoder is built for {len(self.views)} cameras of {self.feature_size} "
                 f"feature pixels, got {num_cams} of {size}: set num_cams, image_size and "
-                "stride of ViewTransformEncoder to those of the images."
+                "stride of ViewTransformEncoder to the values of the images."
             )
         pixels = feats.flatten(3).unbind(dim=1)  # (B, C, h * w) for each camera
         maps = [view(values) for view, values in zip(self.views, pixels, strict=True)]

@@ -149,8 +149,8 @@ def _check(semantic: Tensor, embedding: Tensor, direction: Tensor, config: Vecto
         raise InputError("semantic needs the background and at least one class.")
     if (len(direction) - 1) * config.degrees != 360:
         raise InputError(
-            f"direction has a channel for none and {len(direction) - 1} for directions, which make "
-            f"no full circle in steps of {config.degrees} degrees."
+            f"direction has one channel for no direction and {len(direction) - 1} channels for "
+            f"directions, which make no full circle in steps of {config.degrees} degrees."
         )
     not_finite = []
     for name, values in maps.items():

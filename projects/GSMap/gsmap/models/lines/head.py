@@ -106,8 +106,8 @@ class LineHead(DetectionHead):
         num_layers = len(self.decoder.layers)
         if not 0 < num_layers <= len(LAYER_WEIGHTS):
             raise InputError(
-                f"decoder.num_layers must be 1 to {len(LAYER_WEIGHTS)}, which have weights in the "
-                f"losses, got {num_layers}."
+                f"decoder.num_layers must be 1 to {len(LAYER_WEIGHTS)}, as the losses have weights "
+                f"for {len(LAYER_WEIGHTS)} layers, got {num_layers}."
             )
         self.layer_weights = LAYER_WEIGHTS[-num_layers:]
         self.coder = MapCoder(
@@ -213,8 +213,8 @@ class LineHead(DetectionHead):
         transform = self.transforms[0]
         if "num_pts" not in instances or "masks" not in instances:
             raise InputError(
-                f"sample {sample.metainfo.get('token')!r} has no {self.targets}: put {transform} "
-                "in place of FormatMapTargets into the training pipeline."
+                f"sample {sample.metainfo.get('token')!r} has no {self.targets}: replace "
+                f"FormatMapTargets in the training pipeline by {transform}."
             )
         mask_size = tuple(instances.masks.shape[1:])
         if mask_size != self.mask_size:

@@ -1,4 +1,4 @@
-"""Base class of the targets of line heads: parts of lines, their key points and their masks."""
+"""Targets of line heads: lines cut at the border of the map, their key points and their masks."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

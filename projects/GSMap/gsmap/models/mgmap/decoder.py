@@ -97,7 +97,7 @@ class MGMapDecoder(MapDecoder):
                 f"each refinement stage uses the branches of a layer, but there are {refinements} "
                 f"stages and {len(self.layers)} layers: set refinements to 0 to {len(self.layers)}."
             )
-        # The outputs are those of the layers, then of the stages, with the last branches again.
+        # Branches of the outputs: of all layers, then of the last layers again for the stages.
         first_shared = len(self.layers) - refinements
         self.branches = self.branches + self.branches[first_shared:]
         self.num_masks = num_masks

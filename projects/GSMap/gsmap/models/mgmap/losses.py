@@ -46,7 +46,8 @@ class QueryMaskLoss(MapLoss):
         num_masks = get_decoder(self, head).num_masks
         if num_queries != num_masks:
             raise InputError(
-                f"decoder.num_masks is {num_masks}, and there are {num_queries} queries."
+                f"decoder.num_masks is {num_masks}, and there are {num_queries} queries: set both "
+                "to one number."
             )
 
     def reads(self, pairs: MatchedPairs) -> bool:

@@ -31,7 +31,7 @@ class MGMapHead(MapHead):
         grid: Extent of the map, in metres.
         decoder: Settings of the decoder. `convert_decoder` converts settings of a class other
             than `MGMapNetDecoder`.
-        losses: Settings of the losses besides the two below.
+        losses: Settings of the other losses, to which the two losses below are added.
         query_groups: Settings of the query groups.
         loss_mean_loc: Settings of `SamplingLocationLoss`, or None to train without it.
         loss_ins_seg: Settings of `InstanceMaskLoss`, or None to train without it.
@@ -57,7 +57,7 @@ class MGMapHead(MapHead):
         if "line_width_m" not in mask_settings:
             pixel_m = 2 * element_masks.half_pixel_m
             element_masks.line_width_m = LINE_WIDTH_PX * pixel_m
-        # Lists of one config, or of none if the loss is switched off.
+        # Lists of one config, or empty lists if the losses are switched off.
         mean_loc = optional_part(SamplingLocationLoss, loss_mean_loc)
         ins_seg = optional_part(InstanceMaskLoss, loss_ins_seg, embed_dims=embed_dims)
         super().__init__(

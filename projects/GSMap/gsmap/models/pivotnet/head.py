@@ -1,4 +1,4 @@
-"""PivotNet's head: lines of points, of which the pivots form the map elements."""
+"""PivotNet's head: lines of points, some of which are pivots, the vertices of the map elements."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -65,7 +65,7 @@ def pack_lines(lines: list[Lines]) -> LinePredictions:
         pivot = torch.cat([ends, pivot[:, :, 1:-1], ends], dim=2)  # (B, n, p, 1)
         reference = torch.cat([class_lines.points, pivot], dim=-1)  # (B, n, p, 3)
         num_missing = longest - reference.shape[2]
-        # The logit -1 of the filling is not that of a pivot, so `decode` drops these points.
+        # Pivots have logits > 0, so `decode` drops the filling with logit -1.
         references.append(F.pad(reference, (0, 0, 0, num_missing), value=-1.0))
         logits.append(class_lines.logits)
     return LinePredictions(
@@ -107,8 +107,8 @@ class PivotHead(LineHead):
     ) -> None:
         if len(queries) != len(classes) or any(n < 1 or p < 2 for n, p in queries):
             raise InputError(
-                "queries must be lines (>= 1) and their points (>= 2) for each of "
-                f"{list(classes)}, got {list(queries)}."
+                "queries must be two numbers for each class, of lines (>= 1) and of points per "
+                f"line (>= 2). The classes are {list(classes)}, got {list(queries)}."
             )
         super().__init__(
             grid,
@@ -169,8 +169,8 @@ class PivotHead(LineHead):
             if (numbers > num_points).any():
                 raise InputError(
                     f"a line of class {label} has {int(numbers.max())} pivots, but the head "
-                    f"has {num_points} points: set num_points of FormatPivotTargets to those of "
-                    "its queries."
+                    f"has {num_points} points: set num_points of FormatPivotTargets to the points "
+                    "in the head's queries."
                 )
             class_truth = TrueLines(
                 pivots=pivots[is_class, :num_points],

@@ -62,14 +62,14 @@ class QueryMemory(BaseModule, AddsWeights):
         """Raise ValueError if the head has fewer than two layers or too few queries."""
         if len(head.decoder.layers) < 2:
             raise InputError(
-                "a memory of queries enters after the first decoder layer, and the head has no "
-                "other: set map_head.decoder.num_layers to 2 or more."
+                "a memory of queries is inserted after the first decoder layer, but the head has "
+                "no second layer: set map_head.decoder.num_layers to 2 or more."
             )
         num_queries = head.query_groups[0].num
         if not 0 < self.num < num_queries:
             raise InputError(
-                f"a memory of {self.num} queries does not fit a head of {num_queries}: set "
-                "temporal.queries.num to less than its queries."
+                f"a memory of {self.num} queries does not fit a head of {num_queries} queries: set "
+                "temporal.queries.num to a smaller number than the queries of the head."
             )
 
     def update(self, states: Tensor, motion: Tensor) -> Tensor:

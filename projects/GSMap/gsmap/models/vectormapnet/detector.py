@@ -261,7 +261,7 @@ class KeyPointHead(DetectionHead):
         Args:
             output: Predictions of the layer.
             truths: Targets of each sample. (B,)
-            tokens: Token of each sample, for error messages. (B,)
+            tokens: Name (``token``) of each sample, for error messages. (B,)
 
         Returns:
             Weighted scalars, averaged over the matched elements of the batch.
@@ -296,7 +296,7 @@ class KeyPointHead(DetectionHead):
             scores: Class logits. (N, classes)
             boxes: Corners x0, y0, x1, y1 in pixels of the canvas. (N, 4)
             truth: Targets of the sample, K elements.
-            token: Token of the sample, for error messages.
+            token: Name of the sample, for error messages.
 
         Returns:
             Indices of the predictions and of their annotated elements. (min(N, K),) each

@@ -139,12 +139,12 @@ class VectorMapNetHead(DetectionHead):
     def generate_lines(
         self, feats: Tensor, detections: InstanceData, meta: Mapping[str, object]
     ) -> InstanceData:
-        """Generate the lines of one sample's elements, with its token as the random seed.
+        """Generate the lines of one sample's elements. The name of the sample is the random seed.
 
         Args:
             feats: BEV features of the sample. (C', H, W)
             detections: Elements of the detector: ``pts``, ``labels_3d`` and ``scores_3d``.
-            meta: Metadata of the sample: ``token``.
+            meta: Metadata of the sample, with its name ``token``.
 
         Returns:
             Lines of two or more points: ``pts`` in metres (M, P, 2), ``num_pts`` (M,),

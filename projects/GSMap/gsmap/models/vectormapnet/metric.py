@@ -36,8 +36,8 @@ class VectorMapNetAP(ChamferConfig):
         resamples = settings.resample_predictions and settings.resample_ground_truth
         if settings.dim != 2 or not resamples:
             raise InputError(
-                f"{cls.name} is AP_chamfer of lines of 100 points in the plane: leave out "
-                "heights (dim 3) and points as they are given."
+                f"{cls.name} is AP_chamfer of lines in the plane that are resampled to 100 points: "
+                "set dim=2, and let predictions and ground truth be resampled."
             )
         return cls(settings.classes)
 
