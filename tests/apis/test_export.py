@@ -301,7 +301,7 @@ def test_an_operator_that_onnx_lacks_is_named(tmp_path):
 
 
 def test_another_number_of_cameras_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="^the encoder is built for 6 cameras, got 5: set num_cams"):
+    with pytest.raises(ValueError, match=r"^the encoder is built for 6 cameras, got 5: set num_c"):
         export_onnx(build_small(), tmp_path / "model.onnx", ["a"] * 5, (64, 96))
 
 

@@ -177,10 +177,12 @@ class BEVDeformableAttention(SamplingAttention):
         tokens = feats.flatten(2).transpose(1, 2)  # (B, H * W, C)
         locations = self.locations(query, reference, shape=shape, frames=frames)
         weights = self.weights(query)
-        # Projection and sampling commute. With few samples, projecting last is faster.
+        # Projection and sampling commute. With few samples, projecting last is faster, unless a
+        # fused kernel samples.
         num_reads = weights.numel() * _CORNERS
         num_cells = tokens[..., 0].numel() * self.num_heads
-        if num_reads < num_cells and not (has_kernel(tokens) or has_compiled_op(tokens)):
+        is_fused = has_kernel(tokens) or has_compiled_op(tokens)
+        if num_reads < num_cells and not is_fused:
             sampled = self._sample_then_project(tokens, shape, locations=locations, weights=weights)
         else:
             value = self.values(tokens)

@@ -189,7 +189,8 @@ class LossHead(DetectionHead):
             for index, value in enumerate(self.class_losses(pairs)):
                 layer_losses[index]["loss_cls"] = group.weight * value
         for name, loss in cast(Any, self.losses.items()):
-            if name in names and (is_first or not loss.first_group_only):
+            applies_to_group = is_first or not loss.first_group_only
+            if name in names and applies_to_group:
                 for index, value in self._values_by_layer(loss, pairs).items():
                     layer_losses[index][f"loss_{name}"] = group.weight * value
         if is_first:

@@ -7,7 +7,8 @@ from torch import Tensor, nn
 
 from gsmap.models.base.parts import PartConfig
 
-HeadSetting = Callable[[Any], PartConfig]  # from a value to settings of `MapHead`
+# Function from the value of an added setting to the settings of `MapHead` that implement it.
+HeadSetting = Callable[[Any], PartConfig]
 
 _ADDED_SETTINGS: dict[str, HeadSetting] = {}
 

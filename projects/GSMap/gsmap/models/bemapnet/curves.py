@@ -38,7 +38,9 @@ class Curve(nn.Module):
             pieces end before it.
     """
 
-    weights: Tensor  # of the control points, by the number of pieces less one (k, 100, k * d + 1)
+    # Weights of the control points at each sampled point. The first index is the number of pieces
+    # of the curve less one. (k, 100, k * d + 1)
+    weights: Tensor
 
     def __init__(self, degree: int, pieces: int, to_end: bool = False) -> None:
         super().__init__()

@@ -230,7 +230,7 @@ class BezierHead(LineHead):
         truths = []
         for label, curve in enumerate(cast(Iterable[Curve], self.curves)):
             is_class = instances.labels_3d == label
-            counts = instances.num_pts[is_class]  # of control points
+            counts = instances.num_pts[is_class]  # numbers of control points
             largest = curve.weights.shape[-1]
             has_too_many = counts > largest
             has_half_pieces = (counts - 1) % curve.degree != 0

@@ -15,7 +15,7 @@ from gsmap.models.lines.keys import (
 
 _NECK = "im_backbone.fpn.model."
 _CONVS = "depthwise_conv.conv.=depthwise. pointwise_conv.conv.=pointwise. bn.=norm."
-_PROJECTIONS = {  # from the release to this project
+_PROJECTIONS = {  # names in the release, and their names here
     "p3_down_channel.": "inputs.0.",
     "p4_down_channel.": "inputs.1.",
     "p5_down_channel.": "inputs.2.",

@@ -116,7 +116,8 @@ class BEVEncoderLayer(nn.Module):
         centres = self.centres(grid, query.device).view(1, -1, 2)
         partner = query
         if self.released_pairs:
-            partner = query.repeat_interleave(2, 0)[: len(query)]  # of samples 0, 0, 1, 1, ...
+            # The queries of samples 0, 0, 1, 1, ...
+            partner = query.repeat_interleave(2, 0)[: len(query)]
         pair = torch.cat([partner, query + query_pos], dim=-1)  # (B, Q, 2 C)
         bev = query.transpose(1, 2).unflatten(-1, (grid.height, grid.width))  # (B, C, H, W)
         query = self.norms[0](query + self.self_attn(pair, centres, bev))
@@ -180,7 +181,8 @@ class BEVQueryEncoder(CameraEncoder):
             self.grid.width,
             init_cfg=start,
         )
-        self.level_embeds = nn.Parameter(torch.empty(4, embed_dims))  # of the first num_levels
+        # The released models have embeddings of four levels. The first ``num_levels`` are used.
+        self.level_embeds = nn.Parameter(torch.empty(4, embed_dims))
         self.cams_embeds = nn.Parameter(torch.empty(num_cams, embed_dims))
         self.calibration = ("img_from_frame",)
         self.can_bus_mlp = None

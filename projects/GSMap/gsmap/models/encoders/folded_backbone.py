@@ -46,11 +46,15 @@ class FoldedBackbone:
 
 def can_be_folded(backbone: nn.Module) -> bool:
     """Whether a folded copy would compute the output of the backbone in its present state."""
-    if torch.is_grad_enabled() or torch.compiler.is_compiling() or not isinstance(backbone, ResNet):
+    if torch.is_grad_enabled() or torch.compiler.is_compiling():
         return False
-    if backbone.dcn is not None:  # mmcv would fold the norm of a deformable convolution elsewhere
+    if not isinstance(backbone, ResNet):
+        return False
+    # mmcv would fold the norm of a deformable convolution into another convolution.
+    if backbone.dcn is not None:
         return False
     for module in backbone.modules():
-        if module.training or module._forward_hooks or module._forward_pre_hooks:
+        has_hooks = module._forward_hooks or module._forward_pre_hooks
+        if module.training or has_hooks:
             return False
     return True

@@ -71,13 +71,17 @@ def fused_resnet(backbone: ResNet, images: Tensor, convolve: Convolve) -> tuple[
 
 def is_plain(backbone: nn.Module) -> bool:
     """Whether a backbone is a ResNet of plain blocks, which `fused_resnet` requires."""
-    if not isinstance(backbone, ResNet) or backbone.deep_stem or backbone.plugins is not None:
+    if not isinstance(backbone, ResNet):
+        return False
+    has_extras = backbone.deep_stem or backbone.plugins is not None or backbone.dcn is not None
+    if has_extras:
         return False
     for name in backbone.res_layers:
         for block in getattr(backbone, name):
+            # ``with_cp`` is mmdet's name of gradient checkpointing.
             if type(block) not in (BasicBlock, Bottleneck) or block.with_cp:
                 return False
-    return backbone.dcn is None
+    return True
 
 
 def convolve_folded(
@@ -214,7 +218,8 @@ class _ConvolveReLU(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         x, weight, output = ctx.saved_tensors
         needed = ctx.needs_input_grad
-        grad = torch.ops.aten.threshold_backward(grad, output, 0)  # of the ReLU
+        # Gradient of the ReLU: 0 where its output is 0.
+        grad = torch.ops.aten.threshold_backward(grad, output, 0)
         x_grad, weight_grad, bias_grad = torch.ops.aten.convolution_backward(
             grad,
             x,

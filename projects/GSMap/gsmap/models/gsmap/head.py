@@ -114,7 +114,8 @@ class GSMapHead(MapHead):
             return
         is_valid = len(temperatures) == len(self.classes)
         for pair in temperatures:
-            is_valid = is_valid and len(pair) == 2 and min(pair) > 0
+            is_positive_pair = len(pair) == 2 and min(pair) > 0
+            is_valid = is_valid and is_positive_pair
         if not is_valid:
             raise InputError(
                 f"temperatures must be two numbers > 0 for each of the {len(self.classes)} "

@@ -106,6 +106,6 @@ class GaussianMemory(QueryMemory):
             gaussians = fuse_gaussians(space.decode(transformed), space.decode(refined))
             fused = space.encode(gaussians, refined)
         # Centres outside of the map have been moved to its border, away from the element.
-        distances = (transformed[..., :2] - 0.5).abs()  # from the middle of the map
+        distances = (transformed[..., :2] - 0.5).abs()  # distances from the middle of the map
         inside = distances.amax(-1, keepdim=True) < 0.5
         return torch.where(inside, fused, refined)

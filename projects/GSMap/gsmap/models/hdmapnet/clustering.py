@@ -32,7 +32,7 @@ def dense_clusters(points: Points, eps: float, min_neighbours: int) -> Indices:
         return np.zeros(0, dtype=np.int64)
     covariance = np.cov(points, rowvar=False, bias=True).reshape(points.shape[1], -1)
     _, axes = np.linalg.eigh(covariance)
-    points = points @ axes[:, ::-1]  # in descending order of variance
+    points = points @ axes[:, ::-1]  # coordinates along the axes, the largest variance first
     order = np.argsort(points[:, 0], kind="stable")
     points = np.ascontiguousarray(points[order].T)  # (E, n): most pairs differ in the first axes
     low = np.searchsorted(points[0], points[0] - eps)

@@ -171,7 +171,8 @@ class HDMapNetHead(DetectionHead):
         """
         maps = self(bev_outputs)
         results = []
-        for semantic, embedding, direction in zip(*maps, strict=True):  # for each sample
+        # The three maps have the axis of the samples first.
+        for semantic, embedding, direction in zip(*maps, strict=True):
             results.append(self.lines(LineMaps(semantic, embedding, direction=direction)))
         return results
 

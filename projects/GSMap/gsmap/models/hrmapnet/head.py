@@ -81,7 +81,8 @@ class HRMapNetHead(MapHead):
         )
         num_instances = sum(group.num for group in self.query_groups)
         self.instance_embedding = nn.Embedding(num_instances, embed_dims)
-        self.pts_embedding = PointTable(num_points, embed_dims // 2)  # of C channels
+        # A table for queries of C / 2 channels has embeddings of C channels.
+        self.pts_embedding = PointTable(num_points, embed_dims // 2)
         reference: Any = self.reference
         out_dims = reference.initial.out_features
         reference.initial = mlp(embed_dims, embed_dims, embed_dims, out_dims)

@@ -27,7 +27,8 @@ class LinePredictions(NamedTuple):
 
     Attributes:
         scores: Logits of the classes, -inf except for the class of the query. (B, N, classes)
-        references: Points of each line. (B, N, P, D)
+        references: Points of each line, for `Reference.decode`: coordinates (B, N, P, 2), or
+            coordinates and a logit. (B, N, P, 3)
         lines: Lines of every class, a NamedTuple of tensors (B, n, ...) with ``logits`` and
             ``masks``.
     """
@@ -292,8 +293,8 @@ class LineHead(DetectionHead):
         Returns:
             Losses by name; and the matches of each layer and class, with one entry per sample.
         """
-        groups: list[list[Case]] = []
-        cases: list[Case] = []  # of all groups
+        groups: list[list[Case]] = []  # for each layer and class, its cases of all samples
+        cases: list[Case] = []  # the cases of all groups, one group after another
         weights: list[float] = []
         num_groups = len(outputs) * len(self.classes)
         for layer, layer_weight in zip(outputs, self.layer_weights, strict=True):

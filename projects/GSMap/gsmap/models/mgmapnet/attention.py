@@ -247,7 +247,8 @@ class MultiGranularityAttention(PerPointSampling):
         self.p2i = interaction() if p2i else None
         self.point_code: nn.Sequential | None = None
         self.instance_code: nn.Sequential | None = None
-        if position_codes and (p2p or p2i):
+        attends = p2p or p2i
+        if position_codes and attends:
             self.point_code = mlp(2 * num_samples, embed_dims, embed_dims)
         if position_codes and p2i:
             self.instance_code = mlp(2 * num_points * num_samples, embed_dims, embed_dims)

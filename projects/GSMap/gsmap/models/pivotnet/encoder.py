@@ -239,9 +239,9 @@ class PivotBEVEncoder(CameraEncoder):
         uv, visible = project_pillars(points[:, None], matrices, img_shape=img_shape)
         score = torch.einsum("bvd,qd->bvq", matrices[:, :, 2], points)  # the depth
         if self.camera_by == "angle":  # depth / distance is the cosine of the angle
-            positions = torch.linalg.inv(matrices)[..., :3, 3]  # of the cameras (B, V, 3)
-            ground = points[None, :, :3].expand(len(positions), -1, -1)
-            score = score / torch.cdist(positions, ground)
+            camera_positions = torch.linalg.inv(matrices)[..., :3, 3]  # (B, V, 3)
+            ground = points[None, :, :3].expand(len(camera_positions), -1, -1)
+            score = score / torch.cdist(camera_positions, ground)
         camera = score.argmax(dim=1, keepdim=True)  # (B, 1, Q)
         u_by_camera, v_by_camera = uv[..., 0, :].unbind(-1)  # (B, V, Q)
         u = u_by_camera.gather(1, camera)[:, 0]

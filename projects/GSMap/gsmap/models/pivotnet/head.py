@@ -105,7 +105,8 @@ class PivotHead(LineHead):
         embed_dims: int = 256,
         **kwargs: Any,
     ) -> None:
-        if len(queries) != len(classes) or any(n < 1 or p < 2 for n, p in queries):
+        is_too_small = any(num_lines < 1 or num_points < 2 for num_lines, num_points in queries)
+        if len(queries) != len(classes) or is_too_small:
             raise InputError(
                 "queries must be two numbers for each class, of lines (>= 1) and of points per "
                 f"line (>= 2). The classes are {list(classes)}, got {list(queries)}."

@@ -51,7 +51,8 @@ class ElementMemory:
                 f"temporal.elements needs a head with Gaussians, got {type(head).__name__}: take "
                 "GSMapHead, or leave it out."
             )
-        if not (gate_m > 0 and 0 <= min_score < 1 and noise_m >= 0 and noise_deg >= 0):
+        has_valid_noise = noise_m >= 0 and noise_deg >= 0
+        if not (gate_m > 0 and 0 <= min_score < 1 and has_valid_noise):
             raise InputError(
                 "temporal.elements needs gate_m > 0, min_score in [0, 1), noise_m and noise_deg "
                 f">= 0, got {gate_m}, {min_score}, {noise_m} and {noise_deg}."

@@ -169,7 +169,8 @@ class StreamMemory(BaseModule):
         Yields:
             The batch with its memory.
         """
-        if self.training and self.bev is None and self.queries is None:
+        has_trained_memory = self.bev is not None or self.queries is not None
+        if self.training and not has_trained_memory:
             # The memory of elements is unused in training: samples need no poses.
             yield BatchMemory(outputs)
             return

@@ -147,9 +147,10 @@ class Propagation(FlowHook):
         # instance. (B, K, rows, ...)
         self.propagated: Queries | None = None
         self.last: Queries | None = None  # after the last layer
-        self.num_queries = 0  # N
-        self.best_inds: Tensor | None = None  # (B, K)
-        self.target_pts: Tensor | None = None  # of all queries, 0 without a match (B, N, P, 2 or 3)
+        self.num_queries = 0  # number N of instance queries of all groups
+        self.best_inds: Tensor | None = None  # indices of the queries to remember (B, K)
+        # Matched targets of all queries of the first group, 0 without a match. (B, N, P, 2 or 3)
+        self.target_pts: Tensor | None = None
 
     def refine(self, head: FlowHead, layer: int, refined: Tensor) -> Tensor:
         """Fuse the references of propagated queries after the last layer, see `FlowHook.refine`.

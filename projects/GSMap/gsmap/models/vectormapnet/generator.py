@@ -360,11 +360,11 @@ def causal_mask(num_tokens: int, device: torch.device) -> Tensor:
     A token attends to itself and to earlier tokens; condition tokens attend to each other.
 
     Args:
-        num_tokens: Number T of tokens, with the condition.
+        num_tokens: Number S of tokens, with the tokens of the condition.
         device: Device of the mask.
 
     Returns:
-        True where a token (row) attends to another one (column). (T, T)
+        True where a token (row) attends to another one (column). (S, S)
     """
     mask = torch.ones(num_tokens, num_tokens, dtype=torch.bool, device=device).tril()
     mask[:_CONDITION, :_CONDITION] = True

@@ -127,7 +127,7 @@ def keep_most_likely(logits: Tensor, share: float) -> Tensor:
     """
     sorted_logits, index = logits.sort(dim=-1, descending=True)
     probs = sorted_logits.softmax(dim=-1)
-    mass_before = probs.cumsum(dim=-1) - probs  # of the more likely tokens
+    mass_before = probs.cumsum(dim=-1) - probs  # sum over the more likely tokens
     is_tail = mass_before > share
     is_tail[..., 0] = False
     ranks = index.argsort(dim=-1)  # position of each token in the sorted order

@@ -421,8 +421,8 @@ def _gradients(moments, gaussians, prepared):
     """
     cos, sin, inv_u, inv_v = prepared[..., 2:6].unbind(-1)
     scale_u, scale_v = gaussians[..., 2:4].unbind(-1)
-    m_u, m_v, m_uu, m_uv, m_vv = moments.sum(1).unbind(-1)  # in units of sigma
-    m_u = m_u * inv_u
+    m_u, m_v, m_uu, m_uv, m_vv = moments.sum(1).unbind(-1)
+    m_u = m_u * inv_u  # M_u / sigma_u^2 of the equations
     m_v = m_v * inv_v
     grad_x = cos * m_u - sin * m_v
     grad_y = sin * m_u + cos * m_v

@@ -20,7 +20,7 @@ from gsmap.ops._numba import FASTMATH, pixel_range, run_in_threads
 from gsmap.ops.polyline_raster.reference import DISTANCE_EPS, LENGTH_EPS
 
 FAR = np.float32(np.inf)
-REACH = -math.log(1e-8)  # in units of softness; farther pixels are 0 or 1
+REACH = -math.log(1e-8)  # largest D / softness that counts; farther pixels are 0 or 1
 # Smallest x and y, and size of a pixel along x and y, of a raster in pixels. The centre of pixel
 # (row, col) is at (x, y) = (col, row), where the rasterizer released by Zhang et al. samples it.
 INTEGER_FRAME = (-0.5, -0.5, 1.0, 1.0)
@@ -99,7 +99,7 @@ def _fill_inside(ring, frame, inside):
             if (y0 > y) == (y1 > y):
                 continue
             crossing = (x1 - x0) * (y - y0) / (y1 - y0) + x0
-            position = (crossing - x_min) / step_x - 0.5  # in columns
+            position = (crossing - x_min) / step_x - 0.5  # fractional column of the crossing
             # The edge is to the right of these pixels: it changes them between outside and inside.
             for col in range(math.ceil(min(max(position, 0.0), inside.shape[1]))):
                 inside[row, col] ^= 1

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 BLOCK_VALUES = 1 << 22  # number of distances in memory at a time
-GPU_BLOCK_VALUES = 1 << 25  # with fewer, launches take longer than arithmetic
+GPU_BLOCK_VALUES = 1 << 25  # on a GPU; with fewer, launches take longer than the arithmetic
 DISTANCE_EPS = 1e-6  # smallest distance of a pixel from an edge, in pixels
 # Added to the squared length of an edge, which may be a point, as in Zhang et al.'s released code.
 LENGTH_EPS = 1e-5

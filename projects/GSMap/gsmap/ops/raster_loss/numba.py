@@ -273,7 +273,8 @@ def _row_gradient(pred, target, maps, weight, factors, grad):
     for k in range(len(grad)):
         p = pred[k]
         t = target[k]
-        slope = factors[0] * np.sign(p - t) + factors[1]  # of the sums of w |p - t| and w p
+        # Derivative of the sums of w |p - t| and w p, without the factor w.
+        slope = factors[0] * np.sign(p - t) + factors[1]
         # Chain rule: `maps` contains the gradients with respect to p, p^2 and p t.
         ssim = maps[3 * k] + TWO * p * maps[3 * k + 1] + t * maps[3 * k + 2]
         grad[k] = (ONE + (weight - ONE) * t) * slope - factors[2] * ssim

@@ -34,7 +34,8 @@ def pairwise_soft_iou(preds: Tensor, targets: Tensor, backend: str = "auto") -> 
         ValueError: If the shapes disagree, or if ``backend`` is unknown or does not support the
             inputs.
     """
-    if preds.ndim != 3 or targets.ndim != 3 or preds.shape[1:] != targets.shape[1:]:
+    are_masks = preds.ndim == 3 and targets.ndim == 3
+    if not are_masks or preds.shape[1:] != targets.shape[1:]:
         raise InputError(
             "preds and targets must have shapes (N, H, W) and (K, H, W), "
             f"got {tuple(preds.shape)} and {tuple(targets.shape)}."
