@@ -1,4 +1,7 @@
-"""Mapping between the state keys of the released BeMapNet and of this project."""
+"""Mapping between the state keys of the released BeMapNet and of this project.
+
+The texts in `rules_of` are pairs ``released=here`` of the rest of the keys, or one name for both.
+"""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,7 @@
-"""State keys of the released GeMap and their names here."""
+"""State keys of the released GeMap and their names here.
+
+The texts in `rules_of` are pairs ``released=here`` of the rest of the keys, or one name for both.
+"""
 
 import torch
 

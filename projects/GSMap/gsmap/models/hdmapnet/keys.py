@@ -1,4 +1,8 @@
-"""Mapping between the state keys of the released HDMapNet and of this project."""
+"""Mapping between the state keys of the released HDMapNet and of this project.
+
+The texts in `rules_of` are pairs ``released=here`` of the rest of the keys, or one name for both.
+`zeros` lists keys of the release that have no effect there, and no counterpart here.
+"""
 
 from gsmap.checkpoints.efficientnet_keys import (
     efficientnet_rules,
@@ -19,7 +23,6 @@ HDMAPNET = KeyMap(
         *efficientnet_rules(_TRUNK, "img_backbone."),
         ("camencode.up1.conv.", "img_neck.joined."),
         (f"{_VIEWS}{{i}}.", "bev_encoder.views.{i}."),
-        # Pairs "released=ours" of the rest of the keys after both prefixes.
         *rules_of(
             _BEV,
             _OURS,

@@ -1,4 +1,7 @@
-"""State keys of the HRMapNet release (on MapTRv2) and their names here."""
+"""State keys of the released HRMapNet, which is based on MapTRv2, and their names here.
+
+The texts in `rules_of` are pairs ``released=here`` of the rest of the keys, or one name for both.
+"""
 
 from gsmap.checkpoints.key_rules import KeyMap, rules_of
 from gsmap.models.maptr.keys import HEAD, TRANSFORMER
@@ -31,7 +34,7 @@ HRMAPNET = KeyMap(
             "attentions.1.deformable_attention.=cross_attn. ffns.0.=ffn. norms.",
         ),
     ),
-    _UNUSED,
+    unused=_UNUSED,
     markers=(LIFTED_MARKER, _LABELS),
 )
 

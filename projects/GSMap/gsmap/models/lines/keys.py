@@ -1,4 +1,7 @@
-"""State keys that the released BeMapNet and PivotNet have in common, and their names here."""
+"""State keys that the released BeMapNet and PivotNet have in common, and their names here.
+
+The texts in `rules_of` are pairs ``released=here`` of the rest of the keys, or one name for both.
+"""
 
 import torch
 

@@ -1,4 +1,7 @@
-"""State keys of the released MapTR and their names here, with rules that other models use."""
+"""State keys of the released MapTR and their names here, with rules that other models use.
+
+The texts in `rules_of` are pairs ``released=here`` of the rest of the keys, or one name for both.
+"""
 
 import torch
 
@@ -13,8 +16,6 @@ DECODER_LAYER = "pts_bbox_head.transformer.decoder.layers.{i}."
 OUR_ENCODER_LAYER = "bev_encoder.layers.{i}."
 LAYER = "map_head.decoder.layers.{i}."
 
-# A rule is a pair of key prefixes (released, here). The texts contain pairs ``released=here`` of
-# the rest of the prefixes, or one name for both.
 COMMON_RULES = (
     *rules_of("", "", "img_backbone. img_neck."),
     *rules_of(HEAD, "map_head.", "instance_embedding. pts_embedding. cls_branches."),

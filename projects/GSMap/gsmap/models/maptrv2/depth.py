@@ -37,6 +37,7 @@ def depth_bins(depth_m: Tensor, stride: int, depth_range: tuple[float, float, fl
     # Position in bins, counted from one bin before the first: bin i is from i + 1 to i + 2.
     position = (nearest - (low - step)) / step
     valid = (position >= 1) & (position < num_depth_bins(depth_range) + 1)
+    # The index of the bin is the whole part less 1, which is -1 for a position of 0.
     return torch.where(valid, position, 0).long() - 1
 
 

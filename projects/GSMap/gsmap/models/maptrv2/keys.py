@@ -1,4 +1,8 @@
-"""State keys of the released MapTRv2 and their names here."""
+"""State keys of the released MapTRv2 and their names here.
+
+The texts in `rules_of` are pairs ``released=here`` of the rest of the keys, or one name for both.
+`zeros` lists keys of the release that have no effect there, and no counterpart here.
+"""
 
 import torch
 from torch import Tensor

@@ -1,4 +1,7 @@
-"""Mapping between the state keys of the released MGMap and of this project."""
+"""Mapping between the state keys of the released MGMap and of this project.
+
+The texts in `rules_of` are pairs ``released=here`` of the rest of the keys, or one name for both.
+"""
 
 from gsmap.checkpoints.key_rules import KeyMap, Rules, rules_of
 from gsmap.models.maptr.keys import CODE_WEIGHTS, GRID_OFFSETS, HEAD, MAPTR, TRANSFORMER

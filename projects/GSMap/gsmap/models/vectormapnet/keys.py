@@ -1,4 +1,8 @@
-"""Mapping between the state keys of the released VectorMapNet and of this project."""
+"""Mapping between the state keys of the released VectorMapNet and of this project.
+
+The texts in `rules_of` are pairs ``released=here`` of the rest of the keys, or one name for both.
+`zeros` lists keys of the release that have no effect there, and no counterpart here.
+"""
 
 import torch
 

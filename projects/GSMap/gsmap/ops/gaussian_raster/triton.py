@@ -5,10 +5,12 @@ r"""Triton kernels: masks of 2D Gaussians, one program per tile of an instance.
 The raster of an instance is cut into tiles of TILE x TILE pixels. A program keeps the pixels of one
 tile in registers and loops over the P Gaussians of the instance. Outside of the bounding box of a
 Gaussian, its density is below ``CUT`` of the reference. If the box misses the tile, a scalar branch
-skips the Gaussian. A NaN Gaussian is never skipped, so the mask becomes NaN. With c and s for the
-cosine and sine of its rotation, a Gaussian has u = (c dx + s dy) / sigma_u,
-v = (c dy - s dx) / sigma_v and G = exp(-(u^2 + v^2) / 2). The mask is accumulated as
-R <- R + G (1 - R), which is 1 - prod (1 - G) and exact for small G.
+skips the Gaussian. A NaN Gaussian is never skipped, so the mask becomes NaN.
+
+A pixel at the offset (dx, dy) from the mean has the coordinates u = (c dx + s dy) / sigma_u and
+v = (c dy - s dx) / sigma_v along the axes of the Gaussian, with the cosine c and the sine s of its
+rotation, and the density G = exp(-(u^2 + v^2) / 2). The mask is accumulated as R <- R + G (1 - R),
+which is 1 - prod (1 - G) and exact for small G.
 
 The backward pass computes the transmittance T = prod (1 - G) of the tile again and reads dL/dR
 once. As dR/dG = T / (1 - G), it sums w u, w v, w u^2, w u v and w v^2 for each Gaussian that meets
