@@ -49,7 +49,7 @@ class FlowHead(BuiltHead, Protocol):
             layers: Predictions of the queries, after each layer.
             truths: Ground truth of the batch.
             matches: Matched pairs of each sample: indices of the queries, increasing, and indices
-                of the ground truths, on the CPU. 2 x (m,)
+                of the ground truths, on the CPU. (m,) each
         """
         ...
 

@@ -106,7 +106,7 @@ class MapAssigner:
             predictions: Predictions of L layers, N queries each.
             truths: Ground truth.
             pairs: Matched pairs of each sample: indices of the queries, increasing, and indices of
-                the ground truths, on the CPU. 2 x (m,)
+                the ground truths, on the CPU. (m,) each
         """
         num_layers = len(predictions.layers)
         layer_pairs = []
@@ -128,7 +128,7 @@ class MapAssigner:
             predictions: Predictions of L layers, N queries each.
             truths: Ground truth.
             pairs: Matched pairs of each sample: indices of the queries and of the ground truths, on
-                the CPU. 2 x (L, m)
+                the CPU. (L, m) each
             labels: Class indices of all ground truths, on the CPU. (T,)
 
         Returns:
@@ -308,5 +308,5 @@ class PointsCost(MapCost):
     """Base class of matching costs of points. Its distance chooses the order of matched points."""
 
     def between_points(self, pts: Tensor, targets: Tensor) -> Tensor:
-        """Distance of each coordinate. 2 x (..., P, 2 or 3) -> (..., P, 2 or 3)"""
+        """Distance of each coordinate. Two (..., P, 2 or 3) -> (..., P, 2 or 3)"""
         return (pts - targets).abs()

@@ -44,6 +44,7 @@ class GridMask(nn.Module):
         period = int(torch.randint(2, height, ()))
         side = min(max(round(period * self.ratio), 1), period - 1)
         row, col = torch.randint(period, (2,)).tolist()
-        in_row = (torch.arange(height) + row) % period < side
-        in_col = (torch.arange(width) + col) % period < side
-        return (in_row[:, None] | in_col).float()  # 0 where neither stripe is visible
+        row_is_visible = (torch.arange(height) + row) % period < side
+        column_is_visible = (torch.arange(width) + col) % period < side
+        # Only pixels outside of the visible rows and of the visible columns are in black squares.
+        return (row_is_visible[:, None] | column_is_visible).float()

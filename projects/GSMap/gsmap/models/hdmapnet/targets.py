@@ -98,7 +98,7 @@ class MakeLineMaps(BaseTransform):
             cv2.polylines(gap, pts=[line], isClosed=False, color=(1,), thickness=self.gap_px)
             numbers[:label, gap > 0] = 0
             directions[:, :label, gap > 0] = 0
-        # Erasing has left at most one class with a direction at each pixel.
+        # With gap_px >= thickness_px, erasing has left at most one class at each pixel.
         return numbers, directions.max(axis=1)
 
     def draw_directions(self, raster: NDArray[np.int16], points: Pixels) -> None:
