@@ -20,8 +20,8 @@ from gsmap.ops.deformable_sampling import (
 from gsmap.structures.tensors import at_least_float32, constant
 from gsmap.utils.errors import InputError
 
-_IM2COL_STEP = 64
-_CORNERS = 4
+_IM2COL_STEP = 64  # number of samples that mmcv's compiled op processes at a time
+_CORNERS = 4  # cells around a sampling location, which bilinear sampling reads
 
 
 def has_compiled_op(value: Tensor) -> bool:

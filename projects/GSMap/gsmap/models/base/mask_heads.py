@@ -169,5 +169,6 @@ def class_mask_losses(
     targets = targets.float()
     weight = constant(logits, pos_weight, torch.float)
     cross_entropy = F.binary_cross_entropy_with_logits(logits, targets, pos_weight=weight)
+    # All classes of a sample count as one mask, (B, classes * H, W).
     dice = dice_loss(logits.sigmoid().flatten(1, 2), targets.flatten(1, 2))
     return cross_entropy, dice.mean()

@@ -35,7 +35,7 @@ class MapAssigner:
 
     Args:
         match_costs: Configs of the costs. A cost is called for each sample with the predictions of
-            all layers, the ground truth and the meta dict, and returns a matrix. (N, K)
+            all L layers, the ground truth and the meta dict, and returns a matrix. (L * N, K)
 
     Raises:
         ValueError: If there is no cost.
@@ -207,6 +207,8 @@ class MapAssigner:
 
     def _class_costs(self, predictions: Predictions) -> list[Tensor | None]:
         """Costs of every class, None for costs that depend on more. (B, L * N, classes) each"""
+        # The costs of mmdet read the scores of predictions and the labels of ground truths. Here
+        # the predictions are of all samples, and every class takes the place of a ground truth.
         scores = predictions.scores
         all_scores = SimpleNamespace(scores=scores.flatten(0, 1))
         all_classes = SimpleNamespace(labels=torch.arange(scores.shape[2], device=scores.device))

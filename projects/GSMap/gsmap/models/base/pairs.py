@@ -34,7 +34,7 @@ class Predictions:
         decoded: Output of the decoder layer, with states and references.
         bev_feats: BEV features. (B, C, H, W)
         reference: Decodes ``decoded.references`` to points, metres and masks.
-        masks: Settings and rasters of masks, of losses and of matching costs.
+        masks: Settings and rasters of the masks in losses and in matching costs.
 
     Attributes:
         references: References of points or Gaussians. (B, N, P, D)

@@ -125,6 +125,7 @@ class BezierLosses(LineLosses):
         all_points = points.flatten(0, 1)
         values = point_sample(truth.masks[None], all_points[None])[0]  # (K, n * 2500)
         values = values.unflatten(1, (num_lines, points.shape[1]))  # (K, n, 2500)
+        # The difference of (n, 1, P, 2) and (K, P, 2) is (n, K).
         controls_cost = self.controls * _mean_difference(lines.controls[:, None], truth.controls)
         piece_probs = lines.piece_logits.softmax(dim=-1)  # (n, k)
         pieces_cost = -self.pieces * piece_probs[:, truth.pieces]
@@ -162,7 +163,7 @@ class BezierLosses(LineLosses):
         lines: BezierLines = _concatenate(sample_lines)
         truth: TrueCurves = _concatenate(sample_truths)
         points = neighbourhood(lines.curves, truth.masks.shape[-2:])
-        values = lines.curves[..., 0]
+        values = lines.curves[..., 0]  # an empty tensor if there is no match
         if len(values):
             values = point_sample(truth.masks[:, None], points)[:, 0]
         controls = lines.controls * lines.control_mask[..., None]

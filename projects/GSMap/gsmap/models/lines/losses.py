@@ -70,6 +70,7 @@ class LineLosses:
         Returns:
             Distance of each pair. (M,)
         """
+        # Of the distances of all pairs (M, M), the matched pairs are on the diagonal.
         return mask_distances(masks, truths).diagonal()
 
     @torch.no_grad()
@@ -149,7 +150,7 @@ class LineLosses:
             case_labels = torch.full_like(case.lines.logits[:, 0], 1 - LINE).long()
             case_labels[matched_rows] = LINE
             labels.append(case_labels)
-        weights = constant(logits, [1.0, self.none_weight])
+        weights = constant(logits, [1.0, self.none_weight])  # of a line and of no line
         return self.cls * F.cross_entropy(logits, torch.cat(labels), weight=weights)
 
 

@@ -49,7 +49,7 @@ class DecoupledSelfAttention(nn.Module):
         query = query.unflatten(0, (batch, -1)).transpose(1, 2).flatten(0, 1)  # (B * N, P, C)
         point_pos = query_pos.flatten(0, 1)
         query = self._attend(self.point_attn, query, pos=point_pos, mask=None)
-        return query.unflatten(0, (batch, -1)).flatten(1, 2)
+        return query.unflatten(0, (batch, -1)).flatten(1, 2)  # (B, N * P, C)
 
     def _attend(
         self, attention: nn.MultiheadAttention, query: Tensor, pos: Tensor, mask: Tensor | None

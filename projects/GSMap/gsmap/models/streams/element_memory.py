@@ -15,7 +15,7 @@ from gsmap.structures.line_update import update_from_known_lines
 from gsmap.structures.past import Past
 from gsmap.utils.errors import InputError
 
-PREFIX = "element_"
+PREFIX = "element_"  # of the names of the elements' tensors in the memory of a stream
 
 
 @MODELS.register_module()
