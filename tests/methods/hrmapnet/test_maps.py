@@ -112,7 +112,7 @@ def test_a_frame_elsewhere_is_refused():
         maps.read(None)
     with pytest.raises(ValueError, match="two priors are of 'town'"):
         GivenMaps([MapPrior(TOWN), MapPrior(TOWN)], CLASSES, grid=WINDOW)
-    with pytest.raises(ValueError, match="give at least one prior"):
+    with pytest.raises(ValueError, match="the list of priors is empty"):
         GivenMaps([], CLASSES, grid=WINDOW)
 
 
