@@ -1,4 +1,4 @@
-"""Map priors of the places of a run."""
+"""Map priors by place: maps that earlier drives have predicted."""
 
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
@@ -19,7 +19,7 @@ from gsmap.structures.grid import BEVGrid
 from gsmap.structures.rigid import is_rigid
 from gsmap.utils.errors import InputError
 
-_MOST_SCENES = 16  # maps of single scenes in memory
+_MOST_SCENES = 16  # with one map for each scene, the largest number of maps that are kept
 
 
 class Place(NamedTuple):
@@ -65,10 +65,11 @@ class PlaceMaps:
 
     Args:
         classes: Names of the classes.
-        grid: Extent and cells of the windows that are read and written.
-        rule: Rule of writing of the maps; that of `MapPrior` by default.
-        memory: ``"kept"``: one map for all frames of a place. ``"scene"``: one map for each scene.
-            ``"none"``: nothing is written.
+        grid: Extent and cells of the window of a frame, the part of a map that is read and written.
+        rule: Rule by which the raster of a frame changes a map; by default the rule of `MapPrior`.
+        memory: ``"kept"``: one map for all frames in a town (`Place.name`), or for each scene if
+            the town is unknown. ``"scene"``: one map for each scene. ``"none"``: nothing is
+            written.
 
     Attributes:
         memories: Valid values of ``memory``.
@@ -133,9 +134,12 @@ class PlaceMaps:
         Returns:
             Values in [0, 1] on the host, 0 where nothing is known. (classes, H, W)
         """
-        prior = None if place is None or self.memory == "none" else self.find(place)
-        if place is None or prior is None:
-            return torch.zeros(len(self.classes), self.grid.height, self.grid.width)
+        unknown = torch.zeros(len(self.classes), self.grid.height, self.grid.width)
+        if place is None or self.memory == "none":
+            return unknown
+        prior = self.find(place)
+        if prior is None:
+            return unknown
         return prior.read(place.pose, self.grid)
 
     def write(self, place: Place | None, raster: Tensor) -> None:
@@ -157,7 +161,7 @@ class GivenMaps(PlaceMaps):
     Args:
         priors: The priors.
         classes: Names of the classes.
-        grid: Extent and cells of the windows that are read and written.
+        grid: Extent and cells of the window of a frame, the part of a map that is read and written.
         update: Write each frame after it is predicted.
 
     Raises:
@@ -173,8 +177,8 @@ class GivenMaps(PlaceMaps):
         update: bool = False,
     ) -> None:
         if not priors:
-            raise InputError("give at least one prior, or none at all.")
-        super().__init__(classes, grid)  # no map is created
+            raise InputError("the list of priors is empty: give a prior, or None instead.")
+        super().__init__(classes, grid)  # no rule: this class creates no maps
         self.writes = update
         for prior in priors:
             name = prior.settings.place
@@ -186,7 +190,7 @@ class GivenMaps(PlaceMaps):
                         f"the prior of {name!r} has Gaussians, which a model reads only: leave the "
                         "update out; tools/build_map.py --prior --gaussians makes it anew."
                     )
-                # it has no cells: it is drawn in those of a window
+                # Gaussians have no cells: they are drawn on the cells of a window.
                 found = replace(found, cell_m=expected.cell_m, tile_m=expected.tile_m)
             expected.require_equal(found, f"the prior of {name!r}")
             if name in self._priors:
@@ -198,7 +202,7 @@ class GivenMaps(PlaceMaps):
         return self
 
     def find(self, place: Place) -> AnyPrior:
-        """Map at a place. A frame without the name of a place is taken to be at the only one.
+        """Map at a place. If there is a single map, frames without the name of a place get it.
 
         Raises:
             ValueError: If there is no map of the place.
