@@ -101,9 +101,9 @@ def test_query_groups_do_not_see_each_other():
 
 
 def test_bad_settings_are_refused_when_the_head_is_built():
-    with pytest.raises(ValueError, match="got 3 and 2 layers"):
+    with pytest.raises(ValueError, match="there are 3 stages and 2 layers"):
         mgmap(decoder={"refinements": 3})
-    with pytest.raises(ValueError, match="got -1 and 2 layers"):
+    with pytest.raises(ValueError, match="there are -1 stages and 2 layers"):
         mgmap(decoder={"refinements": -1}, losses=HEAD["losses"])
     with pytest.raises(ValueError, match="num_masks is 3, and there are 4 queries: set both"):
         mgmap(decoder={"num_masks": 3})

@@ -132,7 +132,7 @@ def test_settings_that_do_not_fit_are_refused(settings, message):
 def test_targets_that_do_not_fit_are_refused():
     plain = Det3DDataSample(metainfo={"token": "token-7"})
     plain.gt_instances_3d = InstanceData(labels_3d=torch.zeros(0), pts=torch.zeros(0, 20, 2))
-    with pytest.raises(ValueError, match="'token-7' has no pivots: put FormatPivotTargets"):
+    with pytest.raises(ValueError, match="'token-7' has no pivots: replace FormatMapTargets"):
         losses(head(), plain)
     with pytest.raises(ValueError, match="set pixel_m there to the head's mask_pixel_m"):
         losses(head(), sample([0, -5, 0, 5], size=(8, 4)))

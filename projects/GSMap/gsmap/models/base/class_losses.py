@@ -74,8 +74,8 @@ class QualityClassLoss(ClassLoss):
         first_layer: Config of the loss of the first layer, on logits and one-hot targets.
         beta: Exponent of the distance between score and target.
         loss_weight: Weight of the loss.
-        classes: Indices of the classes with the quality as target; targets of other classes are 1.
-            None means all classes.
+        classes: Indices of the classes with the quality as target. Matched ground truths of other
+            classes have the target 1. None means all classes.
 
     Raises:
         ValueError: If the head lacks a class or an input of the quality.
@@ -109,7 +109,7 @@ class QualityClassLoss(ClassLoss):
         """
         scores = pairs.predictions.scores
         targets = self.targets(pairs)
-        num_queries = scores.shape[1] // pairs.num_layers
+        num_queries = scores.shape[1] // pairs.num_layers  # in a layer; the first layer comes first
         first_labels = pairs.query_labels()[:, :num_queries]
         first_losses = plain_class_loss(
             self.first_layer, scores=scores[:, :num_queries], labels=first_labels

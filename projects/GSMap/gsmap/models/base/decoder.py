@@ -97,7 +97,7 @@ class JoinedDecoded(Decoded):
     def __getattr__(self, name: str) -> Tensor:
         """Field of all layers. (B, L * N, ...)"""
         values = torch.cat([getattr(layer, name) for layer in self._layers], dim=1)
-        setattr(self, name, values)
+        setattr(self, name, values)  # this method is not called for existing attributes
         return values
 
 

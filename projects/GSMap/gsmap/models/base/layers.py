@@ -95,6 +95,7 @@ def resize_map(feats: Tensor, shape: Sequence[int]) -> Tensor:
     return F.interpolate(feats, size=tuple(shape), mode="bilinear", align_corners=True)
 
 
+# Ends of the names of matrices that `init_matrices` leaves as they are.
 _SAMPLING = ("sampling_offsets.weight", "attention_weights.weight", "height_offsets.weight")
 
 

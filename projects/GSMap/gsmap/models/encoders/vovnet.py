@@ -43,7 +43,7 @@ def _convolution(
 
 
 class OneShotAggregation(nn.Module):
-    """Chain of 3x3 convolutions, whose outputs a 1x1 convolution aggregates once, at the end.
+    """Chain of 3x3 convolutions. At the end, a 1x1 convolution joins the input and all outputs.
 
     A gate weights the channels of the result (effective squeeze and excitation, eSE).
 
