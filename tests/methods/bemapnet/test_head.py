@@ -164,7 +164,7 @@ def test_settings_that_do_not_fit_are_refused(settings, message):
 def test_targets_that_do_not_fit_are_refused():
     plain = Det3DDataSample(metainfo={"token": "token-7"})
     plain.gt_instances_3d = InstanceData(labels_3d=torch.zeros(0), pts=torch.zeros(0, 20, 2))
-    with pytest.raises(ValueError, match="'token-7' has no control points: put FormatBezier"):
+    with pytest.raises(ValueError, match="'token-7' has no control points: replace FormatMap"):
         losses(head(), plain)
     with pytest.raises(ValueError, match="set degrees and pieces of FormatBezierTargets"):
         losses(head(), sample(LINES[0], degrees=(3, 1)))
