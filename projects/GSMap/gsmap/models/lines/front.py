@@ -1,4 +1,4 @@
-"""Rasters in the order of BeMapNet and PivotNet: rows from the front, columns from the left."""
+"""Rasters in the order of line heads (`LineHead`): rows from the front, columns from the left."""
 
 from collections.abc import Sequence
 

@@ -10,7 +10,7 @@ from gsmap.structures.tensors import at_least_float32
 from gsmap.utils.errors import InputError
 
 # A line is rendered as a thin closed polygon, along the line and back. The way back is shifted by
-# this distance along x and y, as in the code of Zhang et al. (MapVR).
+# this distance along x and y, as in the code of Zhang et al.
 LANE_GAP_PX = 0.01
 DISTANCES = ("squared", "plain")
 _draw = fused_operator(
