@@ -53,8 +53,8 @@ class GeometryKernelAttention(nn.Module):
     """
 
     offsets: Tensor
-    # Whether tensor sizes are independent of the values, as CUDA graphs need: pairs of a cell and a
-    # camera in which it is invisible are then computed too, with weight 0.
+    # Whether no size of a tensor depends on values, as CUDA graphs need. Then all pairs of a cell
+    # and a camera are computed, with weight 0 where the cell is not visible to the camera.
     fixed_sizes = False
 
     def __init__(

@@ -129,7 +129,7 @@ def _are_neighbours(points: Points, i: int, j: int, eps2: float) -> bool:
 
 @njit(cache=True)
 def _follow_jumps(jumps: Indices, start: int) -> int:
-    """Return the end of the jumps from a point, and shorten these jumps."""
+    """Return the end of the jumps from a point, and let all of them lead to the end directly."""
     end = start
     while jumps[end] != end:
         end = jumps[end]

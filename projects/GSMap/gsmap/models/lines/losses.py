@@ -77,7 +77,8 @@ class LineLosses:
     def match(self, cases: Sequence[Case]) -> list[Any]:
         """Match the lines of all cases.
 
-        The costs of all cases are copied from the device at once, and so are the pairs to it.
+        The costs of all cases are copied from the device at once, as one vector. The matched pairs
+        of all cases are copied to the device at once, too.
 
         Args:
             cases: Lines of one class in one sample each.

@@ -107,6 +107,7 @@ class MGMapDecoder(MapDecoder):
         self.activation = nn.Linear(embed_dims, embed_dims)
         self.segmentation = mask_network(embed_dims, 2, activation=nn.LeakyReLU(0.01))
         self.mask_feature = MaskFeature(embed_dims)
+        # Each stage appends C channels to the states, which the next stage reads.
         self.refinements = ModuleList()
         for number in range(refinements):
             stage = PatchRefinement(

@@ -23,10 +23,10 @@ _POSE = 12  # entries of the first three rows of a transform
 class QueryMemory(BaseModule, AddsWeights):
     """Propagation of the best queries of a frame to the next, for any head (Yuan et al. 2024).
 
-    A small network conditions the states of the queries on the ego motion, and their references are
-    transformed. After the first decoder layer of the next frame they replace its weakest queries.
-    A training loss compares their refined references with the transformed targets of the previous
-    frame.
+    A small network conditions the states of the queries on the ego motion, and the references of
+    the queries are transformed. In the next frame, the propagated queries replace the weakest
+    queries after the first decoder layer. A training loss compares their refined references with
+    the transformed targets of the previous frame.
 
     Args:
         embed_dims: Channels C of the queries.
@@ -52,7 +52,7 @@ class QueryMemory(BaseModule, AddsWeights):
         )
 
     def init_weights(self) -> None:
-        """Initialise the network so that it hardly changes a state."""
+        """Initialise the network so that it hardly changes a state: matrices are 0, biases stay."""
         super().init_weights()
         for layer in self.fc:
             if isinstance(layer, nn.Linear):
@@ -245,6 +245,7 @@ class Propagation(FlowHook):
         leaves, form = tree_flatten(queries.state)
         states = []
         for leaf in leaves:
+            # Leaves with another number of channels are no states, such as sampling locations.
             if isinstance(leaf, Tensor) and leaf.shape[-1] == head.embed_dims:
                 leaf = self.memory.update(leaf, self.past.now_from_then)
             states.append(leaf)
@@ -294,6 +295,7 @@ class Propagation(FlowHook):
         if self.propagated is None or previous is None:
             parameters = [parameter.sum() for parameter in self.memory.parameters()]
             return 0.0 * torch.stack(parameters).sum()
+        # The references of the propagated queries, refined by the branch of the first layer.
         state = _flatten_instances(self.propagated.state)
         pred = head.reference.refine(
             0,

@@ -294,6 +294,7 @@ class PolylineGenerator(BaseModule):
             return tokens
         active = torch.arange(len(tokens), device=tokens.device)  # rows of unfinished lines
         caches: list[Cache | None] = [None] * len(self.layers)
+        # Probabilities of all tokens so far with `redraw`, otherwise of the last token alone.
         all_probs = condition.new_zeros(len(tokens), 0, self.canvas.num_tokens)
         states = condition  # new inputs of a step: the condition, then the previous token
         for step in range(num_steps):
