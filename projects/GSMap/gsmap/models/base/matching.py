@@ -199,7 +199,7 @@ class MapAssigner:
         for count, meta in zip(truths.counts, metas, strict=True):
             if not count:
                 check_finite(next(host_blocks)[None], ["class scores"], img_meta=meta)
-                samples.append(values.new_zeros(1, num_rows, 0))
+                samples.append(values.new_zeros(1, num_rows, 0))  # costs without ground truths
                 continue
             matrices = [next(host_blocks).view(num_rows, count) for _ in self.match_costs]
             samples.append(torch.stack(matrices))

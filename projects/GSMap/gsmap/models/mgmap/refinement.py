@@ -42,6 +42,7 @@ def crop_patches(feats: Tensor, centres: Tensor) -> Tensor:
     samples = samples.flatten(1, 3)[:, :, None]  # (B, Q * 25, 1, 4, 2)
     inside = ((samples >= -1) & (samples <= size)).all(dim=-1)
     samples_on_map = samples.clamp(min=0.0).minimum(size - 1)
+    # `deformable_sample` has values at the centres of cells, half a cell from integer positions.
     locations = (samples_on_map + 0.5) / size
     values = feats.float().flatten(2).transpose(1, 2)  # (B, H * W, C)
     values = values[:, :, None]  # (B, H * W, 1, C)
