@@ -1,9 +1,11 @@
-"""Launches and waits in a frame and in a training step by part, counted without a GPU.
+"""Numbers of kernel launches and of waits for the GPU, counted without a GPU.
 
-The launch of a kernel takes about 20 microseconds of the host, and the GPU is idle during a wait.
-Their numbers do not depend on the size of images. A step is mmengine's, with optimizer, gradient
-clipping and the collection of figures (losses and statistics) for the log. The backward pass of a
-part counts for this part. See `benchmarks.pretended_gpu`.
+They are counted for the prediction of a frame and for a training step, and separately for each
+part of the program (`PARTS`). A launch takes about 20 microseconds of the host, and the GPU is idle
+during a wait. The numbers do not depend on the size of the images. A training step is mmengine's,
+with optimizer, gradient clipping and the collection of figures (losses and statistics) for the
+log. The backward pass of a part is listed as ``backward:`` and its name. See
+`benchmarks.pretended_gpu`.
 """
 
 import argparse
@@ -37,8 +39,8 @@ PARTS = (
     ("map_head", "loss_by_feat", "losses"),
     ("map_head", "statistics", "statistics"),
     ("map_head", "predict_by_feat", "decoding"),
-    ("temporal", "over", "memory"),
-    ("", "parse_losses", "figures"),
+    ("temporal", "over", "memory"),  # features and queries of previous frames
+    ("", "parse_losses", "figures"),  # losses for the log
 )
 
 
@@ -79,7 +81,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 class Trial:
-    """Model of a config on the pretended GPU, with a batch of random inputs.
+    """Model on the pretended GPU, with a batch of random inputs.
 
     Args:
         config: Config file, or a config.
@@ -96,7 +98,7 @@ class Trial:
         self.model, inputs, self.samples = models.model_and_batch(config, options, batch=batch)
         self.inputs: dict[str, Any] = {}
         if self.model.bev_encoder is not None:
-            # An approximate inverse of the normalization.
+            # Undo the normalization, approximately.
             pixels = (inputs["imgs"] * 50 + 120).clamp(0, 255).to(torch.uint8)
             self.inputs["img"] = list(pixels)
         if self.model.lidar_encoder is not None:
@@ -150,7 +152,7 @@ class Trial:
 
     @contextmanager
     def _count_parts(self) -> Iterator[None]:
-        """Count launches by part: methods of the model and of the optimizer."""
+        """Count the launches inside the methods of `PARTS` and of the optimizer for their parts."""
         gpu = self.gpu
         with ExitStack() as stack:
             for attribute, method, part in PARTS:
@@ -188,6 +190,8 @@ def _run_inside(
         with make_context():
             return original(*args, **kwargs)
 
+    # An attribute of the object comes before the method of its class, until it is deleted again.
+    # `object` sets it, as `torch.nn.Module` has rules for its attributes.
     object.__setattr__(owner, method, call_inside)
     try:
         yield

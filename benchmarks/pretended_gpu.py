@@ -1,11 +1,11 @@
-"""Pretended GPU: tensors that compute on the CPU, with every launch and wait of a GPU counted.
+"""Pretended GPU: tensors compute on the CPU, while the launches and waits of a GPU are counted.
 
 ``with PretendedGPU() as gpu: model.to(DEVICE); ...`` computes real values, so code that depends on
-values runs. Operations that fail on a GPU raise the GPU's error: tensors of two devices in one
-operation, numpy of a tensor on the GPU. Launches are kernels and copies (views and allocations are
-none). Waits are the times at which the host waits for the GPU: to read a value, for a size that
-depends on values, or for an upload from memory that is not pinned. Each wait is counted with the
-line of the project that caused it.
+values runs. Two mistakes that fail on a GPU raise the GPU's error: an operation on tensors of two
+devices, and the conversion of a tensor on the GPU to numpy. A launch is the start of a kernel or
+of a copy; views and allocations need no launch. A wait is a time at which the host waits for the
+GPU: to read a value, for a size that depends on values, or for an upload from memory that is not
+pinned. Each wait is counted with the line of the project that caused it.
 
 The device needs torch's support for backends in Python, which torch calls experimental (see
 `available`). Attention that torch fuses on a GPU is one launch here, and this project's Triton
@@ -46,7 +46,8 @@ DEVICE = f"{NAME}:0"
 ROOT = shipped_path()
 aten = torch.ops.aten
 
-# A `torch._foreach_*` kernel takes so many tensors of each list per launch, with 1, 2, .. 5 lists.
+# Largest number of tensors per list in one launch of a `torch._foreach_*` kernel, for kernels that
+# take 1, 2, 3, 4 and 5 lists of tensors.
 _TENSORS_PER_LAUNCH = (110, 64, 48, 36, 30)
 
 
@@ -114,7 +115,7 @@ class PretendedTensor(Tensor):
         return self.host.data_ptr()
 
     def tolist(self) -> Any:
-        """Values as nested lists; a wait."""
+        """Values as nested lists, for which the host waits."""
         return self.cpu().tolist()
 
     @classmethod
@@ -144,7 +145,8 @@ class PretendedGPU(TorchDispatchMode):
         self.launches: Counter[tuple[str, str]] = Counter()
         self.waits: Counter[tuple[str, str, str]] = Counter()
         self._part = ""
-        self._marks: list[tuple[int, str]] = []  # number of the next node of autograd, part
+        # Starts of parts: number of the first autograd node that belongs to it, and its name.
+        self._marks: list[tuple[int, str]] = []
         self._in_backward = False
         self._undo = contextlib.ExitStack()
 
@@ -154,15 +156,17 @@ class PretendedGPU(TorchDispatchMode):
         installed = {**backends.INSTALLED, "triton": True}
         foreach_types = [*foreach_utils._foreach_supported_types, PretendedTensor]
         changes = (
-            # This mode does not reach the threads in which autograd runs backward by default.
+            # This dispatch mode does not reach the threads in which autograd usually runs backward.
             torch.autograd.set_multithreading_enabled(False),
             # `Module.to` makes new parameters: it cannot put pretended values into the old ones.
             _flag(torch.__future__.set_overwrite_module_params_on_conversion),
-            # torch.tensor(.., device) is an upload.
+            # `torch.tensor(.., device)` makes a tensor on the CPU and then uploads it.
             _flag(torch._C._set_only_lift_cpu_tensors),
             _replace_attribute(F, "scaled_dot_product_attention", _attention),
+            # The project chooses its Triton kernels for tensors on this device.
             _replace_attribute(backends, "DEVICES", devices),
             _replace_attribute(backends, "INSTALLED", installed),
+            # Optimizers and the clipping of gradients use `_foreach` kernels, as on a GPU.
             _replace_attribute(foreach_utils, "_foreach_supported_types", foreach_types),
         )
         for change in changes:
@@ -187,7 +191,10 @@ class PretendedGPU(TorchDispatchMode):
 
     @contextlib.contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """Count the work inside the context for a part; its gradients then count for the part, too.
+        """Count the work inside the context for a part.
+
+        When the gradients of this work are computed later, inside of `backward`, they count for
+        ``backward: NAME``.
 
         Args:
             name: Name of the part.
@@ -200,7 +207,7 @@ class PretendedGPU(TorchDispatchMode):
             self._begin(before)
 
     def _begin(self, part: str) -> None:
-        """Count the following work, and its gradients, for a part."""
+        """Count the work from here on, and later its gradients, for a part."""
         self._part = part
         self._marks.append((torch._C._autograd._get_sequence_nr(), part))
 
@@ -242,7 +249,8 @@ class PretendedGPU(TorchDispatchMode):
         if on_gpu:
             self._check_devices(func, name, args=args, tensors=tensors)
         if func in (aten.lift_fresh.default, aten.lift.default):
-            return args[0]
+            return args[0]  # marks a constant, and computes nothing
+        # Without `output_size`, the length of the result depends on the values.
         repeats_by_values = (
             func is aten.repeat_interleave.Tensor and kwargs.get("output_size") is None
         )
@@ -279,10 +287,11 @@ class PretendedGPU(TorchDispatchMode):
             function = REPLACEMENTS.get(func, func)
             result = function(*host_args, **host_kwargs)
         if func in READS:
-            return result
+            return result  # a number of Python
         result = _to_gpu(result)
         if not on_gpu or is_project_kernel or func in REPLACEMENTS:
             return result
+        # A view shares the storage of its argument, and an operation in place returns its argument.
         return return_and_correct_aliasing(func, args, kwargs=kwargs, out=result)
 
     def _convert(self, source: Tensor, kwargs: dict[str, Any]) -> Tensor:
@@ -360,7 +369,8 @@ class PretendedGPU(TorchDispatchMode):
         node = torch._C._current_autograd_node()
         if node is None or "AccumulateGrad" in node.name():
             return "backward: sums"
-        # The part that was active when the node was made: the last mark up to its number.
+        # Nodes are numbered in the order of the forward pass, so this node was made in the part
+        # with the last mark at or before its number.
         number = node._sequence_nr()
         marks_before = bisect.bisect_right(self._marks, number, key=lambda mark: mark[0])
         part = ""
@@ -404,7 +414,7 @@ def _to_gpu(result: Any) -> Any:
 
 def _line_of_project() -> str:
     """Innermost line outside of torch and of this file, as ``file:line``."""
-    frame: FrameType | None = sys._getframe(2)
+    frame: FrameType | None = sys._getframe(2)  # caller of `_wait`
     while frame is not None:
         name = _short_name(frame.f_code.co_filename)
         if name is not None:
@@ -426,16 +436,16 @@ def _short_name(file: str) -> str | None:
 
 
 def _num_launches(name: str, args: Any) -> int:
-    """Number of kernels of an operation; operations on lists take some tensors per kernel."""
+    """Number of kernels of an operation; on lists, one for each group of so many tensors."""
     if not name.startswith(("_foreach", "_fused_adam", "_fused_sgd")):
         return 1
     num_lists = 0
     for arg in args:
         if isinstance(arg, list | tuple) and len(arg) and isinstance(arg[0], Tensor):
             num_lists += 1
-    most_lists = len(_TENSORS_PER_LAUNCH)
-    per_launch = _TENSORS_PER_LAUNCH[min(max(num_lists, 1), most_lists) - 1]
-    return math.ceil(len(args[0]) / per_launch)
+    counted_lists = min(max(num_lists, 1), len(_TENSORS_PER_LAUNCH))
+    group_size = _TENSORS_PER_LAUNCH[counted_lists - 1]  # the first entry is for one list
+    return math.ceil(len(args[0]) / group_size)
 
 
 @contextlib.contextmanager
@@ -471,7 +481,9 @@ def _attention(
     is_causal: bool = False,
     **kwargs: Any,
 ) -> Tensor:
-    """Compute attention; on the pretended GPU by torch's memory-efficient kernel, for any mask.
+    """Compute attention.
+
+    Tensors on the pretended GPU use torch's memory-efficient kernel, whatever the mask is.
 
     Args:
         query: Queries. (B, heads, N, C)

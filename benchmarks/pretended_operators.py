@@ -1,4 +1,7 @@
-"""Operators on the pretended GPU (`benchmarks.pretended_gpu`): their kinds and CPU counterparts."""
+"""Operators on the pretended GPU: sets by their launches and waits, and counterparts for the CPU.
+
+See `benchmarks.pretended_gpu`.
+"""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -12,7 +15,7 @@ from gsmap.ops.kernel_sampling.reference import sample_kernels_reference
 
 aten = torch.ops.aten
 
-# Operations that are neither kernels nor copies, although their schema declares no view.
+# Operations without a launch. Views have none either, but their schemas declare them.
 FREE = {
     aten.detach.default,
     aten.alias.default,
@@ -30,7 +33,7 @@ FREE = {
     aten.is_same_size.default,
     aten.sym_size.int,
 }
-# Operations whose result or size the host reads from the device.
+# Operations for which the host waits, as it reads their result, or its size, from the GPU.
 WAITS = {
     aten._local_scalar_dense.default,
     aten.is_nonzero.default,
@@ -43,7 +46,9 @@ WAITS = {
     aten.unique_dim.default,
     aten._linalg_check_errors.default,
 }
+# Operations whose result is a number of Python.
 READS = {aten._local_scalar_dense.default, aten.is_nonzero.default, aten.equal.default}
+# Operations whose second argument is a list of indices, which may be on the CPU.
 INDEXING = {
     aten.index.Tensor,
     aten.index_put.default,
@@ -109,6 +114,7 @@ def _efficient_attention_backward(
     scale = options.get("scale") or query.shape[-1] ** -0.5
     weights = _attention_weights(query, key, bias=bias, scale=scale)
     grad_weights = grad @ value.transpose(-1, -2)
+    # Gradient of a softmax w: w * (g - sum(g * w)), then of the scaling.
     grad_logits = weights * (grad_weights - (grad_weights * weights).sum(-1, keepdim=True)) * scale
     grad_query = grad_logits @ key
     grad_key = grad_logits.transpose(-1, -2) @ query
@@ -129,7 +135,8 @@ def _sample_deformably(
 ) -> Tensor:
     """Reference of the operator ``deformable_sample``."""
     result = deformable_sample(value, (height, width), locations, weights, backend="reference")
-    return result.unflatten(2, (weights.shape[2], -1))
+    num_heads = weights.shape[2]
+    return result.unflatten(2, (num_heads, -1))  # the operator's result has an axis of heads
 
 
 def _sample_kernels(
@@ -168,11 +175,12 @@ def run_cpu_kernel(name: str, args: Any) -> Any:
     operator = name.removeprefix("gsmap.")
     reference = _REFERENCES.get(operator.removesuffix("_backward"))
     if reference is None:
+        # An operator NAME_in_warps is a variant for the GPU of the operator NAME.
         kernel = getattr(torch.ops.gsmap, operator.replace("_in_warps", ""))
         return kernel(*inputs, "cpu")
     if not operator.endswith("_backward"):
         return reference(*inputs)
-    upstream, *inputs = inputs
+    upstream, *inputs = inputs  # a backward operator takes the gradient of the result first
 
     def gradients() -> list[Tensor]:
         leaves = [tensor.requires_grad_() for tensor in inputs[:3]]
@@ -180,5 +188,6 @@ def run_cpu_kernel(name: str, args: Any) -> Any:
         grads = torch.autograd.grad(result, leaves, grad_outputs=upstream, materialize_grads=True)
         return list(grads)
 
-    with ThreadPoolExecutor(1) as thread:  # autograd is off below this mode
+    # Autograd is off here, inside of the dispatch mode of `PretendedGPU`; another thread has it.
+    with ThreadPoolExecutor(1) as thread:
         return thread.submit(gradients).result()

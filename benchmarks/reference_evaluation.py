@@ -1,8 +1,9 @@
 """AP_chamfer and AP_raster by the algorithms of the reference evaluators, for comparison.
 
-The algorithms are slow. AP_chamfer resamples lines by one shapely call per point, computes all
-distances again for each threshold, and searches touching strips, which are shapely buffers, in a
-tree. AP_raster draws and dilates a whole canvas for each element, and compares run-length codes.
+The algorithms are slow. AP_chamfer resamples lines by one shapely call per point, and computes all
+distances again for each threshold. It compares two lines only if their strips touch; strips are
+shapely buffers, which a tree finds. AP_raster draws and dilates a whole canvas for each element,
+and compares run-length codes.
 """
 
 from collections.abc import Sequence
@@ -28,7 +29,7 @@ from gsmap.structures.elements import MapElements
 Frame = tuple[MapElements, MapElements]  # predictions, ground truth
 _OPENCV_VERSION = tuple(int(part) for part in cv2.__version__.split(".")[:2])
 FILLS_AS_RELEASED = (4, 8) <= _OPENCV_VERSION <= (4, 10)
-"""Whether the installed OpenCV fills polygons like the versions behind the released figures."""
+"""Whether the installed OpenCV fills the pixels that it filled for the published AP_raster."""
 
 
 def _resample(line: np.ndarray) -> np.ndarray:
@@ -55,7 +56,8 @@ def _chamfer_hits(pred: list[np.ndarray], gt: list[np.ndarray], threshold: float
     Returns:
         Whether each prediction matches a ground truth that no earlier one matches.
     """
-    distances = np.full((len(pred), len(gt)), 100.0)  # metres, beyond each threshold
+    # Lines whose strips do not touch stay at 100 m, farther than each threshold.
+    distances = np.full((len(pred), len(gt)), 100.0)
     strips = [_strip(line) for line in gt]
     tree = shapely.STRtree(strips)
     for i, line in enumerate(pred):
@@ -66,17 +68,19 @@ def _chamfer_hits(pred: list[np.ndarray], gt: list[np.ndarray], threshold: float
                 distances[i, k] = (points.min(axis=0).mean() + points.min(axis=1).mean()) / 2
     matched = set()
     hits = []
-    for i in range(len(pred)):
-        best = int(distances[i].argmin()) if len(gt) else -1
-        hit = best >= 0 and distances[i, best] <= threshold and best not in matched
+    for distances_to_gt in distances:
+        hit = False
+        if len(gt):
+            nearest = int(distances_to_gt.argmin())
+            hit = bool(distances_to_gt[nearest] <= threshold) and nearest not in matched
+            if hit:
+                matched.add(nearest)
         hits.append(hit)
-        if hit:
-            matched.add(best)
     return hits
 
 
 def _rank(elements: MapElements, label: int, minimum: float = 0.0) -> np.ndarray:
-    """Indices of a class's elements of at least a score, in descending order of score. (n,)"""
+    """Indices of the elements of a class that score at least ``minimum``, best first. (n,)"""
     rows = np.flatnonzero((elements.labels == label) & (elements.confidence >= minimum))
     ranked: np.ndarray = rows[np.argsort(-elements.confidence[rows], kind="stable")]
     return ranked
@@ -106,6 +110,7 @@ def chamfer_map(
             preds.append([_resample(pred.polylines[i]) for i in ranked])
             gts.append([_resample(gt.polylines[k]) for k in truths])
             confidences.append(pred.confidence[ranked])
+        # Hits are listed by frame; `order` sorts those of all frames by score.
         order = np.argsort(-np.concatenate(confidences), kind="stable")
         num_gts = sum(map(len, gts))
         for threshold in thresholds:
@@ -126,7 +131,7 @@ def _encode_masks(
         rows: Indices of the elements. (n,)
         polygon: Whether to fill the elements.
         config: Rules.
-        by_opencv: Whether OpenCV fills polygons, instead of `gsmap.evaluation`.
+        by_opencv: Whether OpenCV fills polygons, instead of the rasterizer of `gsmap.evaluation`.
 
     Returns:
         One code per element.
@@ -134,6 +139,7 @@ def _encode_masks(
     width, height = config.size_px
     if polygon and not by_opencv:
         words = rasterize(elements.select(rows), config)
+        # A word has one bit per column, the first column lowest; the last word has unused bits.
         bits = np.unpackbits(words.view(np.uint8), axis=-1, bitorder="little")
         return [run_length.encode(np.asfortranarray(mask)) for mask in bits[..., :width]]
     codes = []
@@ -150,18 +156,27 @@ def _encode_masks(
 
 
 def _raster_hits(ious: np.ndarray, threshold: float) -> list[bool]:
-    """Match predictions, in descending order of score, by their IoU with ground truths (N, K)."""
+    """Match predictions, in descending order of score, with the free ground truth of highest IoU.
+
+    Args:
+        ious: IoU of each prediction with each ground truth. (N, K)
+        threshold: Smallest IoU of a match.
+
+    Returns:
+        Whether each prediction has a match. (N,)
+    """
     matched = set()
     hits = []
     for row in ious:
-        best = threshold
-        match = -1
+        best_iou = threshold
+        match = None
         for k, iou in enumerate(row):
-            if k not in matched and iou >= best:
-                best = iou
+            if k not in matched and iou >= best_iou:
+                best_iou = iou
                 match = k
-        matched.add(match)
-        hits.append(match >= 0)
+        if match is not None:
+            matched.add(match)
+        hits.append(match is not None)
     return hits
 
 
@@ -171,9 +186,9 @@ def raster_map(frames: Sequence[Frame], config: RasterConfig, by_opencv: bool = 
     Args:
         frames: Predictions and ground truth of each sample.
         config: Rules.
-        by_opencv: Whether the installed OpenCV fills polygons, whose versions differ along the
-            outline (``FILLS_AS_RELEASED``); otherwise `gsmap.evaluation` fills them with the pixels
-            of the released figures. OpenCV draws lines in both cases.
+        by_opencv: Whether the installed OpenCV fills polygons. Its versions differ in pixels along
+            the outline (``FILLS_AS_RELEASED``). Otherwise `gsmap.evaluation` fills them, with the
+            pixels of the published AP. OpenCV draws lines in both cases.
 
     Returns:
         Mean over classes and thresholds, in [0, 1]; classes without ground truth are left out.
@@ -194,7 +209,8 @@ def raster_map(frames: Sequence[Frame], config: RasterConfig, by_opencv: bool = 
             gt_codes = _encode_masks(
                 gt, truths, polygon=polygon, config=config, by_opencv=by_opencv
             )
-            frame_ious = run_length.iou(pred_codes, gt_codes, [0] * len(truths))
+            is_crowd = [0] * len(truths)  # no ground truth of COCO's kind "crowd"
+            frame_ious = run_length.iou(pred_codes, gt_codes, is_crowd)
             confidences.append(pred.confidence[rows])
             ious.append(np.asarray(frame_ious).reshape(len(rows), len(truths)))
         order = np.argsort(-np.concatenate(confidences), kind="stable")
@@ -203,4 +219,5 @@ def raster_map(frames: Sequence[Frame], config: RasterConfig, by_opencv: bool = 
             for frame_ious in ious:
                 hits += _raster_hits(frame_ious, threshold)
             aps.append(interpolated_ap(np.array(hits, dtype=bool)[order], num_gts))
-    return float(np.mean([ap for ap in aps if ap >= 0]))
+    aps_with_truth = [ap for ap in aps if ap >= 0]  # a class without ground truth has -1
+    return float(np.mean(aps_with_truth))

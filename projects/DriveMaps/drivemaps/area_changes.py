@@ -22,10 +22,10 @@ from drivemaps.drive import Drive, DriveFrame
 from drivemaps.truth import polygons_of
 from gsmap.structures.elements import BoolArray, FloatArray, MapElements
 
-_MIN_OVERLAP = 0.3  # smallest shared part, of the smaller area, of two areas of one object
-_MIN_SHARE = 0.8  # smallest part in view of the outline of an area that is in view
-_MIN_MOVE_M = 0.75  # smallest shift of the centre of an area that has moved
-_MIN_FRAMES = 3  # smallest number of frames with a detection of an area that has moved
+_MIN_OVERLAP = 0.3  # two areas are one object if they share at least this part of the smaller one
+_MIN_SHARE = 0.8  # an area is in view if at least this part of its outline is
+_MIN_MOVE_M = 0.75  # an area has moved if its centre is shifted by at least this
+_MIN_FRAMES = 3  # smallest number of detections that can show that an area has moved
 _STEP_M = 1.0  # largest distance between successive points of an outline
 
 
@@ -65,7 +65,7 @@ def area_changes(
     new_areas = [_areas_of(one_pass.elements, label) for one_pass in passes]
     detections = _detections(passes, label=label, config=config)
     changes = []
-    for area, known in _scored_areas(old, label):
+    for area, old_score in _scored_areas(old, label):
         outline = _outline(area)
         in_view = _passes_in_view(outline, passes)
         is_seen = _passes_that_have(area, new_areas)
@@ -73,13 +73,14 @@ def area_changes(
         num_missing = int((in_view & ~is_seen).sum())
         views, matches = _views_of(outline, area=area, detections=detections)
         score_sum = sum(matches.scores)
-        if 2 * num_missing > num_in_view:
-            num_without = views - score_sum
+        is_removed = 2 * num_missing > num_in_view  # by more than half of the passes
+        if is_removed:
+            num_without = views - score_sum  # a detection counts by its score
             change = Change(
                 REMOVED,
                 label,
                 line=shapely.get_coordinates(area.exterior),
-                confidence=known * smooth_share(num_without, views),
+                confidence=old_score * smooth_share(num_without, views),
                 passes_in_view=num_in_view,
                 num_passes=num_missing,
             )
@@ -94,7 +95,7 @@ def area_changes(
                 MOVED,
                 label,
                 line=shapely.get_coordinates(new_area.exterior),
-                confidence=known * share * shift.probability(_MIN_MOVE_M),
+                confidence=old_score * share * shift.probability(_MIN_MOVE_M),
                 passes_in_view=num_in_view,
                 num_passes=num_in_view - num_missing,
                 moved_m=shift.mean_m,
@@ -127,7 +128,8 @@ def _added(
                 in_view = _passes_in_view(outline, passes)
                 is_seen = _passes_that_have(area, new_areas)
                 num_seen = int((in_view & is_seen).sum())
-                if 2 * num_seen <= in_view.sum():
+                is_present = 2 * num_seen > in_view.sum()  # in more than half of the passes
+                if not is_present:
                     continue
                 views = float(views_of_passes(outline, passes).sum(axis=0).mean())
                 change = Change(
@@ -139,12 +141,12 @@ def _added(
                     num_passes=num_seen,
                 )
                 changes.append(change)
-                known_areas.append(area)
+                known_areas.append(area)  # so the next passes do not add it again
     return changes
 
 
 def _polygons(rings: list[FloatArray]) -> list[shapely.Polygon]:
-    """Convert rings to valid polygons, the parts of a ring that crosses itself apart."""
+    """Convert rings to valid polygons; a ring that crosses itself becomes several."""
     polygons = []
     for part in shapely.get_parts(np.array(polygons_of(rings), dtype=object)):
         if isinstance(part, shapely.Polygon):
@@ -184,7 +186,7 @@ def _passes_that_have(
 
 
 def _shared_shares(area: shapely.Polygon, others: list[shapely.Polygon]) -> FloatArray:
-    """Shared part of the smaller area with each other area. (n,)"""
+    """Ground that an area shares with each other area, as a part of the smaller one. (n,)"""
     shapes = np.array(others, dtype=object)
     shared_m2 = shapely.area(shapely.intersection(area, shapes))
     smaller_m2 = np.minimum(area.area, shapely.area(shapes))
@@ -195,7 +197,7 @@ def _shared_shares(area: shapely.Polygon, others: list[shapely.Polygon]) -> Floa
 def _largest_overlap(
     area: shapely.Polygon, areas_of_passes: list[list[shapely.Polygon]]
 ) -> shapely.Polygon | None:
-    """Area of the passes with the largest shared part; None if none is the same object."""
+    """Area of the passes that overlaps most with an area; None if all are other objects."""
     best = None
     largest_share = _MIN_OVERLAP
     for areas in areas_of_passes:
@@ -262,7 +264,8 @@ def _views_of(
         detections: Predicted areas of all frames of the passes.
 
     Returns:
-        Number of frames, and the best detection of each frame with one.
+        Number of frames with the whole area in range, and the best detection of each of these
+        frames that has one.
     """
     views = 0
     matches = _Matches()
@@ -285,6 +288,7 @@ def _shift_of(area: shapely.Polygon, matches: _Matches) -> Shift:
     shifts = np.array(matches.centres) - centre  # (F, 2)
     variances = np.array(matches.variances)
     weights = np.array(matches.scores) / variances
-    mean = weights @ shifts / weights.sum()
+    mean = weights @ shifts / weights.sum()  # (2,)
     direction = mean / max(float(np.linalg.norm(mean)), 1e-9)
+    # Distances along the direction of the mean shift.
     return Shift.of_frames(shifts @ direction, variances=variances, weights=weights)

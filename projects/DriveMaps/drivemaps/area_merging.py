@@ -11,8 +11,8 @@ from drivemaps.truth import components, polygons_of
 from gsmap.structures.elements import FloatArray, IntArray
 
 _MAJORITY = 0.5  # share of the votes above which a spot belongs to an area
-_MIN_OVERLAP = 0.3  # smallest shared part, of the smaller area, of two detections of one object
-_SIMPLIFY_M = 0.15  # tolerance of outlines, which alternate between the edges of several frames
+_MIN_OVERLAP = 0.3  # two detections are of one object if they share this part of the smaller one
+_SIMPLIFY_M = 0.15  # tolerance of simplification: outlines follow the edges of several frames
 
 
 def merge_areas(drive: Drive, label: int, config: MergeConfig) -> list[tuple[FloatArray, float]]:
@@ -33,6 +33,7 @@ def merge_areas(drive: Drive, label: int, config: MergeConfig) -> list[tuple[Flo
         Closed ring in metres in the global frame, (n, 2), and mean confidence in [0, 1] of each
         area.
     """
+    # One entry for each detection.
     areas: list[shapely.Geometry] = []
     frames: list[int] = []
     scores: list[float] = []
@@ -68,7 +69,15 @@ def merge_areas(drive: Drive, label: int, config: MergeConfig) -> list[tuple[Flo
 
 
 def _group_by_overlap(areas: np.ndarray, frames: IntArray) -> list[IntArray]:
-    """Group areas (A,) of different frames (A,) that overlap; return the indices of each group."""
+    """Group areas that overlap.
+
+    Args:
+        areas: Detections of all frames. (A,)
+        frames: Index of the frame of each detection; only detections of two frames are joined. (A,)
+
+    Returns:
+        Indices of the detections of each group. each (n,)
+    """
     first, second = shapely.STRtree(areas).query(areas, predicate="intersects")
     differ = frames[first] != frames[second]
     first = first[differ]
@@ -86,7 +95,7 @@ def _vote(
     scores: FloatArray,
     weights: FloatArray,
 ) -> list[tuple[FloatArray, float]]:
-    """Outline the ground that most of the frames with a detection of an object assign to it.
+    """Outline the ground of an object by a vote of the frames that detected it.
 
     Args:
         drive: Frames of the drive.
@@ -105,17 +114,19 @@ def _vote(
     edges = [shapely.boundary(shape) for shape in (*areas, *footprints.values())]
     # The votes are constant between the edges, so one spot per face is enough.
     faces = shapely.get_parts(shapely.polygonize([shapely.union_all(edges)]))
-    spots = shapely.get_coordinates(shapely.point_on_surface(faces))  # (F, 2)
+    spots = shapely.get_coordinates(shapely.point_on_surface(faces))  # (faces, 2)
     x, y = spots.T
-    votes = np.zeros(len(faces))
-    all_votes = np.zeros(len(faces))
+    votes = np.zeros(len(faces))  # of frames whose detections contain the spot
+    all_votes = np.zeros(len(faces))  # of frames that have the spot in range
     support = np.zeros(len(faces))
     for frame_index, rows in rows_of_frame.items():
-        contains = np.array([shapely.contains_xy(areas[row], x, y) for row in rows])  # (rows, F)
+        in_rows = [shapely.contains_xy(areas[row], x, y) for row in rows]
+        contains = np.array(in_rows)  # (rows, faces)
         weight = weights[rows].mean()
         votes += weight * contains.any(axis=0)
         all_votes += weight * shapely.contains_xy(footprints[frame_index], x, y)
         support += (scores[rows][:, None] * contains).max(axis=0)
+    # A detection may reach out of the range of its frame, where `votes` exceeds `all_votes`.
     is_chosen = votes > _MAJORITY * np.maximum(all_votes, votes)
     num_frames = drive.count_frames_in_range(spots)
     confidence = np.minimum(support / np.maximum(num_frames, 1), 1.0)

@@ -1,4 +1,4 @@
-"""Changes of a place between an old map and later drives, and rules of all their kinds."""
+"""Changes of a place since an old map was made, and the rules that all kinds of changes share."""
 
 from dataclasses import dataclass, field
 
@@ -15,11 +15,11 @@ MOVED = "moved"
 KINDS = (REMOVED, ADDED, MOVED)
 """Kinds of changes."""
 MIN_VIEWS = 5
-"""Smallest number of frames of a pass that have a point in range, for the point to be in view."""
-_NEW_GROUND_M = 30.0  # distance from all elements of the old map
-_PRIOR_VIEWS = 2.0  # pseudo-count of frames against a change
-_MAP_SIGMA_M = 0.2  # standard deviation of the error of a map, which all frames share
-_MIN_SIGMAS = 3.0  # smallest shift of a change, in standard errors
+"""A point is in view of a pass if at least this many frames of the pass have it in range."""
+_NEW_GROUND_M = 30.0  # ground farther than this from all elements of the old map is new
+_PRIOR_VIEWS = 2.0  # frames against a change that are assumed before any frame is counted
+_MAP_SIGMA_M = 0.2  # standard deviation of the error of the old map, common to all frames
+_MIN_SIGMAS = 3.0  # a shift is significant from this number of standard errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,14 +42,15 @@ class Change:
     Args:
         kind: ``removed``, ``added`` or ``moved``.
         label: Index of the class.
-        line: Vertices in metres in the global frame, closed for areas: of the old map for
-            ``removed``, otherwise the new position. (n, 2)
+        line: Vertices in metres in the global frame, closed for areas. A removed element has its
+            position in the old map, and others have their new position. (n, 2)
         confidence: Confidence in [0, 1].
-        passes_in_view: Number of passes that have the place in view.
-        num_passes: Number of these passes that do not see a removed element, or see another one.
-        moved_m: Distance in metres by which it moved, across a line or of the centre of an area;
-            None for other kinds.
-        moved_std_m: Standard error of the distance in metres, or None.
+        passes_in_view: Number of passes that have the element in view.
+        num_passes: Number of these passes that agree on the change: they do not see a removed
+            element, or see an added or moved one.
+        moved_m: Distance in metres by which a moved element moved, across a line or between the
+            centres of an area; None for other kinds.
+        moved_std_m: Standard error of this distance in metres; None for other kinds.
     """
 
     kind: str
@@ -68,9 +69,10 @@ class Changes:
 
     Args:
         changes: Changes by class, then by kind.
-        num_on_new_ground: Number of elements of the passes that are far from the old map, by class.
-            They are no changes.
-        num_not_in_view: Number of elements of the old map without a part in view, by class.
+        num_on_new_ground: Number of elements of the passes on ground that the old map does not
+            cover, by class. They are no changes.
+        num_not_in_view: Number of elements of the old map of which no pass has a vertex in view, by
+            class.
     """
 
     changes: list[Change]
@@ -84,8 +86,9 @@ class Shift:
 
     Args:
         mean_m: Mean over the frames, weighted by score over variance, in metres.
-        std_m: Standard error in metres: the larger one of the error by the variances of the
-            frames and of the error by their scatter. Both take frames as independent.
+        std_m: Standard error of the mean in metres. It is the larger one of two estimates, from
+            the variances of the frames and from the scatter of their distances. Both treat frames
+            as independent.
     """
 
     mean_m: float
@@ -104,22 +107,23 @@ class Shift:
         """
         shares = weights / weights.sum()
         mean_m = float(shares @ distances)
+        # Variance of a weighted mean of independent values: sum of share^2 * variance.
         by_variances = float(shares**2 @ variances)
         by_scatter = float(shares**2 @ (distances - mean_m) ** 2)
         return cls(mean_m, std_m=max(by_variances, by_scatter) ** 0.5)
 
     def exceeds(self, smallest_m: float) -> bool:
-        """Whether the shift is larger than a distance and than three standard errors."""
+        """Whether the shift is at least a distance, and at least three standard errors."""
         return abs(self.mean_m) >= max(smallest_m, _MIN_SIGMAS * self.std_m)
 
     def probability(self, smallest_m: float) -> float:
-        """Probability that the shift exceeds a distance, with an error that all frames share."""
+        """Probability that the shift exceeds a distance, by its error and that of the old map."""
         sigma = float(np.hypot(self.std_m, _MAP_SIGMA_M))
         return float(ndtr((abs(self.mean_m) - smallest_m) / sigma))
 
 
 def smooth_share(support: float, views: float) -> float:
-    """Share of the frames that support a change, with two frames against it as a prior."""
+    """Share of the frames that support a change, as if two more frames were against it."""
     return float(np.clip(support / (views + _PRIOR_VIEWS), 0, 1))
 
 
@@ -152,7 +156,8 @@ def near_lines(points: FloatArray, lines: list[FloatArray], within_m: float) -> 
     if shapes and len(points):
         tree = shapely.STRtree(shapes)
         pairs = tree.query(shapely.points(points), predicate="dwithin", distance=within_m)
-        is_near[pairs[0]] = True
+        point_indices, _ = pairs
+        is_near[point_indices] = True
     return is_near
 
 

@@ -1,8 +1,9 @@
-"""Changes of a place between an old map and later drives, and their file.
+"""Search for the changes of a place since an old map was made, and their GeoJSON file.
 
-Each drive is a pass. A point is in view of a pass if at least five frames have it in range, and an
-element of the old map is seen if the map of the pass has an element of its class there. A change
-needs more than half of the passes that have it in view.
+The place is compared with later drives, which are called passes. A point is in view of a pass if
+at least five frames of the drive have it in range. A pass sees an element of the old map if the map
+of its drive has an element of this class there. A change is reported if more than half of the
+passes that have it in view agree on it.
 """
 
 from collections import Counter
@@ -33,7 +34,9 @@ from gsmap.structures.elements import MAX_TOTAL_LENGTH_M, MapElements
 from gsmap.structures.polylines import arc_lengths
 from gsmap.utils.errors import InputError
 
-_MARGIN_M = 60.0  # around the range of the frames, for elements that show the known ground
+# Elements of the old map this far outside of the range of the frames still show which ground the
+# old map covers.
+_MARGIN_M = 60.0
 
 
 def find_changes(
@@ -41,16 +44,19 @@ def find_changes(
 ) -> Changes:
     """Find the elements of a place that were removed, added or moved.
 
-    * Removed: a part of at least 8 m of an old line, a whole line, or an old area, that most passes
-      in view do not see.
-    * Added: such a part of a line, or an area, in the map of a pass, of which the old map has no
-      element of the class within 1.5 m, or no area that shares 30 percent. The old map must have an
-      element of any class within 30 m.
-    * Moved: such a part of an old line whose predictions lie at least 0.5 m beside it on one side,
-      or an old area whose centre moved by at least 0.75 m, and by at least three standard errors.
+    A change concerns a whole area, or a part of a line that is at least 8 m long or the whole line.
 
-    The confidence of a removed or moved element is that of a removal or a move, times the score of
-    the element in the old map.
+    * Removed: an area or a part of a line of the old map that most passes in view do not see.
+    * Added: an area or a part of a line in the map of a pass that the old map does not have. The
+      old map has no line of the class within 1.5 m of it, or no area of the class that shares 30
+      percent with it. An element of any class of the old map must lie within 30 m, for elsewhere
+      the old map may not cover the ground.
+    * Moved: a part of a line of the old map whose predictions lie at least 0.5 m beside it, all on
+      one side, or an area of the old map whose centre moved by at least 0.75 m. Both shifts must
+      also be at least three standard errors.
+
+    The confidence of a removed or moved element is multiplied by its score in the old map, as an
+    element that never was there cannot be removed.
 
     Args:
         old: Old map in the global frame.
@@ -58,7 +64,7 @@ def find_changes(
         config: Parameters of merging; ``MergeConfig()`` by default.
 
     Returns:
-        Changes, and numbers of elements that are not compared.
+        Changes, and the numbers of elements that could not be compared.
 
     Raises:
         ValueError: If the old map has more than 1,000 km of lines near the drives.
@@ -66,12 +72,12 @@ def find_changes(
     config = config or MergeConfig()
     passes = list(passes)
     classes = passes[0].drive.classes
-    whole = old
+    whole_map = old
     old = _near_passes(old, passes)
     changes: list[Change] = []
     for label, name in enumerate(classes):
-        changes_of_class = area_changes if name in AREA_CLASSES else line_changes
-        changes += changes_of_class(old, passes, label, config)
+        find_in_class = area_changes if name in AREA_CLASSES else line_changes
+        changes += find_in_class(old, passes, label, config)
     changes.sort(key=lambda change: (change.label, KINDS.index(change.kind), -change.confidence))
     num_on_new_ground: Counter[str] = Counter()
     for one_pass in passes:
@@ -79,19 +85,19 @@ def find_changes(
             if not on_known_ground(line, old).any():
                 num_on_new_ground[classes[label]] += 1
     num_not_in_view: Counter[str] = Counter()
-    views = views_of_passes(whole.points[:, :2], passes).max(axis=0)
-    for index, label in enumerate(whole.labels.tolist()):
-        vertices = slice(whole.offsets[index], whole.offsets[index + 1])
-        if views[vertices].max(initial=0) < MIN_VIEWS:
+    most_views = views_of_passes(whole_map.points[:, :2], passes).max(axis=0)  # of any pass. (M,)
+    for index, label in enumerate(whole_map.labels.tolist()):
+        vertices = slice(whole_map.offsets[index], whole_map.offsets[index + 1])
+        if most_views[vertices].max(initial=0) < MIN_VIEWS:
             num_not_in_view[classes[label]] += 1
     return Changes(changes, dict(num_on_new_ground), num_not_in_view=dict(num_not_in_view))
 
 
 def _near_passes(old: MapElements, passes: Sequence[Pass]) -> MapElements:
-    """Select the elements of an old map near the drives, which are sampled every metre.
+    """Select the elements of an old map near the drives.
 
     Raises:
-        ValueError: If they are too long.
+        ValueError: If their lines are too long in all, as they are sampled every metre later.
     """
     origins = [frame.origin for one_pass in passes for frame in one_pass.drive.frames]
     margin_m = _MARGIN_M + max(one_pass.drive.reach_m for one_pass in passes)
@@ -100,10 +106,14 @@ def _near_passes(old: MapElements, passes: Sequence[Pass]) -> MapElements:
     is_near = np.zeros(len(old), dtype=np.bool_)
     total_m = 0.0
     for index, line in enumerate(old.polylines):
-        if len(line) and (line[:, :2].min(axis=0) <= high).all():
-            is_near[index] = bool((line[:, :2].max(axis=0) >= low).all())
-        if is_near[index]:
-            total_m += float(arc_lengths(line[:, :2])[-1])
+        if not len(line):
+            continue
+        points = line[:, :2]
+        starts_before = bool((points.min(axis=0) <= high).all())
+        ends_behind = bool((points.max(axis=0) >= low).all())
+        if starts_before and ends_behind:  # its bounding box overlaps the box of the drives
+            is_near[index] = True
+            total_m += float(arc_lengths(points)[-1])
     if total_m > MAX_TOTAL_LENGTH_M:
         raise InputError(
             f"the old map has {total_m / 1000:.0f} km of lines near the drives: at most "
@@ -122,15 +132,15 @@ def write_changes(
     """Write changes as GeoJSON, a feature each.
 
     The properties of a feature are ``class``, ``change`` (``removed``, ``added`` or ``moved``),
-    ``map``, ``confidence``, ``passes_in_view``, and ``passes_not_seen`` of removed elements or
-    ``passes_seen`` of others. Moved elements have ``moved_m`` and its standard error
-    ``moved_std_m``.
+    ``map``, ``confidence`` and ``passes_in_view``. Among the passes in view, ``passes_not_seen`` is
+    the number that do not see a removed element, and ``passes_seen`` the number that see an added
+    or moved one. Moved elements also have ``moved_m`` and its standard error ``moved_std_m``.
 
     Args:
         path: File to write.
         changes: Changes in the global frame.
         classes: Class names in label order.
-        place: Name of the map, which is the property ``map``.
+        place: Name of the map, the value of the property ``map``.
         origin: Position of the global frame on the Earth; without one, coordinates are metres.
 
     Raises:
@@ -138,14 +148,14 @@ def write_changes(
     """
     features = []
     for change in changes:
-        counted = "passes_not_seen" if change.kind == REMOVED else "passes_seen"
+        count_key = "passes_not_seen" if change.kind == REMOVED else "passes_seen"
         properties: dict[str, Any] = {
             "class": classes[change.label],
             "change": change.kind,
             "map": place,
             "confidence": round(change.confidence, 4),
             "passes_in_view": change.passes_in_view,
-            counted: change.num_passes,
+            count_key: change.num_passes,
         }
         if change.kind == MOVED and change.moved_m is not None and change.moved_std_m is not None:
             properties["moved_m"] = round(change.moved_m, 4)
@@ -155,7 +165,7 @@ def write_changes(
 
 
 def summarize_changes(found: Changes) -> str:
-    """Describe the number of changes of each kind, and of the elements that are not compared.
+    """Describe the number of changes of each kind, and the number of elements not compared.
 
     Args:
         found: Changes of a place.

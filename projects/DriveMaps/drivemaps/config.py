@@ -7,8 +7,8 @@ import numpy as np
 from drivemaps.drive import DriveFrame
 from gsmap.structures.elements import FloatArray
 
-NEAR_SIGMA_M = 0.2  # standard deviation near the vehicle of vertices without Gaussians
-SIGMA_PER_M = 0.02  # standard deviation per metre of distance from the vehicle
+NEAR_SIGMA_M = 0.2  # standard deviation of vertices without Gaussians, near the vehicle
+SIGMA_PER_M = 0.02  # additional standard deviation per metre of distance from the vehicle
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,8 @@ class MergeConfig:
         min_confidence: Smallest confidence of a vertex of a line in the map, in [0, 1]
             (``merge_lines``).
         min_area_confidence: Smallest confidence of an area in the map, in [0, 1]
-            (``merge_areas``). Lower, because models detect areas only from nearby.
+            (``merge_areas``). It is lower than for lines, because models detect areas only from
+            nearby.
     """
 
     gaussians: bool = True
@@ -30,8 +31,8 @@ class MergeConfig:
     def variances(self, frame: DriveFrame) -> FloatArray:
         """Compute the variance of each predicted vertex across its line.
 
-        It is the variance of the vertex's Gaussian, or a constant without Gaussians, plus a part
-        that grows with the distance from the vehicle.
+        It is the variance of the vertex's Gaussian across the line, or a constant without
+        Gaussians, plus a part that grows with the distance from the vehicle.
 
         Args:
             frame: Frame with its predictions.
@@ -55,5 +56,6 @@ class MergeConfig:
         sigmas = [np.zeros(0)]
         for line_means, line_scales, line_rotations in zip(means, scales, rotations, strict=True):
             gaussians = Gaussians(line_means, scales=line_scales, rotations=line_rotations)
-            sigmas.append(extents_along_line(gaussians)[:, 1].numpy())
+            _, across = extents_along_line(gaussians).unbind(-1)  # along and across the line
+            sigmas.append(across.numpy())
         return np.concatenate(sigmas) ** 2 + far

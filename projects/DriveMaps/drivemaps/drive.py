@@ -17,7 +17,7 @@ MIN_LENGTH_M = 2.0
 MIN_AREA_M2 = 1.0
 """Smallest area in square metres of an area in the map of a drive."""
 SIMPLIFY_M = 0.02
-"""Largest distance in metres of a dropped vertex from the simplified line."""
+"""Tolerance of simplification in metres: dropped vertices lie at most this far from the line."""
 _SLACK_M = 1e-3  # covers the rounding of transforms
 
 
@@ -41,6 +41,8 @@ class DriveFrame:
     @property
     def rotation(self) -> FloatArray:
         """Rotation by yaw from the annotation frame to the global frame. (2, 2)"""
+        # The first column of the transform is the x axis of the frame. A vehicle that is tilted
+        # has an axis that is shorter than 1 in the plane.
         cos, sin = self.sample.global_from_frame[:2, 0]
         return np.array([[cos, -sin], [sin, cos]]) / np.hypot(cos, sin)
 
@@ -100,7 +102,7 @@ class Drive:
         Returns:
             True for points in the range. (M,)
         """
-        low, high = np.array([self.x_range, self.y_range]).T
+        low, high = np.array([self.x_range, self.y_range]).T  # corners (x, y) of the range
         local = frame.to_frame(points)
         return ((local >= low) & (local <= high)).all(axis=1)
 
@@ -149,6 +151,7 @@ class Drive:
         points = elements.points[:, :2]
         low = np.minimum.reduceat(points, starts)  # (N, 2)
         high = np.maximum.reduceat(points, starts)  # (N, 2)
+        # Whether bounding boxes overlap the square around the frame, by axis. (N, 2)
         starts_before = low <= frame.origin + self.reach_m
         ends_behind = high >= frame.origin - self.reach_m
         is_near = (starts_before & ends_behind).all(axis=1)

@@ -21,8 +21,8 @@ class MapOrigin:
     Args:
         latitude_deg: Latitude of the origin on the WGS 84 ellipsoid in degrees, in (-90, 90).
         longitude_deg: Longitude of the origin in degrees, in [-180, 180].
-        utm_zone: UTM zone to whose grid the axes are parallel. By default, the axes point to true
-            east and north at the origin.
+        utm_zone: Number of the UTM zone whose grid the axes are parallel to. By default, the axes
+            point to true east and north at the origin.
 
     Raises:
         ValueError: If the latitude or the longitude is out of range.
@@ -41,7 +41,7 @@ class MapOrigin:
 
     @cached_property
     def _projection(self) -> Any:
-        """Projection from degrees to metres, with any false origin."""
+        """Projection from degrees to metres; at the origin its coordinates need not be zero."""
         create_projection = import_extra("pyproj", "maps").Proj
         if self.utm_zone is not None:
             return create_projection(proj="utm", zone=self.utm_zone, ellps="WGS84")
@@ -69,8 +69,8 @@ class MapOrigin:
             farthest_m = max(np.abs(x).max(), np.abs(y).max())
             raise InputError(
                 f"the map reaches {farthest_m:.3g} m from the origin of "
-                "its frame, where there is no longitude and latitude: its poses are wrong, or "
-                "--formats geojson without --origin writes metres."
+                "its frame, where there is no longitude and latitude: check its poses, or write it "
+                "in metres, by --formats geojson without --origin."
             )
         return degrees
 
@@ -92,11 +92,11 @@ class MapOrigin:
         x, y = self._projection(longitude_deg, latitude_deg)
         points = np.stack([x, y], axis=1) - origin
         farthest_m = np.abs(points).max(initial=0.0)
-        if not farthest_m <= _FARTHEST_M:
+        if not farthest_m <= _FARTHEST_M:  # `not <=` is also true of NaN
             raise InputError(
                 f"{where}: the map lies {farthest_m / 1000:.0f} km from the origin "
-                f"{self.latitude_deg:g} {self.longitude_deg:g} of the global frame: give its "
-                "origin (LAT LON), or the map of this place."
+                f"{self.latitude_deg:g} {self.longitude_deg:g} of the global frame: give the "
+                "origin of this map (LAT LON), or a map of the place at this origin."
             )
         return points
 
@@ -106,8 +106,8 @@ class MapGrid:
     """Coordinate reference system of a global frame that is a map grid.
 
     Args:
-        crs: Name of the system for ``pyproj``, such as ``EPSG:32650``. Its easting is x, its
-            northing y.
+        crs: Name of the system for ``pyproj``, such as ``EPSG:32650``. The easting of the system is
+            x of the global frame, and its northing is y.
 
     Raises:
         RuntimeError: If ``pyproj`` is missing.
@@ -125,8 +125,8 @@ class MapGrid:
         units = {axis.unit_name for axis in system.axis_info[:2]}
         if not system.is_projected or units != {"metre"}:
             raise InputError(
-                f"{self.crs} ({system.name}) is no grid in metres: give that of the poses, such as "
-                "EPSG:32650."
+                f"{self.crs} ({system.name}) is no grid in metres: give the grid of the poses, "
+                "such as EPSG:32650."
             )
 
     @cached_property
@@ -204,8 +204,9 @@ def require_near(positions: FloatArray, where: str) -> None:
 def known_origin(meta: AnnotationMeta, map_name: str) -> MapOrigin | None:
     """Look up the origin of a map in the devkit of its data set.
 
-    In the devkit of nuScenes, the reference coordinate of a map is its south-western corner, and
-    so is the origin of the poses. Argoverse 2 shifts the UTM grid to the origin of a city.
+    The poses of nuScenes start from the south-western corner of a map, whose latitude and longitude
+    the devkit calls the reference coordinate. Argoverse 2 has UTM coordinates minus the origin of
+    the city.
 
     Args:
         meta: Metadata of the annotation file.

@@ -12,8 +12,8 @@ from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import FloatArray, MapElements
 from gsmap.utils.files import write_text
 
-# Longitude and latitude. RFC 7946 allows no other system and has dropped the member ``crs``, but
-# programs still read it.
+# The system of longitude and latitude. RFC 7946 has dropped the member ``crs``, as it allows no
+# other system, but programs still read it.
 _CRS84 = {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}
 
 
@@ -65,7 +65,7 @@ def write_features(
             points = origin.lon_lat(line).round(9).tolist()  # a tenth of a millimetre
         is_area = properties["class"] in AREA_CLASSES and points[0] == points[-1]
         if is_area and not shapely.is_ccw(shapely.LineString(line)):
-            points.reverse()
+            points.reverse()  # RFC 7946 asks for anticlockwise outer rings
         geometry = {
             "type": "Polygon" if is_area else "LineString",
             "coordinates": [points] if is_area else points,

@@ -21,8 +21,8 @@ from gsmap.utils.json_items import items_of
 
 _ADVICE = "give a GeoJSON FeatureCollection"
 _KINDS = ("LineString", "MultiLineString", "Polygon", "MultiPolygon")
-_NO_CRS = "no crs"  # in place of a value that the file lacks
-# Ends of the names of longitude and latitude on the WGS 84 ellipsoid
+_NO_CRS = "no crs"  # stands for the member `crs` of a file without it, as null has a meaning
+# Names of the system of longitude and latitude on the WGS 84 ellipsoid end in one of these.
 _DEGREES = ("CRS84", "EPSG:4326", "EPSG::4326")
 
 
@@ -35,14 +35,15 @@ def read_geojson(
     """Read a FeatureCollection of lines and polygons.
 
     Coordinates are longitude and latitude (RFC 7946). With ``"crs": null`` they are metres of the
-    global frame. Lines and polygons are used, also several in one feature; of polygons the outer
-    ring. Heights are dropped. Other features are counted.
+    global frame. Lines and the outer rings of polygons are used, also if a feature has several of
+    them. Heights are dropped. Features of other kinds are only counted.
 
     Args:
         path: File, which may be untrusted.
         classes: Class names in label order.
         origin: Position of the global frame on the Earth, for coordinates in degrees.
-        rule: Property of the class of a feature; by default ``class`` with names of classes.
+        rule: Property that gives a feature its class. By default this is ``class``, whose values
+            are names of classes.
 
     Returns:
         Elements in the global frame, and the number of features that are not used.
@@ -78,7 +79,7 @@ def read_geojson(
 
 
 def _require_degrees(crs: Any, path: Path) -> None:
-    """Require that a file names no coordinate system but longitude and latitude."""
+    """Require that the coordinate system of a file is longitude and latitude, if it names one."""
     if crs == _NO_CRS:
         return
     name = None
@@ -92,7 +93,7 @@ def _require_degrees(crs: Any, path: Path) -> None:
 
 
 def _add_feature(feature: Any, collector: ElementCollector) -> None:
-    """Add the lines of a feature, or count it."""
+    """Add the lines of a feature to the collector, or count the feature as unused."""
     if not isinstance(feature, dict) or feature.get("type") != "Feature":
         raise InputError("it is no object of type Feature")
     geometry = feature.get("geometry")
@@ -112,9 +113,8 @@ def _add_feature(feature: Any, collector: ElementCollector) -> None:
     if name is None:
         return
     score = _score_of(properties or {})
-    parts = [geometry.get("coordinates")]
-    if kind.startswith("Multi"):
-        parts = _list_of(parts[0])
+    coordinates = geometry.get("coordinates")
+    parts = _list_of(coordinates) if kind.startswith("Multi") else [coordinates]
     for part in parts:
         if kind.endswith("Polygon"):
             rings = _list_of(part)

@@ -32,8 +32,9 @@ def write_lanelet2(
 ) -> None:
     """Write a map for the ``lanelet2`` package.
 
-    Areas become polygons, and other rings end at the node at which they start. Each node has its
-    position in the global frame in metres as ``local_x`` and ``local_y``.
+    Areas become polygons, which do not repeat their first node. Other rings end at the node at
+    which they start. Each node has its position in the global frame, in metres, as ``local_x`` and
+    ``local_y``.
 
     Args:
         path: File to write.
@@ -64,7 +65,7 @@ def write_lanelet2(
 
 
 def _add_lanelets(file: "_OSMFile", lanes: LaneGraph, speed_limit_kmh: float) -> None:
-    """Add lanelets; successive ones share the end nodes of their bounds."""
+    """Add lanelets. The bounds of successive lanelets have their end nodes in common."""
     tags = {
         "type": "lanelet",
         "subtype": "road",
@@ -93,7 +94,7 @@ class _OSMFile:
 
     def __init__(self, origin: MapOrigin | MapGrid) -> None:
         self._origin = origin
-        # In the order of the file.
+        # The kinds are written in this order.
         self._elements_of_kind: dict[str, list[ElementTree.Element]] = {
             "node": [],
             "way": [],

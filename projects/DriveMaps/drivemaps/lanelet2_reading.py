@@ -26,12 +26,14 @@ CLASS_OF_TYPE = {
     "pedestrian_marking": "ped_crossing",
     "stop_line": "stop_line",
 }
-"""Class of the line strings of a Lanelet2 type. Other types may be names of classes."""
+"""Class of the line strings of a Lanelet2 type. A type that is not listed may name a class."""
 _CROSSING = "ped_crossing"
-_BLOCK = 1 << 20  # bytes
-_DEEPEST = 20  # nested elements of XML
-_MOST_PARTS = 10_000_000  # nodes, ways, relations, and references to them
-_MOST_USES = 4  # of a node by crosswalks, on average
+_BLOCK = 1 << 20  # bytes that are read at once
+_DEEPEST = 20  # largest depth of nested XML elements
+_MOST_PARTS = 10_000_000  # largest number of nodes, ways, relations, and references to them
+# The rings of crosswalks have at most so many nodes in all, as a multiple of the parts of the file:
+# a small file could otherwise use one long line in any number of crosswalks.
+_MOST_USES = 4
 _KINDS = ("node", "way", "relation")
 
 
@@ -60,7 +62,7 @@ class _Way(NamedTuple):
 
     @property
     def ring_or_line(self) -> list[str]:
-        """IDs of its nodes. The last node of an area is its first one."""
+        """IDs of its nodes, with the first node of an area repeated at the end."""
         is_area = self.tags.get("area") == "yes"
         if is_area and self.nodes[:1] != self.nodes[-1:]:
             return [*self.nodes, self.nodes[0]]
@@ -90,13 +92,14 @@ def read_lanelet2(
     A line string gets its class by the tag ``class``, or else by its type (`CLASS_OF_TYPE`). A
     lanelet of the subtype ``crosswalk`` is an area of the class ``ped_crossing``. Positions are
     ``local_x`` and ``local_y`` if all used nodes have them, and otherwise longitude and latitude.
-    Other line strings and relations are counted.
+    Other line strings and relations are only counted.
 
     Args:
-        path: File, which may be untrusted. A document type, and so every entity, is refused.
+        path: File, which may be untrusted. A file with a document type is refused, as this is
+            where XML declares entities.
         classes: Class names in label order.
         origin: Position of the global frame on the Earth, for nodes without local positions.
-        rule: Tag of the class of a line string, in place of the types.
+        rule: Tag that gives a line string its class. Types and crosswalks are then not used.
 
     Returns:
         Elements in the global frame, and the number of elements that are not used.
@@ -114,7 +117,7 @@ def read_lanelet2(
     collector.unused.update(parser.num_deleted)
     crosswalks = parser.crosswalks() if rule is None and _CROSSING in classes else {}
     lines = []
-    bounds: set[str] = set()  # ways of crosswalks
+    bounds: set[str] = set()  # IDs of ways that are bounds of crosswalks
     for number, relation in crosswalks.items():
         lines.append((_CROSSING, parser.ring_of(number, relation)))
         bounds.update(relation.way_of_role.values())
@@ -141,13 +144,17 @@ def read_lanelet2(
 
 
 def _with_class(tags: Mapping[str, str], classes: Sequence[str]) -> dict[str, str]:
-    """Add the class of a Lanelet2 type to tags that name no class."""
-    kind = tags.get("type", "")
+    """Return tags that name a class, found by the Lanelet2 type if the given tags name none."""
     if tags.get(CLASS_KEY) in classes:
         return dict(tags)
+    kind = tags.get("type", "")
+    if kind in CLASS_OF_TYPE:
+        return {CLASS_KEY: CLASS_OF_TYPE[kind]}
+    if kind in classes:
+        return {CLASS_KEY: kind}
+    # This names no class, and describes the line string in the count of unused elements.
     subtype = tags.get("subtype", "")
-    description = f"{kind}/{subtype}" if subtype else kind
-    return {CLASS_KEY: CLASS_OF_TYPE.get(kind, kind if kind in classes else description)}
+    return {CLASS_KEY: f"{kind}/{subtype}" if subtype else kind}
 
 
 class _Parser:
@@ -199,7 +206,7 @@ class _Parser:
         raise self._error("it has a document type, which OSM files lack")
 
     def _start(self, name: str, attributes: dict[str, str]) -> None:
-        """Read the start of an element."""
+        """Read the start of an XML element."""
         self._depth += 1
         if self._depth > _DEEPEST:
             raise self._error(f"its elements are nested deeper than {_DEEPEST}")
@@ -211,7 +218,7 @@ class _Parser:
             self._num_parts += 1
             if self._num_parts > _MOST_PARTS:
                 raise self._error(f"it has more than {_MOST_PARTS:,} nodes and references")
-        if self._depth == 2:
+        if self._depth == 2:  # a node, a way or a relation, whose parts follow inside of it
             self._attributes = attributes
             self._tags = {}
             self._references = []
@@ -226,7 +233,7 @@ class _Parser:
             self._way_of_role[role] = self._required(attributes, "ref", owner=name)
 
     def _end(self, name: str) -> None:
-        """Keep a node, a way or a relation at its end."""
+        """Store a node, a way or a relation at the end of its XML element."""
         self._depth -= 1
         if self._depth != 1 or name not in _KINDS:
             return
@@ -347,10 +354,11 @@ class _Parser:
                 raise self._error(f"crosswalk {number!r:.40} has no {role} bound")
             bounds.append(way.nodes)
         left, right = bounds
-        ends = self._nodes([left[-1], right[0], right[-1]])
-        is_local = all(node.local is not None for node in ends)
-        last, first, other = self.positions([left[-1], right[0], right[-1]], is_local=is_local)
-        if np.linalg.norm(other - last) <= np.linalg.norm(first - last):
+        ends = [left[-1], right[0], right[-1]]
+        is_local = all(node.local is not None for node in self._nodes(ends))
+        left_end, right_start, right_end = self.positions(ends, is_local=is_local)
+        # The ring goes along the left bound and on to the nearer end of the right bound.
+        if np.linalg.norm(right_end - left_end) <= np.linalg.norm(right_start - left_end):
             right = right[::-1]
         ring = [*left, *right, left[0]]
         self._num_ring_nodes += len(ring)

@@ -22,10 +22,10 @@ HALF_WIDTH_M = 1.75
 _MOST_HALF_WIDTH_M = 3.0  # a border farther away belongs to another lane
 _MIN_HALF_WIDTH_M = 0.5
 _JOIN_M = 1.0  # ends within this distance are one node of the lane graph
-_SHORTEST_M = 2.0  # smallest distance between the points at which a lane is split, and its ends
-_STEP_M = 2.0  # largest distance of the points at which directions and widths are measured
-_MIN_SUCCESSOR_COSINE = 0.5  # between the directions of successive lanes
-_MIN_PARALLEL_COSINE = 0.7  # between a line and a piece along it, in either direction
+_SHORTEST_M = 2.0  # a lane is split only at points farther apart, and farther from its ends
+_STEP_M = 2.0  # lanes are sampled at most this far apart, to measure directions and widths
+_MIN_SUCCESSOR_COSINE = 0.5  # smallest cosine between the directions of successive lanes
+_MIN_PARALLEL_COSINE = 0.7  # smallest |cosine| between a line and a piece that runs along it
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class Lanelet:
 
 @dataclass(frozen=True, eq=False)
 class LaneGraph:
-    """Graph of lanelets; the bounds of successive lanelets share their ends at a node.
+    """Graph of lanelets. At a node, the bounds of successive lanelets meet in one point per side.
 
     Args:
         lanelets: Lanelets, the edges of the graph.
@@ -63,8 +63,8 @@ class LaneGraph:
 def lane_graph_of(drive: Drive, elements: MapElements) -> LaneGraph:
     """Construct lanelets from the centre lines in the map of a drive.
 
-    Lines of maps have no direction of travel. A centre line is oriented like most of the centre
-    lines of the frames along it.
+    The lines of a merged map have no direction of travel. A centre line of the map gets the
+    direction of most of the centre lines in the frames that run along it.
 
     Args:
         drive: Frames with centre lines in the direction of travel.
@@ -192,8 +192,9 @@ def _directions(line: FloatArray) -> FloatArray:
     """Unit direction of a line at each vertex. (n, 2)"""
     steps = np.diff(line, axis=0)
     steps = steps / np.linalg.norm(steps, axis=1, keepdims=True)
-    mean = np.concatenate([steps[:1], steps[:-1] + steps[1:], steps[-1:]])
-    return mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
+    # A vertex has the mean direction of both adjacent segments, an end that of its only one.
+    sums = np.concatenate([steps[:1], steps[:-1] + steps[1:], steps[-1:]])
+    return sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-9)
 
 
 def _resample(line: FloatArray) -> FloatArray:
@@ -221,11 +222,12 @@ def _orient_lines(lines: Sequence[FloatArray], pieces: Sequence[FloatArray]) -> 
     for line in lines:
         samples = _resample(line[:, :2])
         _, neighbours = tree.query(samples, k=8, distance_upper_bound=_JOIN_M)
-        rows, columns = np.nonzero(neighbours < len(directions))  # others are missing neighbours
+        # A missing neighbour has the index `len(directions)`.
+        rows, columns = np.nonzero(neighbours < len(directions))
         neighbour_directions = directions[neighbours[rows, columns]]
         cosines = (_directions(samples)[rows] * neighbour_directions).sum(axis=1)
         is_parallel = np.abs(cosines) > _MIN_PARALLEL_COSINE
-        votes = np.sign(cosines[is_parallel]).sum()
+        votes = np.sign(cosines[is_parallel]).sum()  # each near point votes +1 or -1
         is_opposite = votes < 0
         oriented.append(line[::-1] if is_opposite else line)
     return oriented
@@ -257,9 +259,10 @@ def _split(lines: Sequence[FloatArray]) -> list[FloatArray]:
         cuts = [0.0, shape.length]  # positions along the line in metres
         near_ends = tree.query(shape, predicate="dwithin", distance=_JOIN_M)
         for end in sorted(near_ends.tolist()):
-            if end // 2 == index:
+            if end // 2 == index:  # line i has the ends 2 i and 2 i + 1
                 continue
             cut = shape.project(shapely.Point(ends[end]))
+            # Compare the direction of this line around the cut with the other line's end.
             around = np.clip([cut - 0.5, cut + 0.5], 0.0, shape.length)
             before, after = shapely.get_coordinates(shapely.line_interpolate_point(shape, around))
             follows = (after - before) @ end_directions[end] > _MIN_SUCCESSOR_COSINE
@@ -283,6 +286,7 @@ def _half_width(line: FloatArray, side: int, borders: shapely.STRtree) -> float:
     Returns:
         Distance in metres, ``HALF_WIDTH_M`` if most vertices have no border beside them.
     """
+    # A ray from each vertex across the line, as long as the widest half of a lane.
     across = side * _MOST_HALF_WIDTH_M * _to_left(_directions(line))
     rays = shapely.linestrings(np.stack([line, line + across], axis=1))
     rows, border_indices = borders.query(rays, predicate="intersects")
@@ -290,6 +294,7 @@ def _half_width(line: FloatArray, side: int, borders: shapely.STRtree) -> float:
     crossings = shapely.intersection(rays[rows], borders.geometries[border_indices])
     nearest_m = np.full(len(line), np.inf)
     np.minimum.at(nearest_m, rows, shapely.distance(starts, crossings))
+    # Infinite without a border beside the vertex.
     finite_m = nearest_m[np.isfinite(nearest_m)]
     if 2 * len(finite_m) < len(line):
         return HALF_WIDTH_M

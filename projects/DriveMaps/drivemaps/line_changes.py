@@ -32,18 +32,18 @@ from drivemaps.line_matching import (
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 from gsmap.structures.polylines import arc_lengths
 
-_MIN_LENGTH_M = 8.0  # smallest length of a changed part of a line that is not the whole line
-_MIN_MOVE_M = 0.5  # smallest shift of a vertex that has moved
-_MIN_FRAMES = 3  # smallest number of frames with a match of a vertex that has moved
+_MIN_LENGTH_M = 8.0  # shorter changed parts are ignored, unless they are whole lines
+_MIN_MOVE_M = 0.5  # a vertex has moved if it is shifted by at least this
+_MIN_FRAMES = 3  # smallest number of matched frames that can show that a vertex has moved
 _WINDOW = 5  # number of vertices of the running median along a line
 
 
 @dataclass(frozen=True, eq=False)
 class _Evidence:
-    """Views of the vertices of lines by the passes.
+    """Views of M vertices by the passes.
 
     Args:
-        views: Frames of each pass that have a vertex in range. (passes, M)
+        views: Number of frames of each pass that have a vertex in range. (passes, M)
         is_seen: Whether the map of a pass has a line of the class near a vertex. (passes, M)
     """
 
@@ -52,7 +52,7 @@ class _Evidence:
 
     @classmethod
     def of_points(cls, points: FloatArray, passes: list[Pass], label: int) -> "_Evidence":
-        """Collect the views of points. (M, 2)"""
+        """Collect the views of points (M, 2) by the passes, for a class."""
         is_seen = []
         for one_pass in passes:
             elements = one_pass.elements
@@ -78,20 +78,24 @@ class _Evidence:
         return 2 * num_seen > self.is_in_view.sum(axis=0)
 
     def count_passes(self, part: slice, seen: bool) -> tuple[int, int]:
-        """Count passes by the majority of the vertices of a part.
+        """Count the passes that have a part of a line in view, and those that agree on it.
+
+        A pass has the part in view if it has more than half of the vertices in view. It sees the
+        part, or misses it, if it sees or misses more than half of the vertices in view.
 
         Args:
-            part: Vertices.
-            seen: Whether to count the passes that see the part, or those that do not.
+            part: Vertices of the part, n in number.
+            seen: True counts the passes that see the part as agreeing, False those that miss it.
 
         Returns:
-            Number of passes that have the part in view, and number of those that see it, or not.
+            Number of passes that have the part in view, and number of these that agree.
         """
-        in_view = self.is_in_view[:, part]
+        in_view = self.is_in_view[:, part]  # (passes, n)
         num_in_view = in_view.sum(axis=1)
-        counted = in_view & (self.is_seen[:, part] == seen)
-        has_part = 2 * num_in_view > in_view.shape[1]
-        agrees = has_part & (2 * counted.sum(axis=1) > num_in_view)
+        num_agreeing = (in_view & (self.is_seen[:, part] == seen)).sum(axis=1)
+        num_vertices = in_view.shape[1]
+        has_part = 2 * num_in_view > num_vertices
+        agrees = has_part & (2 * num_agreeing > num_in_view)
         return int(has_part.sum()), int(agrees.sum())
 
 
@@ -113,11 +117,13 @@ def line_changes(
     if not len(lines.points):
         return _added(old, passes, label)
     predictions = [dense_predictions(one_pass.drive, label, config) for one_pass in passes]
+    # The old lines come first, so their vertices have the indices up to `num_old`.
     joined = join_lines([lines, *predictions])
     normals = normals_of(joined)
     num_old = len(lines.points)
     matches = match_vertices(joined, normals, queries=np.arange(num_old))
     evidence = _Evidence.of_points(lines.points, passes, label)
+    # Sum of the scores of the predictions that match each old vertex.
     scores = joined.scores[matches.segments]
     support = np.bincount(matches.vertices, scores, minlength=num_old)
     changes = []
@@ -126,13 +132,13 @@ def line_changes(
         in_view, num_passes = evidence.count_passes(part, seen=False)
         if not num_passes:
             continue
-        num_without = float((views - support)[part].mean())
-        known = float(lines.scores[part].mean())
+        num_without = float((views - support)[part].mean())  # a match counts by its score
+        old_score = float(lines.scores[part].mean())
         change = Change(
             REMOVED,
             label,
             line=lines.points[part],
-            confidence=known * smooth_share(num_without, float(views[part].mean())),
+            confidence=old_score * smooth_share(num_without, float(views[part].mean())),
             passes_in_view=in_view,
             num_passes=num_passes,
         )
@@ -147,13 +153,14 @@ def _moved(
     """Find parts of the old lines that moved across their direction.
 
     Args:
-        joined: Old lines as the first ones, and the lines of all frames.
+        joined: The old lines, followed by the lines of all frames.
         normals: Unit vector to the left of each vertex of the old lines. (M, 2)
         matches: Matches of the vertices of the old lines.
         evidence: Views of the vertices of the old lines.
         label: Index of the class.
     """
     num_old = len(normals)
+    # Shift of each vertex: weighted mean distance of its matches, smoothed along its line.
     weights = joined.weights[matches.segments]
     total = np.bincount(matches.vertices, weights, minlength=num_old)
     moments = np.bincount(matches.vertices, weights * matches.distances, minlength=num_old)
@@ -191,7 +198,7 @@ def _moved(
 
 
 def _first_lines(lines: DenseLines, num_vertices: int) -> DenseLines:
-    """Lines of the first vertices."""
+    """The first lines, which have ``num_vertices`` vertices in all."""
     last = int(np.searchsorted(lines.offsets, num_vertices))
     return DenseLines(
         points=lines.points[:num_vertices],
@@ -203,11 +210,12 @@ def _first_lines(lines: DenseLines, num_vertices: int) -> DenseLines:
 
 
 def _shift_of(joined: DenseLines, matches: Matches) -> Shift:
-    """Mean distance of matches of one part; each frame counts once, however many vertices match."""
+    """Mean distance of the matches of one part, from the mean of each frame."""
+    # `rows` numbers the frames with matches, and `counts` are their numbers of matches.
     _, rows = np.unique(joined.frames[matches.segments], return_inverse=True)
     counts = np.bincount(rows)
     scores = joined.scores[matches.segments]
-    variances = scores / joined.weights[matches.segments]
+    variances = scores / joined.weights[matches.segments]  # as a weight is score over variance
     mean_variances = np.bincount(rows, variances) / counts
     mean_scores = np.bincount(rows, scores) / counts
     return Shift.of_frames(
@@ -244,14 +252,15 @@ def _added(old: MapElements, passes: list[Pass], label: int) -> list[Change]:
                 num_passes=num_passes,
             )
             changes.append(change)
-            known_lines = [*known_lines, change.line]
+            known_lines = [*known_lines, change.line]  # so the next passes do not add it again
     return changes
 
 
 def _parts(lines: DenseLines, flags: BoolArray) -> list[slice]:
     """Find the parts of lines whose vertices have a flag.
 
-    A part is at least 8 m long, or a whole line. Single vertices with another value are ignored.
+    A part is at least 8 m long, or a whole line. The flags are smoothed along a line by a running
+    median, so that one or two deviating vertices neither interrupt a part nor make one.
 
     Args:
         lines: Lines. M vertices

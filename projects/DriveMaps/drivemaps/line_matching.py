@@ -19,8 +19,8 @@ STEP_M = 1.0
 """Largest distance in metres between the vertices of densely sampled lines."""
 _MAX_TURN_DEG = 30.0  # largest angle between two lines that are matched
 _CHUNK_SIZE = 2000  # vertices that are matched at once; memory grows with it
-# Limit of the pairs of a vertex and a segment near it: the larger one of a constant and a number
-# per vertex and frame.
+# At most so many pairs of a vertex and a nearby segment are examined: the larger one of
+# `_MOST_PAIRS` and `_MOST_PAIRS_PER_FRAME` for each vertex and frame.
 _MOST_PAIRS = 2 * 10**7
 _MOST_PAIRS_PER_FRAME = 16
 
@@ -57,7 +57,7 @@ class DenseLines:
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Matches of vertices with segments of other lines, C in number.
+    """Matches of vertices with segments of other lines. There are C matches.
 
     Args:
         vertices: Index of the vertex. (C,)
@@ -140,6 +140,7 @@ def dense_predictions(drive: Drive, label: int, config: MergeConfig) -> DenseLin
 def normals_of(lines: DenseLines) -> FloatArray:
     """Unit vector to the left of the line at each vertex. (M, 2)"""
     vertices = np.arange(len(lines.points))
+    # The ends of a line have one neighbour, and are their own second one.
     following = vertices + 1
     following[lines.offsets[1:] - 1] -= 1
     previous = vertices - 1
@@ -152,10 +153,11 @@ def normals_of(lines: DenseLines) -> FloatArray:
 def match_vertices(
     lines: DenseLines, normals: FloatArray, queries: IntArray | None = None
 ) -> Matches:
-    """Match vertices with the nearest line of about its direction in each other frame.
+    """Match each vertex, in each other frame, with the nearest line of about the same direction.
 
-    There is no match if the frame of the vertex has another line at less than twice the distance:
-    lines of one frame belong to different objects.
+    There is no match if the frame of the vertex has another line, on this side of the vertex, at
+    less than twice the distance of the match. Lines of one frame belong to different objects, so
+    the match could belong to the other line.
 
     Args:
         lines: Lines of all frames.
@@ -176,9 +178,10 @@ def match_vertices(
         queries = np.arange(len(points))
     num_frames = len(np.unique(lines.frames))
     num_pairs_left = max(_MOST_PAIRS, _MOST_PAIRS_PER_FRAME * num_frames * len(points))
+    # The normal of a vertex within reach, on both sides, has a bounding box of twice this size.
     reach = np.abs(REACH_M * normals)
     chunks = []
-    for start in range(0, max(len(queries), 1), _CHUNK_SIZE):
+    for start in range(0, max(len(queries), 1), _CHUNK_SIZE):  # one empty chunk without queries
         chunk = queries[start : start + _CHUNK_SIZE]
         boxes = _boxes(points[chunk] - reach[chunk], points[chunk] + reach[chunk])
         positions, segments = tree.query(boxes)
@@ -214,7 +217,7 @@ def _concatenate(chunks: list[Matches]) -> Matches:
 
 
 def _boxes(low: FloatArray, high: FloatArray) -> np.ndarray:
-    """Axis-aligned rectangles as polygons. (n, 2), (n, 2) -> (n,)"""
+    """Axis-aligned rectangles as polygons, from two opposite corners. (n, 2), (n, 2) -> (n,)"""
     return shapely.box(low[:, 0], low[:, 1], high[:, 0], high[:, 1])
 
 
@@ -239,14 +242,16 @@ def _match_pairs(
     vertex = lines.points[vertices]
     start = lines.points[segments] - vertex
     end = lines.points[segments + 1] - vertex
-    # Positions along the line of the vertex; the segment crosses the normal at position 0.
+    # Components across the normal, that is along the line of the vertex, in metres. A segment
+    # crosses the normal where this component is 0.
     start_along = start[:, 1] * normal[:, 0] - start[:, 0] * normal[:, 1]
     end_along = end[:, 1] * normal[:, 0] - end[:, 0] * normal[:, 1]
-    extent = end_along - start_along  # signed length of the segment along this line, in metres
+    extent = end_along - start_along
+    # Position of the crossing on the segment, from 0 (start) to 1 (end).
     fraction = -start_along / np.where(extent == 0.0, np.inf, extent)
     distances = (normal * (start + fraction[:, None] * (end - start))).sum(axis=1)
     lengths = np.linalg.norm(end - start, axis=1)
-    crosses = start_along * end_along <= 0.0
+    crosses = start_along * end_along <= 0.0  # the ends lie on both sides of the normal
     is_parallel = np.abs(extent) > np.cos(np.radians(_MAX_TURN_DEG)) * lengths
     is_near = np.abs(distances) <= REACH_M
     return Matches(vertices, segments, distances).select(crosses & is_parallel & is_near)
@@ -255,8 +260,8 @@ def _match_pairs(
 def _select_matches(lines: DenseLines, candidates: Matches) -> Matches:
     """Select the nearest match of each vertex in each other frame, ordered by vertex and frame.
 
-    A candidate in the frame of the vertex is a rival: the next line on its side of the vertex.
-    Matches beyond half the distance of a rival are dropped.
+    A candidate in the frame of the vertex is a rival: another line of the same frame, on one side
+    of the vertex. Matches on this side beyond half the distance of the nearest rival are dropped.
 
     Args:
         lines: Lines of all frames.
@@ -271,9 +276,11 @@ def _select_matches(lines: DenseLines, candidates: Matches) -> Matches:
         is_rival = in_one_frame & (distances >= 0.0)
         nearest_rival_m = np.full(len(distinct), np.inf)
         np.minimum.at(nearest_rival_m, rows[is_rival], distances[is_rival])
+        # Candidates on the other side have negative distances here, and stay.
         is_selected &= distances <= nearest_rival_m[rows] / 2.0
     matches = candidates.select(is_selected)
     frames = lines.frames[matches.segments]
+    # Sort by vertex, then by frame, distance and segment; the first of each vertex and frame stays.
     order = np.lexsort((matches.segments, np.abs(matches.distances), frames, matches.vertices))
     matches = matches.select(order)
     is_new_vertex = np.diff(matches.vertices, prepend=-1) != 0

@@ -26,7 +26,7 @@ from gsmap.structures.polylines import arc_lengths
 from gsmap.utils.errors import InputError
 
 _NUM_ROUNDS = 3  # times that all vertices move to the mean
-# Limits of the work: total length of the lines of a class, a constant plus a part per frame.
+# Limit of the work: the lines of a class may have this total length, plus a length for each frame.
 _MOST_M = 250_000.0
 _MOST_PER_FRAME_M = 5_000.0
 
@@ -62,7 +62,7 @@ def merge_lines(drive: Drive, label: int, config: MergeConfig) -> list[tuple[Flo
     support = lines.scores + np.bincount(matches.vertices, matched_scores, minlength=num_vertices)
     num_frames = drive.count_frames_in_range(lines.points)
     share = support / np.maximum(num_frames, 1)
-    smooth_share = median_filter(share, 3)  # the vertex of a sharp corner has no match
+    smooth_share = median_filter(share, 3)  # fills in the vertices of sharp corners, without match
     confidence = np.minimum(smooth_share, 1.0)
     is_confident = confidence >= config.min_confidence
     parts = _select_parts(lines, matches=matches, confidence=confidence, is_confident=is_confident)
@@ -90,7 +90,7 @@ def _check_total_length(drive: Drive, label: int) -> None:
 
 
 def _move_to_means(lines: DenseLines, normals: FloatArray, matches: Matches) -> DenseLines:
-    """Move each vertex along its normal to the weighted mean of its line in all frames."""
+    """Move each vertex along its normal to the weighted mean of itself and its matches."""
     num_vertices = len(lines.points)
     weights = lines.weights[matches.segments]
     moments = weights * matches.distances
@@ -102,7 +102,10 @@ def _move_to_means(lines: DenseLines, normals: FloatArray, matches: Matches) -> 
 def _select_parts(
     lines: DenseLines, matches: Matches, confidence: FloatArray, is_confident: BoolArray
 ) -> list[slice]:
-    """Select parts of lines that together cover all lines once, the best supported line first.
+    """Select parts of lines that together cover all lines once.
+
+    Lines are visited by falling support. The parts of a line that no previous part covers are
+    selected, and the vertices of other lines that match a selected part become covered.
 
     Args:
         lines: Lines of all frames, which lie on top of each other.
@@ -111,8 +114,10 @@ def _select_parts(
         is_confident: Vertices that may be selected. (M,)
 
     Returns:
-        Vertices of each part, of one line.
+        Vertices of each part; a part lies within one line.
     """
+    # Sort the matches by the line of their segment. Those with line i are then the matches
+    # line_bounds[i]:line_bounds[i + 1].
     matched_lines = lines.line_indices[matches.segments]
     matches = matches.select(np.argsort(matched_lines, kind="stable"))
     line_bounds = np.searchsorted(
@@ -135,6 +140,7 @@ def _select_parts(
             if arc_lengths(lines.points[start:end])[-1] < JOIN_M:
                 continue
             parts.append(slice(start, end))
+            # A segment has the index of its first vertex, so the last one begins at `end - 2`.
             is_covered = (segments >= start) & (segments < end - 1)
             is_free[vertices[is_covered]] = False
     return parts

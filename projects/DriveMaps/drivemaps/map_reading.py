@@ -1,4 +1,8 @@
-"""Rules that all readers of map files share: classes of elements, bounds, counts of the rest."""
+"""Rules that all readers of map files share.
+
+They find the class of an element, refuse files that are too large or have impossible coordinates,
+and count the elements that are not used.
+"""
 
 import math
 from collections import Counter
@@ -22,7 +26,7 @@ FARTHEST_M = 1e7
 _MOST_VERTICES = 5_000_000
 _SMALLEST_M2 = 0.01  # smaller areas are points or lines
 _LONGEST_NAME = 60  # characters of a value in a message
-_LISTED_REASONS = 8  # in a message
+_LISTED_REASONS = 8  # largest number of reasons in a message
 
 
 class MapFile(NamedTuple):
@@ -62,8 +66,8 @@ class ClassRule:
         """Parse ``KEY VALUE=CLASS ...``.
 
         Args:
-            words: Name of the property, then the class of each of its values. Without values, they
-                are names of classes.
+            words: Name of the property, then values with their classes. If no value is listed, the
+                values of the property are names of classes.
             classes: Names of the classes.
 
         Raises:
@@ -83,7 +87,7 @@ class ClassRule:
 
 
 class ElementCollector:
-    """Lines of a file that have a class, and counts of the others.
+    """Collects the lines of a file that have a class, and counts the other ones.
 
     Args:
         path: File, for messages.
@@ -102,10 +106,13 @@ class ElementCollector:
         self._num_vertices = 0
 
     def class_of(self, values: Mapping[str, Any]) -> str | None:
-        """Find the class of an element; None, and a count, if it has none.
+        """Find the class of an element.
 
         Args:
             values: Untrusted properties of the element.
+
+        Returns:
+            Name of the class. None, if the element has none; it is then counted as unused.
         """
         value = values.get(self._rule.key)
         if isinstance(value, (int, float)):
@@ -120,7 +127,7 @@ class ElementCollector:
         return name
 
     def add(self, name: str, line: FloatArray, score: float = 1.0) -> None:
-        """Add an element, or count it if it has no length, or an area is open or has no area.
+        """Add an element, or count it as unused if it has no length or is an area that is open.
 
         Args:
             name: Class of the element.
@@ -149,6 +156,8 @@ class ElementCollector:
     def finish(self, origin: MapOrigin | MapGrid | None) -> MapFile:
         """Convert the lines to the global frame, check them, and create the map.
 
+        Areas that enclose no ground are counted as unused.
+
         Args:
             origin: Position of the global frame on the Earth for lines in degrees; None for lines
                 in metres.
@@ -168,7 +177,7 @@ class ElementCollector:
         for line, label, score in rows:
             points = line if origin is None else origin.points_of(line, where=str(self._path))
             farthest_m = np.abs(points).max()
-            if not farthest_m <= FARTHEST_M:
+            if not farthest_m <= FARTHEST_M:  # `not <=` is also true of NaN
                 raise InputError(
                     f"{self._path} reaches {farthest_m:.3g} m from the origin of the global frame: "
                     f"at most {FARTHEST_M:g} m are read."

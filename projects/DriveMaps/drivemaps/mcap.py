@@ -83,7 +83,7 @@ class _Log:
         self._channels[topic].log(message, log_time=time_ns)
 
     def _stamp(self, time_ns: int) -> Any:
-        """Convert a time to a message."""
+        """Convert a time in nanoseconds to Foxglove's timestamp."""
         seconds, nanoseconds = divmod(time_ns, 10**9)
         return self._messages.Timestamp(seconds, nanoseconds)
 

@@ -1,4 +1,4 @@
-"""Maps of drives from the predictions of their frames, by merging or by suppression."""
+"""Maps of drives from the predictions of their frames, by merging or non-maximum suppression."""
 
 from dataclasses import replace
 

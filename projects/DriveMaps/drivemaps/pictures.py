@@ -25,7 +25,7 @@ def plot_maps(maps: Mapping[str, MapElements], track: np.ndarray, style: MapStyl
     low = points.min(axis=0) - 5
     high = points.max(axis=0) + 5
     width, height = high - low
-    rows = len(maps) if width > 2.5 * height else 1
+    rows = len(maps) if width > 2.5 * height else 1  # one column or one row of panels
     figure, axes = panel_grid(rows, len(maps) // rows)
     panel_width = WIDTH_IN * rows / len(maps) - 0.5  # inches, without the labels
     panel_height = panel_width * min(height / width, 2)

@@ -43,6 +43,8 @@ class Moment:
         if elements.scales is None or elements.rotations is None:
             return None
         centres = np.concatenate([np.zeros((0, 3)), *self.lines])
+        # Elements are in the global frame. A rotation by an angle about z has the quaternion
+        # (0, 0, sin(angle / 2), cos(angle / 2)).
         half_angles = (elements.rotations - self.frame.yaw_rad) / 2.0
         quaternions = np.zeros((len(half_angles), 4))
         quaternions[:, 2] = np.sin(half_angles)
@@ -76,7 +78,9 @@ class Replay:
         return frame_view(self.frame_kind, self.ground_z_m)
 
     def moments(self) -> Iterator[Moment]:
-        """Iterate over the frames of the drive, with a map that grows by the range of each frame.
+        """Iterate over the frames of the drive, each with the part of the map explored so far.
+
+        The range of each frame adds to the explored part.
 
         Yields:
             Each frame, in the order of time.
@@ -111,7 +115,7 @@ def _raise_to_ground(
     views: Sequence[FrameView],
     frame_tree: cKDTree,
 ) -> FloatArray:
-    """Add the height of the ground, by the ground plane of the nearest frame.
+    """Add to points the height of the ground, from the ground plane of the nearest frame.
 
     Args:
         points: Points (x, y) in metres in the global frame. (n, 2)
@@ -129,6 +133,6 @@ def _raise_to_ground(
         rows = nearest == index
         local = views[index].lift(frame.to_frame(points[rows]))
         pose = frame.sample.global_from_frame
-        height = local @ pose[2, :3] + pose[2, 3]
+        height = local @ pose[2, :3] + pose[2, 3]  # the third row of the pose gives z
         raised[rows] = np.column_stack([points[rows], height])
     return raised

@@ -1,4 +1,4 @@
-"""Scores of maps of drives: AP of elements, completeness and accuracy of their length."""
+"""Scores of maps of drives: AP of elements, completeness and accuracy of lengths."""
 
 from collections.abc import Mapping, Sequence
 
@@ -15,8 +15,8 @@ from gsmap.structures.polylines import clip_to_box
 from gsmap.utils.words import markdown_table
 
 NUM_POINTS = 1000
-"""Number of points that elements of drives, hundreds of metres long, are resampled to."""
-_NUM_POINTS_OF_SAMPLES = 100
+"""Number of points to which elements of drives, hundreds of metres long, are resampled."""
+_NUM_POINTS_OF_SAMPLES = 100  # number of points for elements within the range of one sample
 
 
 def chamfer_ap(
@@ -54,7 +54,7 @@ def _with_mean(value_of_class: dict[str, float]) -> dict[str, float]:
 def near_and_total_m(
     lines: MapElements, other: MapElements, label: int, within_m: float
 ) -> FloatArray:
-    """Measure the length of the lines of a class, near another map and in all.
+    """Measure the length of the lines of a class: the part near another map, and the total.
 
     Args:
         lines: Map whose lines are measured.
@@ -78,7 +78,7 @@ def _linestrings(elements: MapElements, label: int) -> np.ndarray:
 
 
 def cut_to_frame(elements: MapElements, drive: Drive, frame: DriveFrame) -> MapElements:
-    """Cut the range of a frame out of the map of a drive, as ground truth is cut out of a map.
+    """Cut the range of a frame out of the map of a drive, by the rules for ground truth.
 
     Args:
         elements: Map in the global frame.

@@ -10,8 +10,8 @@ from gsmap.structures.elements import FloatArray
 from gsmap.structures.polylines import arc_lengths
 
 JOIN_M = 2.0  # largest gap that is closed
-_HEADING_M = 2.0  # length at an end of a line that defines its direction there
-_GAP_STEP_M = 0.25  # gaps are rounded to this; of equal ones the straightest is closed first
+_HEADING_M = 2.0  # the last 2 m of a line define its direction at an end
+_GAP_STEP_M = 0.25  # gaps are rounded to this; the straightest of equal ones is closed first
 _RING_M = 10.0  # smallest length of a line that is closed to a ring
 
 
@@ -54,9 +54,9 @@ def _candidates(lines: Sequence[FloatArray]) -> list[tuple[int, int]]:
     ends = []
     headings = []
     for line in lines:
-        for part in (line[:, :2], line[::-1, :2]):
-            end = part[0]
-            inner = shapely.line_interpolate_point(shapely.LineString(part), _HEADING_M)
+        for from_end in (line[:, :2], line[::-1, :2]):  # begins at the first end, at the last end
+            end = from_end[0]
+            inner = shapely.line_interpolate_point(shapely.LineString(from_end), _HEADING_M)
             heading = end - shapely.get_coordinates(inner)[0]
             ends.append(end)
             headings.append(heading / max(np.linalg.norm(heading), 1e-9))
@@ -69,8 +69,10 @@ def _candidates(lines: Sequence[FloatArray]) -> list[tuple[int, int]]:
     cosine = (outward[first] * outward[second]).sum(axis=1)
     gap = np.linalg.norm(points[first] - points[second], axis=1)
     rounded_gap = np.round(gap / _GAP_STEP_M)
+    # Sort by gap, then by direction: a line goes straight on if its ends point at each other, with
+    # a cosine of -1. The indices of the ends decide last, for a fixed order.
     order = np.lexsort((second, first, cosine.round(6), rounded_gap))
-    continues = cosine[order] < 0.0
+    continues = cosine[order] < 0.0  # turns by less than a right angle
     return [(int(a), int(b)) for a, b in pairs[order[continues]]]
 
 
@@ -83,14 +85,14 @@ def _join_chain(
         lines: All lines. N x (n, D)
         partner_of: End that each joined end is joined to; line i has the ends 2 i and 2 i + 1.
         index: Index of a line of the chain.
-        visited: Indices of lines in previous chains; the lines of this chain are added.
+        visited: Indices of the lines in previous chains. This function adds the lines of the chain.
 
     Returns:
         Vertices without successive equal ones. (m, D)
     """
     entry = 2 * index  # end at which the walk enters a line; the other end is entry ^ 1
     passed = {index}
-    # Walk back to an open end, or once around a ring.
+    # Walk from line to line until an end is not joined, or until all lines of a ring are passed.
     while entry in partner_of and partner_of[entry] // 2 not in passed:
         entry = partner_of[entry] ^ 1
         passed.add(entry // 2)
@@ -105,7 +107,8 @@ def _join_chain(
         parts.append(line if starts_at_first else line[::-1])
         following = partner_of.get(entry ^ 1)
         if following == start:
-            parts.append(parts[0][:1])
+            first_vertex = parts[0][:1]
+            parts.append(first_vertex)  # closes the ring
             break
     points = np.concatenate(parts)
     has_moved = (points[1:, :2] != points[:-1, :2]).any(axis=1)

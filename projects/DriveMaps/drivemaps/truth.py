@@ -12,7 +12,9 @@ from drivemaps.stitching import stitch
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
 
-GRID_M = 0.002  # snaps equal points of two samples, which differ by far less, by rounding
+# Vertices are rounded to this grid, so that a point that two samples have in common becomes equal
+# in both. By rounding errors of the poses, it differs by far less.
+GRID_M = 0.002
 _OVERLAP_M = 0.2  # pieces that share more length than this belong to one line
 
 
@@ -85,8 +87,9 @@ def _unite_areas(rings: Sequence[FloatArray]) -> list[FloatArray]:
 
 
 def _unite_lines(pieces: Sequence[FloatArray]) -> list[FloatArray]:
-    """Lines that are covered by overlapping pieces. each (n, 2)"""
+    """Unite pieces that run along each other to lines. each (n, 2)"""
     lines = np.array([shapely.LineString(piece) for piece in pieces], dtype=object)  # (N,)
+    # The length of a line inside of the strip around another line is their shared length.
     strips = shapely.buffer(lines, 2 * GRID_M, cap_style="flat")
     first, second = shapely.STRtree(strips).query(lines, predicate="intersects")
     shared_m = shapely.length(shapely.intersection(lines[first], strips[second]))
@@ -97,5 +100,5 @@ def _unite_lines(pieces: Sequence[FloatArray]) -> list[FloatArray]:
         united.append(shapely.line_merge(union))
     parts = shapely.get_parts(np.array(united, dtype=object))
     stitched = stitch([shapely.get_coordinates(part) for part in parts])
-    # after joining, as parts between two forks may be short
+    # Short lines are dropped only now, as a part between two forks may be short before stitching.
     return [line for line in stitched if shapely.LineString(line).length >= MIN_LENGTH_M]
