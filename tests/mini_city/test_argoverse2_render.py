@@ -204,7 +204,7 @@ def test_what_cannot_be_rendered_is_said_and_the_rest_goes_on(tmp_path):
     assert [path.name for path in out.iterdir()] == ["log-a"]
     text = render_logs(logs[:2], out, RenderOptions(scale=0.1, calibration=logs[0]))
     assert "7 pictures of 1 logs" in text
-    assert "is there already and kept" in text
+    assert "exists and is not replaced" in text
     assert set(Argoverse2Log(out / "log-b").calibration) == set(RING_CAMERAS)
 
 

@@ -117,7 +117,7 @@ class Shift:
         return abs(self.mean_m) >= max(smallest_m, _MIN_SIGMAS * self.std_m)
 
     def probability(self, smallest_m: float) -> float:
-        """Probability that the shift exceeds a distance, by its error and that of the old map."""
+        """Probability that the shift exceeds a distance, by its error and the old map's error."""
         sigma = float(np.hypot(self.std_m, _MAP_SIGMA_M))
         return float(ndtr((abs(self.mean_m) - smallest_m) / sigma))
 

@@ -36,7 +36,7 @@ def make_scene(
 ) -> SceneMap:
     """Lay out the ground of a log from its map.
 
-    Paint follows the lane markings and crossings of the map; a lane boundary without a marking has
+    Paint follows the lane markings and crossings of the map. A lane boundary without a marking gets
     no paint.
 
     Args:
@@ -107,8 +107,12 @@ def _unique_lines(lines: np.ndarray, window: shapely.Polygon) -> list[int]:
     tree = shapely.STRtree(lines)
     unique: set[int] = set()
     for i in sorted(tree.query(window, predicate="intersects").tolist()):
-        near = unique.intersection(tree.query(lines[i], "dwithin", distance=SAME_LINE_M).tolist())
-        if not any(shapely.hausdorff_distance(lines[i], lines[j]) < SAME_LINE_M for j in near):
+        close = tree.query(lines[i], predicate="dwithin", distance=SAME_LINE_M).tolist()
+        earlier = unique.intersection(close)
+        is_repeated = any(
+            shapely.hausdorff_distance(lines[i], lines[j]) < SAME_LINE_M for j in earlier
+        )
+        if not is_repeated:
             unique.add(i)
     return sorted(unique)
 
@@ -121,10 +125,11 @@ def _line_paint(line: np.ndarray, kind: str) -> list[np.ndarray]:
         return dashed_line(line, LINE_WIDTH_M, dash_m=DASH_M, gap_m=GAP_M)
     if kind.startswith(("DASH_SOLID", "SOLID_DASH")):  # one solid, one dashed line side by side
         curve = shapely.LineString(line)
-        dashed = np.array(curve.offset_curve(DOUBLE_GAP_M).coords)
-        solid = np.array(curve.offset_curve(-DOUBLE_GAP_M).coords)
-        if kind.startswith("SOLID"):
-            dashed, solid = solid, dashed
+        left = np.array(curve.offset_curve(DOUBLE_GAP_M).coords)
+        right = np.array(curve.offset_curve(-DOUBLE_GAP_M).coords)
+        is_left_solid = kind.startswith("SOLID")  # a kind names the left line first
+        solid = left if is_left_solid else right
+        dashed = right if is_left_solid else left
         dashes = dashed_line(dashed, LINE_WIDTH_M, dash_m=DASH_M, gap_m=GAP_M)
         return dashes + solid_line(solid, LINE_WIDTH_M)
     return solid_line(line, LINE_WIDTH_M)
@@ -155,10 +160,11 @@ def height_grid(
     cell_m = 1.0 / grid_from_city.s
     corners = grid_from_city.transform_from(np.array(bounds).reshape(2, 2))
     rows, columns = heights.array.shape
+    # First and last cell (column, row) inside the bounds; the range has at least one cell.
     low = np.clip(np.floor(corners[0]).astype(int), 0, (columns - 1, rows - 1))
     high = np.clip(np.ceil(corners[1]).astype(int), low + 1, (columns, rows))
     part = heights.array[low[1] : high[1], low[0] : high[0]].astype(np.float64)
-    # p_grid = s (p_city + t), with cells centred at + 0.5
+    # A point of the city is at p_grid = s (p_city + t), and the centre of cell i at i + 0.5.
     origin = (low + 0.5) * cell_m - grid_from_city.t
     x = origin[0] + np.arange(part.shape[1]) * cell_m
     y = origin[1] + np.arange(part.shape[0]) * cell_m

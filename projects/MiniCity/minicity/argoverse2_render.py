@@ -32,7 +32,8 @@ from minicity.lighting import random_lighting
 from minicity.renderer import SceneRenderer
 
 VIEW_M = 50.0
-GROUND_PIXELS_PER_IMAGE_PIXEL = 0.0625 * 800  # metres times image width, equal to MiniCity's
+# Edge of a ground pixel in metres, times the width of the image in pixels: 6.25 cm for 800 columns.
+GROUND_PIXELS_PER_IMAGE_PIXEL = 0.0625 * 800
 JPEG_QUALITY = 90
 
 
@@ -67,7 +68,8 @@ class RenderOptions:
 def scaled_camera(camera: PinholeCamera, scale: float) -> tuple[np.ndarray, int, int]:
     """Camera parameters for a scaled picture.
 
-    Integer pixel coordinates lie at pixel centres, so the picture's corner (-0.5, -0.5) is fixed.
+    Integer pixel coordinates lie at pixel centres. Scaling therefore keeps the corner of the
+    picture, at (-0.5, -0.5), in place.
 
     Args:
         camera: Camera of the log.
@@ -80,8 +82,8 @@ def scaled_camera(camera: PinholeCamera, scale: float) -> tuple[np.ndarray, int,
     height = max(1, round(camera.height_px * scale))
     ratio = np.array([width / camera.width_px, height / camera.height_px])
     intrinsics = camera.intrinsics.K.copy()
-    intrinsics[:2] *= ratio[:, None]
-    intrinsics[:2, 2] += 0.5 * (ratio - 1)
+    intrinsics[:2] *= ratio[:, None]  # focal lengths and principal point
+    intrinsics[:2, 2] += 0.5 * (ratio - 1)  # u + 0.5 is scaled, and not u
     return intrinsics, width, height
 
 
@@ -140,8 +142,8 @@ def _make_photographer(
 def render_log(log_dir: Path, out_dir: Path, options: RenderOptions) -> int:
     """Render a log into a folder of the official layout.
 
-    The folder appears when it is complete. It has the log's map, poses and calibration, the latter
-    for the scaled pictures.
+    The folder appears when it is complete. It has the log's map and poses, and a calibration for
+    the scaled pictures.
 
     Args:
         log_dir: Folder of the log.
@@ -158,7 +160,7 @@ def render_log(log_dir: Path, out_dir: Path, options: RenderOptions) -> int:
         OSError: If a file cannot be written, for example on a full disk; nothing is left behind.
     """
     if out_dir.exists():
-        raise FileExistsError(f"{out_dir} is there already and kept: delete it to render it again")
+        raise FileExistsError(f"{out_dir} exists and is not replaced: delete it to render it again")
     log = Argoverse2Log(log_dir)
     calibrated_log = log
     if not log.calibration and options.calibration is not None:
@@ -212,7 +214,9 @@ def _copy_log(log_dir: Path, calibrated_log: Argoverse2Log, target: Path, scale:
 
 
 def _try_log(log_dir: Path, out: Path, options: RenderOptions) -> int | str:
-    """Render a log into a folder of ``out``. A full disk raises, unlike an unusable log.
+    """Render a log into a folder of ``out``.
+
+    An unusable log is reported in the result. Other errors, such as a full disk, are raised.
 
     Returns:
         Number of pictures, or the reason for which the log cannot be rendered.

@@ -8,12 +8,15 @@ import numpy as np
 from gsmap.utils.errors import InputError
 from minicity.curves import Array
 
-NEAR_M = 0.25
+NEAR_M = 0.25  # least depth of points that are projected
 
 
 @dataclass(frozen=True)
 class Camera:
-    """Pinhole camera. Integer pixel coordinates lie at pixel centres; x right, y down, z forward.
+    """Pinhole camera.
+
+    The axes of the camera frame are x right, y down and z forward. Integer pixel coordinates lie at
+    pixel centres.
 
     Attributes:
         intrinsics: Focal lengths and principal point, in pixels. (3, 3)
@@ -77,12 +80,13 @@ def clip_near(polygon: Array, near_m: float = NEAR_M) -> Array:
         near_m: Least depth of the result, in metres.
 
     Returns:
-        Corners of the part with z >= ``near_m``; m is 0 where nothing is left. (m, 3)
+        Corners of the part with z >= ``near_m``; m is 0 if the whole polygon is behind it. (m, 3)
     """
     corners = []
     for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
         if a[2] >= near_m:
             corners.append(a)
         if (a[2] >= near_m) != (b[2] >= near_m):  # the edge from a to b crosses the plane
-            corners.append(a + (near_m - a[2]) / (b[2] - a[2]) * (b - a))
+            share = (near_m - a[2]) / (b[2] - a[2])  # of the edge, up to the crossing
+            corners.append(a + share * (b - a))
     return np.array(corners).reshape(-1, 3)

@@ -27,6 +27,7 @@ def pose_messages(
         Messages with position and orientation in the world, and velocity, acceleration (gravity
         included) and rotation rate in the car's frame, by central differences.
     """
+    # Half a step more than the duration includes the end in the range.
     times = np.arange(-0.1, duration_s + 0.5 / RATE_HZ, 1.0 / RATE_HZ)
     before = np.array([world_from_ego(float(t - STEP_S)) for t in times])
     now = np.array([world_from_ego(float(t)) for t in times])
@@ -35,6 +36,7 @@ def pose_messages(
     velocity = (after[:, :3, 3] - before[:, :3, 3]) / (2 * STEP_S)
     motion = (after[:, :3, 3] - 2 * now[:, :3, 3] + before[:, :3, 3]) / STEP_S**2
     acceleration = motion + np.array([0.0, 0.0, GRAVITY])
+    # Rotation of the car from before to after, in the car's frame.
     rotation = Rotation.from_matrix(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
     quaternions = Rotation.from_matrix(now[:, :3, :3]).as_quat()  # x, y, z, w
     fields = {

@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--preset",
         choices=sorted(PRESETS),
-        help="data set of a published comparison, in place of the options of size and seed below",
+        help="data set of a published comparison; it sets all options below but --workers",
     )
     parser.add_argument("--scenes", type=int, help="number of scenes, a fifth for validation")
     parser.add_argument("--seed", type=int, help="seed of every random choice (default: 0)")
@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--new-passes",
         type=int,
         metavar="M",
-        help="how many of the passes are new: after the repainting, for validation (default: 1)",
+        help="number of passes after the repainting, which validation uses (default: 1)",
     )
     parser.add_argument("--workers", type=int, help="processes (default: one per core)")
 

@@ -30,7 +30,8 @@ class MiniCityConfig:
         val_scenes: Validation scenes among ``scenes``; None takes a fifth, at least one.
         passes: Number of times that every scene is driven, in [1, 20].
         repainted: Share of the streets that are repainted between two passes, in [0, 1].
-        new_passes: Number of passes after the repainting, in [1, passes - 1] if there is one.
+        new_passes: Number of passes after the repainting, at least 1, and at most ``passes - 1`` if
+            there are several passes.
 
     Raises:
         ValueError: If a value is out of range.
@@ -69,7 +70,7 @@ class MiniCityConfig:
         self._check_passes()
 
     def _check_passes(self) -> None:
-        """Check the passes, and that the official split names their scenes."""
+        """Check the passes, and that the official split has enough names for their scenes."""
         if not 1 <= self.passes <= MAX_PASSES:
             raise InputError(f"passes must be in 1..{MAX_PASSES}, got {self.passes}.")
         if not 0 <= self.repainted <= 1:
@@ -79,8 +80,8 @@ class MiniCityConfig:
         most_new = max(1, self.passes - 1)
         if not 1 <= self.new_passes <= most_new:
             raise InputError(
-                f"new_passes must be in 1..{most_new}, one less than the passes, got "
-                f"{self.new_passes}."
+                f"new_passes must be in 1..{most_new}, as one pass is driven before the "
+                f"repainting, got {self.new_passes}."
             )
         train_names = self.num_train * self.passes
         val_names = self.num_val * self.passes
@@ -104,7 +105,7 @@ class MiniCityConfig:
     def as_dict(self) -> dict:
         """All values as JSON-ready fields, with the format version of the generator.
 
-        Fields of passes that have their default are left out.
+        The fields ``passes``, ``repainted`` and ``new_passes`` are left out at their defaults.
         """
         values = {"format": FORMAT, **asdict(self), "val_scenes": self.num_val}
         for name in ("passes", "repainted", "new_passes"):
@@ -129,12 +130,13 @@ PRESETS = {
 """Data sets of the published comparisons.
 
 ``protocol_s`` has 1,600 training and 400 validation samples. ``protocol_s_test`` has 500 validation
-samples in a town of another seed, for one final test of each model: no recipe, weight or epoch is
-chosen by it. Its single training scene is there for the format alone.
+samples in a town of another seed. It serves for one final test of each model: no recipe, weight or
+epoch may be chosen by it. Its single training scene exists because the format needs one.
 """
 
 
 def _digest(parts: tuple) -> bytes:
+    """Hash of some values, 16 bytes."""
     text = "|".join(map(str, parts))
     return hashlib.blake2b(text.encode(), digest_size=16).digest()
 

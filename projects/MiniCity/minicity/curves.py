@@ -38,6 +38,7 @@ def interpolate(values: Array, lengths: Array, at: Array) -> Array:
     Returns:
         Interpolated rows. (k, D)
     """
+    # `at` lies between the rows `left` and `left + 1`.
     left = np.clip(np.searchsorted(lengths, at, side="right") - 1, 0, len(lengths) - 2)
     span = np.maximum(lengths[left + 1] - lengths[left], 1e-12)
     share = np.clip((at - lengths[left]) / span, 0.0, 1.0)[:, None]
@@ -93,7 +94,7 @@ def hermite(
     Returns:
         Points at equal steps of the curve's parameter. (count, 2)
     """
-    t = np.linspace(0.0, 1.0, num=count)[:, None]
+    t = np.linspace(0.0, 1.0, num=count)[:, None]  # parameter of the curve
     reach = pull * float(np.linalg.norm(end - start))
     return (
         (2 * t**3 - 3 * t**2 + 1) * start
@@ -134,7 +135,7 @@ def rectangle(center: Array, yaw_rad: float, length_m: float, width_m: float) ->
     c = np.cos(yaw_rad)
     s = np.sin(yaw_rad)
     corners = 0.5 * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * [length_m, width_m]
-    return corners @ np.array([[c, s], [-s, c]]) + center
+    return corners @ np.array([[c, s], [-s, c]]) + center  # row vectors: the transposed rotation
 
 
 def unit(yaw_rad: float) -> Array:

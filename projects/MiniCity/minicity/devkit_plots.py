@@ -1,7 +1,7 @@
 """Draw a sample and the map around it with the nuScenes devkit.
 
-The devkit draws polygons with ``descartes``. Its last release is older than shapely 2 and expects
-rings as arrays, so `repair_descartes` replaces its conversion of polygons.
+The devkit draws polygons with the package ``descartes``, whose last release is older than shapely 2
+and expects rings as arrays. `repair_descartes` therefore replaces its conversion of polygons.
 """
 
 import argparse

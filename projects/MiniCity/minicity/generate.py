@@ -1,4 +1,4 @@
-"""Generate a MiniCity data set in the nuScenes format, whole or not at all."""
+"""Generate a MiniCity data set in the nuScenes format. An unfinished data set is never left."""
 
 import json
 import logging
@@ -26,7 +26,7 @@ from minicity.scene import Records, SceneMaker, SceneTask
 from minicity.town import Town, make_town
 
 MARKER = "minicity.json"
-BEFORE = ".before"  # ends the name of the map of a town before streets are repainted
+BEFORE = ".before"  # suffix of a town's name, for its map before streets are repainted
 CHANGES = "changes.geojson"
 TABLES = [
     "category",
@@ -51,7 +51,7 @@ LOGGER = logging.getLogger(__name__)
 def plan_scenes(config: MiniCityConfig) -> list[SceneTask]:
     """Name the scenes after the official split and distribute them among the towns.
 
-    A pass of all streets ends before the next one begins.
+    The scenes of one pass, which drives along every street once, come before those of the next.
     """
     from nuscenes.utils import splits
 
@@ -61,7 +61,7 @@ def plan_scenes(config: MiniCityConfig) -> list[SceneTask]:
         (splits.val, config.num_val, VAL_LOCATIONS),
     ):
         for i, name in enumerate(names[: count * config.passes]):
-            pass_index, route = divmod(i, count)
+            pass_index, route = divmod(i, count)  # `route` is the number of the street
             location = locations[route % len(locations)]
             is_new = pass_index >= config.passes - config.new_passes
             has_old_paint = config.repainted > 0 and not is_new
@@ -108,7 +108,7 @@ def generate(
         passes: Number of times that every scene is driven, at other hours and in other weather and
             traffic; the data set has ``scenes * passes`` scenes.
         repainted: Share of the streets that are repainted before the new passes, in [0, 1].
-        new_passes: Number of the last passes that are new.
+        new_passes: Number of passes after the repainting, the last ones.
         workers: Number of processes; None takes one per core, 0 or 1 works in this process.
         progress: Whether to show a progress bar.
 
@@ -185,18 +185,20 @@ def is_complete(root: Path, config: MiniCityConfig) -> bool:
 
 @contextmanager
 def _partial_folder(root: Path) -> Iterator[Path]:
-    """Lock a folder beside ``root`` for writing, and delete it if writing fails."""
+    """Create and lock a folder beside ``root`` for writing, and delete it if writing fails."""
     root.parent.mkdir(parents=True, exist_ok=True)
     partial = root.with_name(f"{root.name}{SUFFIX}")
     require_no_link(partial)
     partial.mkdir(exist_ok=True)
     handle = os.open(partial, os.O_RDONLY | os.O_NOFOLLOW)
     try:
+        # None on a disk without locks, where only an empty folder is known to be unused.
         locked = try_lock(handle)
-        if not locked and (locked is False or any(partial.iterdir())):
+        is_used = locked is False or (locked is None and any(partial.iterdir()))
+        if is_used:
             raise WorkError(
-                f"another process is generating into {partial}: wait for its end, or, if there is "
-                "none and this disk has no locks, remove that folder."
+                f"another process is generating into {partial}: wait for its end. If there is no "
+                "other process, and this disk has no locks, remove that folder."
             )
         try:
             for leftover in partial.iterdir():
@@ -213,7 +215,7 @@ def _partial_folder(root: Path) -> Iterator[Path]:
 
 
 def _fill(root: Path, config: MiniCityConfig, workers: int | None, progress: bool) -> None:
-    """Write every file of a data set but its marker."""
+    """Write every file of a data set except its marker, which shows that it is complete."""
     for mount in CAMERAS:
         (root / "samples" / mount.channel).mkdir(parents=True)
     (root / "samples" / "LIDAR_TOP").mkdir()
@@ -259,7 +261,8 @@ def _make_towns(
         tasks: All scenes.
 
     Returns:
-        Towns by the name of their map, and the path of the picture of each location.
+        Towns by the name of their map, and the path of the drivable-area picture of each location.
+        A location whose streets are repainted has two towns, before and after.
     """
     (root / "maps" / "expansion").mkdir(parents=True)
     street_counts = Counter(task.location for task in tasks if task.pass_index == 0)
@@ -291,7 +294,7 @@ def _pass_table(config: MiniCityConfig, tasks: list[SceneTask]) -> list[dict[str
                 "scene_token": make_token(config.seed, task.name, "scene"),
                 "scene": task.name,
                 "location": task.location,
-                "first_scene": task.route,  # on the same street
+                "first_scene": task.route,  # scene of the first pass of this street
                 "pass": task.pass_index + 1,
                 "passes": config.passes,
                 "map_expansion": task.expansion,
@@ -301,7 +304,10 @@ def _pass_table(config: MiniCityConfig, tasks: list[SceneTask]) -> list[dict[str
 
 
 def _splits(config: MiniCityConfig, tasks: list[SceneTask]) -> dict[str, list[str]]:
-    """Names of the scenes of each split; the earlier passes of validation are apart."""
+    """Names of the scenes of each split.
+
+    Validation scenes before the repainting form the split ``val_earlier``.
+    """
     splits: dict[str, list[str]] = {"train": [], "val": [], "val_earlier": []}
     for task in tasks:
         split = "train"
@@ -360,7 +366,7 @@ def _run_scenes(
     """Make all scenes in worker processes.
 
     Returns:
-        Records of each scene by table, by scene name.
+        Records of each scene, by its name and then by table.
     """
     wanted_workers = default_workers() if workers is None else max(workers, 1)
     workers = min(wanted_workers, len(tasks))

@@ -1,8 +1,9 @@
 """Ground in a camera's image, filtered so that thin paint survives at a distance.
 
-Far away a pixel covers much more ground along the line of sight than across it. A plain mip-map
-would blur a lane line of 15 cm away, so image rows are grouped into bands, each sampled several
-times per row from the texture level that fits its width.
+Far from the camera, a pixel covers much more ground along the line of sight than across it. A plain
+mip-map, whose level fits the length of this footprint, would blur away a lane line of 15 cm. Here
+the texture level fits the width of the footprint, and each image row takes several samples along
+its length. Adjacent rows with equal levels and numbers of samples form a band.
 """
 
 from dataclasses import dataclass
@@ -16,8 +17,8 @@ from minicity.scene_map import HeightGrid
 from minicity.terrain import Footprints, make_terrain, terrain_footprints
 from minicity.texture import GroundTexture, Image
 
-MAX_SAMPLES = 8
-HORIZON_EPS = 1e-4
+MAX_SAMPLES = 8  # largest number of samples per image row
+HORIZON_EPS = 1e-4  # rays that fall less than this are above the horizon
 Color = tuple[float, float, float]
 
 
@@ -40,6 +41,7 @@ class Band:
     def sample_rows(self) -> Array:
         """Image rows of the samples, in pixels. ((stop - start) * samples,)"""
         count = (self.stop - self.start) * self.samples
+        # The first row begins at `start - 0.5`. A sample is in the middle of its part of a row.
         return self.start - 0.5 + (np.arange(count) + 0.5) / self.samples
 
 
@@ -66,10 +68,12 @@ def plane_footprints(camera: Camera, homography: Array) -> Footprints:
     Returns:
         Footprints of all rows.
     """
-    rows = np.arange(camera.height + 1)
+    rows = np.arange(camera.height + 1)  # one more, for the lower edge of the last row
     column = np.full(rows.shape, (camera.width - 1) / 2)
+    # Upper edge of each row, in homogeneous coordinates of the ground. (3, H + 1)
     center = homography @ np.stack([column, rows - 0.5, np.ones(rows.shape)])
     beside = homography @ np.stack([column + 1, rows - 0.5, np.ones(rows.shape)])
+    # The third coordinate is the fall of a ray. A bound keeps rays above the horizon finite.
     hit = center[:2] / np.minimum(center[2], -4 * HORIZON_EPS)
     hit_beside = beside[:2] / np.minimum(beside[2], -4 * HORIZON_EPS)
     distance = np.linalg.norm(hit - camera.center[:2, None], axis=0)
@@ -95,6 +99,8 @@ def make_bands(footprints: Footprints, resolution_m: float, num_levels: int) -> 
     Returns:
         Bands from the top of the image to its bottom.
     """
+    # Texture pixels should be as large as the footprint is wide, and so large that `MAX_SAMPLES` of
+    # them cover its length. By the factor 1.2, they may be up to 20 percent larger.
     target = np.maximum(footprints.across, footprints.along / MAX_SAMPLES)
     fit = np.floor(np.log2(np.maximum(target / resolution_m, 1.0) * 1.2))
     levels = np.clip(fit, 0, num_levels - 1).astype(int)
@@ -104,11 +110,15 @@ def make_bands(footprints: Footprints, resolution_m: float, num_levels: int) -> 
     for row in np.flatnonzero(footprints.visible).tolist():
         level = int(levels[row])
         count = int(samples[row])
-        last = bands[-1] if bands else None
-        if last and last.stop == row and (last.level, last.samples) == (level, count):
-            bands[-1] = Band(last.start, row + 1, level=level, samples=count)
-        else:
-            bands.append(Band(row, row + 1, level=level, samples=count))
+        start = row
+        if bands:
+            last = bands[-1]
+            is_adjacent = last.stop == row
+            is_equal = (last.level, last.samples) == (level, count)
+            if is_adjacent and is_equal:
+                bands.pop()  # the band goes on with this row
+                start = last.start
+        bands.append(Band(start, row + 1, level=level, samples=count))
     return bands
 
 
@@ -140,6 +150,7 @@ def render_flat_ground(
     skyline = _plane_skyline(camera, homography[2])
     footprints = plane_footprints(camera, homography)
     for band in make_bands(footprints, texture.resolution_m, num_levels=len(texture.levels)):
+        # As in `Band.sample_rows`: row k of the samples is at row first_row + k / band.samples.
         first_row = band.start - 0.5 + 0.5 / band.samples
         pixel_from_sample = np.array([[1.0, 0, 0], [0, 1.0 / band.samples, first_row], [0, 0, 1.0]])
         samples = cv2.warpPerspective(
@@ -193,6 +204,8 @@ def render_uneven_ground(
 
 def _plane_skyline(camera: Camera, horizon: Array) -> Array:
     """Image row of a plane's horizon in every column, from the homography's third row (3,). (W,)"""
+    # Row v of column u at which h0 u + h1 v + h2 = -HORIZON_EPS. A camera that is not upside down
+    # has h1 < 0, as its rays fall from row to row.
     slope = min(horizon[1], -1e-9)
     return -(horizon[0] * np.arange(camera.width) + horizon[2] + HORIZON_EPS) / slope
 
@@ -204,7 +217,7 @@ def _paste_band(image: Image, samples: Image, band: Band, skyline: Array) -> Non
         size = (image.shape[1], band.stop - band.start)
         rows = cv2.resize(samples, size, interpolation=cv2.INTER_AREA)
     target = image[band.start : band.stop]
-    if skyline.max() < band.start:
+    if skyline.max() < band.start:  # no sky in these rows
         target[:] = rows
         return
     below = np.arange(band.start, band.stop)[:, None] > skyline

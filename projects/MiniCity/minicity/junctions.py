@@ -44,7 +44,9 @@ class Connector:
 
 
 def mouth(road: Road, at_start: bool) -> Array:
-    """Mouth of a road from its right to its left kerb as a driver in the junction faces it.
+    """Mouth of a road: its cross-section where it meets a junction.
+
+    Points go from the right to the left kerb, for a driver who leaves the junction along the road.
 
     Args:
         road: The road.
@@ -55,6 +57,7 @@ def mouth(road: Road, at_start: bool) -> Array:
     """
     end = 0 if at_start else -1
     points = np.stack([road.line(offset_m)[end] for offset_m in road.section.all_offsets])
+    # Offsets go from right to left along the centre line, which enters the junction at its end.
     return points if at_start else points[::-1]
 
 
@@ -81,6 +84,8 @@ def make_junction(node: int, arms: list[tuple[int, bool]], roads: list[Road]) ->
     ring = []
     for i in range(len(arms)):
         j = (i + 1) % len(arms)
+        # The corner leads from the left kerb of road i, into the junction, and to the right kerb of
+        # the next road.
         turn_rad = float(np.arccos(np.clip(-outward[i] @ outward[j], -1, 1)))
         corner = hermite(
             start=mouths[i][-1],
@@ -111,7 +116,7 @@ def _choose_target(source: Lane, lanes_in: int, targets: list[Lane]) -> Lane | N
         targets: Lanes that leave the junction on one road, from the innermost.
 
     Returns:
-        The lane, or None where this turn is made from another lane.
+        The lane. None if drivers make this turn from another lane than ``source``.
     """
     angle = _turning_angle(source, targets[0])
     if angle > STRAIGHT_RAD:

@@ -15,7 +15,7 @@ RANGE_NOISE_M = 0.015
 
 
 def footprint_array(footprints: list[Array], heights: list[float]) -> Array:
-    """Pack rectangles and their heights into rows.
+    """Pack boxes, given by rectangles on the ground and heights, into rows.
 
     Args:
         footprints: Corners x, y of each rectangle in metres. Each (4, 2)
@@ -97,19 +97,21 @@ def scan(
     elevation = np.linspace(LOWEST_RAD, HIGHEST_RAD, num=BEAMS)
     level = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
     slope = np.tan(elevation)
+    # Horizontal distance at which each beam meets the ground, z = 0; inf for level and rising ones.
     ground = np.where(slope < -1e-3, -origin[2] / np.minimum(slope, -1e-3), np.inf)
+    # Horizontal distance and box of the hit of each ray; -1 stands for the ground.
     reach = np.broadcast_to(ground[:, None], (BEAMS, COLUMNS)).copy()
     hit_box = np.full((BEAMS, COLUMNS), -1)
     corner_distances = np.linalg.norm(boxes[:, :8].reshape(-1, 4, 2) - origin[:2], axis=-1)
     near = boxes[corner_distances.min(axis=1) < RANGE_M]
-    entry = _entry_distances(origin[:2], level, boxes=near)
+    entry = _entry_distances(origin[:2], level, boxes=near)  # (COLUMNS, boxes)
     column, box = np.nonzero(np.isfinite(entry))
     # Far hits first: of several hits of one ray, the nearest is written last and stays.
     order = np.argsort(-entry[column, box], kind="stable")
     column = column[order]
     box = box[order]
     distance = entry[column, box]
-    height = origin[2] + slope[:, None] * distance
+    height = origin[2] + slope[:, None] * distance  # of each beam at each hit. (BEAMS, hits)
     # A ray above the ground, z = 0, at the box has not met the ground: the box is nearer.
     rows, hit = np.nonzero((height > 0) & (height < near[box, 8]))
     reach[rows, column[hit]] = distance[hit]

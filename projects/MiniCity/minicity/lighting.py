@@ -21,7 +21,7 @@ CLEAR_WARMTH = (-0.04, 0.04)  # share of the gain added to red and subtracted fr
 RAIN_STREAKS = (60, 160)
 VEILED_ELEVATION_RAD = 0.3  # elevation of a sun behind clouds
 
-SKY_CURVE = 0.6  # exponent below 1: the colour changes fastest just above the horizon
+SKY_CURVE = 0.6  # an exponent below 1 lets the colour change fastest just above the horizon
 WET_SLOPE = 0.12  # slope of the line of sight at which the mirroring drops to 1 / e
 LEAST_VEIL = 0.02  # weaker haze is left out
 NEAREST_GROUND_M = 0.1
@@ -99,7 +99,7 @@ def random_lighting(rng: np.random.Generator) -> Lighting:
     streaks = 0
     if weather == "rain":
         streaks = int(rng.integers(RAIN_STREAKS[0], RAIN_STREAKS[1]))
-    level = np.cos(elevation)
+    level = np.cos(elevation)  # horizontal part of the direction towards the sun
     blue, green, red = _GAINS[column]
     look = {name: values[column] for name, values in _LOOKS.items()}
     return Lighting(
@@ -124,6 +124,7 @@ def render_sky(camera: Camera, lighting: Lighting) -> Image:
     rows = np.arange(camera.height)
     pixels = np.stack([np.full(rows.shape, camera.width / 2), rows, np.ones(rows.shape)])
     directions = camera.world_from_pixel @ pixels
+    # Sine of the elevation of each row, which is 0 at the horizon and 1 overhead.
     rise = np.clip(directions[2] / np.linalg.norm(directions, axis=0), 0, 1) ** SKY_CURVE
     top = np.array(lighting.sky_top)
     low = np.array(lighting.haze)
@@ -164,11 +165,13 @@ def finish(image: Image, lighting: Lighting, rng: np.random.Generator) -> Image:
     Returns:
         The finished picture, BGR. (H, W, 3)
     """
+    # New value of each value of a pixel, for each colour channel. (256, 3)
     table = np.clip(np.arange(256)[:, None] * np.array(lighting.gain), 0, 255).astype(np.uint8)
-    image = cv2.LUT(image, np.ascontiguousarray(table[:, None]))  # table as (256, 1, 3)
+    image = cv2.LUT(image, np.ascontiguousarray(table[:, None]))  # OpenCV takes (256, 1, 3)
     if lighting.streaks:
         _draw_streaks(image, lighting, rng=rng)
     rows, columns = image.shape[:2]
+    # The noise of a picture is a random part of a fixed tile, which repeats for large pictures.
     tile = _sensor_noise(lighting.noise)
     room = (max(1, NOISE_PX - rows), max(1, NOISE_PX - columns))
     top, left = rng.integers(0, room).tolist()

@@ -34,8 +34,8 @@ LAYERS = [
     "traffic_light",
     "lane_connector",
 ]
-MASK_RESOLUTION_M = 0.1
-PIECE_M = 4.0
+MASK_RESOLUTION_M = 0.1  # edge of a pixel of the drivable-area picture
+PIECE_M = 4.0  # approximate length of the pieces of a centre line
 
 
 def _rings(polygon: Polygon) -> list[Array]:
@@ -74,6 +74,7 @@ class MapWriter:
     def polygon(self, polygon: Polygon) -> str:
         """Add a polygon in metres and return its token."""
         token = self._token("polygon")
+        # The format does not repeat the first node of a ring.
         exterior, *holes = [self._nodes(ring[:-1]) for ring in _rings(polygon)]
         self.tables["polygon"].append(
             {
@@ -108,6 +109,7 @@ class MapWriter:
 
     def add_road(self, road: Road) -> None:
         """Add the surface, blocks, dividers, crossings and stop lines of a road."""
+        # A road with a median has two segments; the following records refer to the last one.
         for surface in road_surface(road):
             segment = self.add(
                 "road_segment",
@@ -203,7 +205,7 @@ class MapWriter:
     def _add_center(self, token: str, center: Array) -> None:
         """Add the centre line (n, 2) of a lane or connector as an arc-line path of straight pieces.
 
-        The path starts without neighbours in the connectivity.
+        The connectivity gets an entry for the lane without any neighbours, which are added later.
         """
         lengths = arc_lengths(center)
         count = max(1, round(lengths[-1] / PIECE_M))
@@ -219,6 +221,8 @@ class MapWriter:
                 {
                     "start_pose": [float(a[0]), float(a[1]), yaw],
                     "end_pose": [float(b[0]), float(b[1]), yaw],
+                    # A Dubins path: left turn, straight, right turn. Both turns have no length, so
+                    # their radius has no effect.
                     "shape": "LSR",
                     "radius": 999.999,
                     "segment_length": [0.0, length, 0.0],
@@ -303,6 +307,7 @@ def write_mask(root: Path, town: Town, seed: int) -> str:
         rings_px = []
         for ring in _rings(polygon):
             x, y = (ring / MASK_RESOLUTION_M).T
+            # Row 0 of the picture is at the largest y.
             rings_px.append(np.round(np.column_stack([x, size - y])).astype(np.int32))
         cv2.fillPoly(mask, rings_px, color=(255.0,))
     name = f"maps/{make_token(seed, town.name, 'mask')}.png"

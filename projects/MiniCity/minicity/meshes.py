@@ -136,7 +136,7 @@ class FrozenMesh:
 
 
 def merge(first: FrozenMesh, second: FrozenMesh) -> FrozenMesh:
-    """Concatenate two meshes; the objects of the second one are numbered after the first one's."""
+    """Concatenate two meshes. Objects of the second mesh are numbered on after the first mesh."""
     shift = len(first.anchors)
     return FrozenMesh(
         quads=np.concatenate([first.quads, second.quads]),
@@ -185,6 +185,7 @@ def patches(face: Array, left: Array, right: Array, bottom: Array, top: Array) -
     Returns:
         Corners of each part in the order of ``face``, in metres. (n, 4, 3)
     """
+    # Shares of the width and of the height for the four corners of each part. (n, 4, 1)
     across = np.stack([left, right, right, left], axis=1)[..., None]
     upward = np.stack([bottom, bottom, top, top], axis=1)[..., None]
     foot = face[0] + across * (face[1] - face[0])
@@ -258,7 +259,7 @@ def add_tree(mesh: Mesh, tree: Array, ground_z_m: float = 0.0) -> None:
     for side in prism_faces(trunk, low_m=ground_z_m, high_m=trunk_top)[:4]:
         mesh.add_quad(side, BARK)
     radius = 0.24 * height
-    shade = 0.8 + 0.05 * (int(x * 10) % 7)
+    shade = 0.8 + 0.05 * (int(x * 10) % 7)  # differs from tree to tree by its position
     for dx, dy, dz, tone in CROWN:
         above = 0.68 * height + radius * dz
         spot = np.array([x + radius * dx, y + radius * dy, ground_z_m + above])

@@ -14,7 +14,7 @@ STATION_M = 3.0  # distance of the points of a centre line
 MIN_ROAD_M = 40.0
 CORNER_M = (4.0, 8.0)
 BEND_CUT_M = 40.0  # length of a street that the curve of a bend replaces, on each side
-STEPS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
+STEPS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])  # to the neighbour at arm 0, 1, 2 and 3
 
 
 @dataclass
@@ -73,7 +73,7 @@ def _remove_streets(nodes: list[Node], rng: np.random.Generator) -> None:
     """Remove random streets in place; each node keeps at least two."""
     streets = []
     for i, node in enumerate(nodes):
-        for arm in (0, 1):
+        for arm in (0, 1):  # arms 2 and 3 are the streets of other nodes
             if node.neighbours[arm] is not None:
                 streets.append((i, arm))
     for k in rng.permutation(len(streets)):
@@ -82,7 +82,7 @@ def _remove_streets(nodes: list[Node], rng: np.random.Generator) -> None:
         assert other is not None
         if min(nodes[i].degree, nodes[other].degree) > 2 and rng.random() < 0.2:
             nodes[i].neighbours[arm] = None
-            nodes[other].neighbours[(arm + 2) % 4] = None
+            nodes[other].neighbours[(arm + 2) % 4] = None  # the street from its other end
 
 
 def random_section(rng: np.random.Generator) -> CrossSection:
@@ -135,11 +135,12 @@ def random_style(rng: np.random.Generator) -> RoadStyle:
 
 @dataclass
 class Chain:
-    """Street from one junction or dead end to the next, through nodes at which it merely bends.
+    """Street from one junction or dead end to the next, through nodes at which it only bends.
 
     Attributes:
         nodes: Node indices along the street.
-        arms: (arm at which it leaves the first node, arm at which it enters the last node).
+        arms: Arm of the first node at which the street leaves, and arm of the last node at which it
+            arrives.
         center: Centre line from node to node, in metres. (n, 2)
         section: Lanes across the street.
         style: Paint and surface.
@@ -221,7 +222,7 @@ def _follow_street(nodes: list[Node], start: int, arm: int, rng: np.random.Gener
     assert current is not None
     visited = [start, current]
     while nodes[current].degree == 2:
-        back = (arm + 2) % 4
+        back = (arm + 2) % 4  # arm at which the street arrives
         arm = next(a for a in range(4) if a != back and nodes[current].neighbours[a] is not None)
         center = _join_at_bend(center, _curve_to_neighbour(nodes, current, arm))
         following = nodes[current].neighbours[arm]
@@ -240,8 +241,8 @@ def _follow_street(nodes: list[Node], start: int, arm: int, rng: np.random.Gener
 def _half_widths(chain: Chain, at_start: bool) -> tuple[float, float]:
     """Distances of the left and the right kerb from the centre line, in metres.
 
-    Left and right are seen from the junction along the street. A section has them along its centre
-    line, so they are exchanged at its end.
+    Left and right are meant for a driver who leaves the junction. At the end of the street, this is
+    against the centre line, so the sides of the section are exchanged.
     """
     left = chain.section.left_m
     right = -chain.section.right_m  # offsets to the right are negative
@@ -251,8 +252,9 @@ def _half_widths(chain: Chain, at_start: bool) -> tuple[float, float]:
 def mouth_distances(arms: list[tuple[float, float, float]], corner_m: float) -> list[float]:
     """Distance from the centre of a junction at which each of its roads ends.
 
-    Two neighbouring kerbs meet at ``(w2 + w1 cos(phi)) / sin(phi)`` along the first road, with
-    ``phi`` the angle between the roads and ``w`` the half widths; the corner's radius is added.
+    The kerbs between two neighbouring roads meet at ``(w2 + w1 cos(phi)) / sin(phi)`` along the
+    first road. Here ``phi`` is the angle between the roads, and ``w1`` and ``w2`` are the half
+    widths of both roads on the facing sides. Space for the rounded corner is added.
 
     Args:
         arms: (angle in radians, left half width, right half width in metres) of each road, in
@@ -269,11 +271,11 @@ def mouth_distances(arms: list[tuple[float, float, float]], corner_m: float) -> 
         angle = (arms[j][0] - arms[i][0]) % (2 * np.pi)
         if angle > 0.9 * np.pi or count == 1:
             continue
-        w1 = arms[i][1]
-        w2 = arms[j][2]
-        for k, near, far in ((i, w1, w2), (j, w2, w1)):
+        w1 = arms[i][1]  # left side of road i
+        w2 = arms[j][2]  # right side of the next road
+        for road, near, far in ((i, w1, w2), (j, w2, w1)):
             meet = (far + near * np.cos(angle)) / np.sin(angle)
-            distances[k] = max(distances[k], meet + corner_m)
+            distances[road] = max(distances[road], meet + corner_m)
     return [float(d) for d in distances]
 
 
@@ -289,8 +291,9 @@ def make_roads(
         name: Name of the town.
 
     Returns:
-        The roads; and per node, (road index, whether the road starts there, angle in radians) of
-        each road, anticlockwise by angle.
+        The roads, one for each street and in their order. For each node, the list of roads that
+        meet there, anticlockwise: index of the road, whether it starts there, and its angle in
+        radians.
     """
     meetings: list[list[tuple[int, bool, float]]] = [[] for _ in nodes]
     for c, chain in enumerate(chains):
@@ -298,7 +301,7 @@ def make_roads(
             node = chain.nodes[end]
             angle = nodes[node].turn_rad + chain.arms[end] * np.pi / 2
             meetings[node].append((c, at_start, float(angle % (2 * np.pi))))
-    cuts = np.zeros((len(chains), 2))
+    cuts = np.zeros((len(chains), 2))  # length to cut off at the start and at the end, in metres
     for n, meeting in enumerate(meetings):
         meeting.sort(key=lambda m: m[2])
         if nodes[n].degree < 3:

@@ -82,7 +82,7 @@ def _add_road(scene: SceneMap, road: Road) -> None:
 def divider_pieces(road: Road) -> list[tuple[float, float]]:
     """Arc lengths (start, end) of the pieces of divider paint, in metres.
 
-    Paint is interrupted at crossings between the ends of the road.
+    Crossings within the painted part of the road interrupt the paint, with 0.4 m to spare.
     """
     pieces = []
     start = road.clear_start_m
@@ -201,7 +201,8 @@ def _arrows(road: Road) -> list[Array]:
         (road.stop_forward, road.forward_edges, 1),
         (road.stop_backward, road.backward_edges, -1),
     ):
-        if stop is None or len(edges) < 3 or road.length_m < 40:
+        has_several_lanes = len(edges) > 2  # n lanes have n + 1 edges
+        if stop is None or not has_several_lanes or road.length_m < 40:
             continue
         arc_m = stop[0] - 7.0 if sign > 0 else stop[1] + 7.0
         forward = unit(road.direction(arc_m)) * sign

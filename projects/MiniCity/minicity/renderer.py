@@ -18,15 +18,15 @@ from minicity.terrain import sample_height
 from minicity.texture import SHIFT, GroundTexture, Image, darken, paint_ground
 from minicity.vehicles import Vehicle, vehicle_mesh
 
-FAR_M = 160.0
-SMALL_FAR_M = 90.0
-MIN_PIXELS = 1.2
-BACKDROP_RADIUS_M = 26.0
-SMALL_RADIUS_M = 9.0
-SHADOW_FAR_M = 45.0
+FAR_M = 160.0  # largest distance of visible buildings
+SMALL_FAR_M = 90.0  # largest distance of other visible objects
+MIN_PIXELS = 1.2  # quads with a smaller extent are not drawn
+BACKDROP_RADIUS_M = 26.0  # radius of a sphere around any building
+SMALL_RADIUS_M = 9.0  # radius of a sphere around any other object
+SHADOW_FAR_M = 45.0  # largest distance of vehicles with a shadow
 LIGHT_UNDER_VEHICLES = 0.62  # share of light left under a vehicle without sun
 LIGHT_IN_SHADOW = 0.52  # share of light left under a vehicle and in its shadow with sun
-LOWEST_SUN = 0.2  # sine of the elevation at which shadows have their greatest length
+LOWEST_SUN = 0.2  # sine of the elevation below which shadows do not become longer
 TOP_LIGHT = 0.1  # share of the ambient light that depends on the upward part of the normal
 GLOW = 1.3  # brightness of lamps and lit windows under any light
 PAINTED_MARGIN_M = 50.0  # extent of the painted ground around a camera
@@ -42,11 +42,11 @@ class SceneRenderer:
         bounds: xmin, ymin, xmax, ymax of the painted ground in the world, in metres: about 50 m
             around every camera.
         lighting: Light and weather.
-        resolution_m: Edge of a ground pixel in metres, > 0; 0.06 suits images 800 pixels wide,
-            0.12 images of 400.
+        resolution_m: Edge of a ground pixel in metres, > 0. Suitable values are 0.06 for images 800
+            pixels wide, and 0.12 for 400 pixels.
         rng: Source of the surface noise.
         static: Buildings, trees and poles.
-        shadows: Outlines of their shadows on the ground, in metres. Each (n, 2)
+        shadows: Outlines of the shadows of ``static`` on the ground, in metres. Each (n, 2)
 
     Raises:
         ValueError: If ``bounds`` have no area or ``resolution_m`` is not positive.
@@ -148,7 +148,9 @@ def _shade_under(image: Image, camera: Camera, vehicles: list[Vehicle], lighting
     forward = camera.cam_from_world[2, :3]  # optical axis in the world
     for vehicle in vehicles:
         sight = vehicle.center - camera.center
-        if np.hypot(sight[0], sight[1]) > SHADOW_FAR_M or sight @ forward < -SMALL_RADIUS_M:
+        is_far = np.hypot(sight[0], sight[1]) > SHADOW_FAR_M
+        is_behind = sight @ forward < -SMALL_RADIUS_M
+        if is_far or is_behind:
             continue
         outline = vehicle_shadow(vehicle, lighting)
         z = float(vehicle.center[2] - vehicle.size[2] / 2)
@@ -202,7 +204,8 @@ class _Drawable:
     """Polygon or disc in image coordinates.
 
     Attributes:
-        order: Sort key: (1 for objects before buildings, -distance of the object, layer, -depth).
+        order: Sort key, smallest drawn first: 0 for buildings and 1 for other objects, minus the
+            distance of the object, the layer inside the object, and minus the depth of the shape.
         group: Index of the object.
         polygon: Corners in fixed-point pixels, or None. (n, 2)
         disc: x, y and radius in fixed-point pixels, or None.
@@ -217,7 +220,7 @@ class _Drawable:
 
 
 def draw_mesh(image: Image, camera: Camera, mesh: FrozenMesh, lighting: Lighting) -> None:
-    """Draw a mesh into a picture, buildings before all else, far objects first, in place.
+    """Draw a mesh into a picture, in place: buildings first, then other objects, far ones first.
 
     Args:
         image: Picture with sky and ground, BGR. (H, W, 3)
@@ -277,7 +280,7 @@ def _visible_quads(
     corners = camera.to_camera(mesh.quads[index])
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0])
     # Camera coordinates start at the camera, so `corners` are directions of sight.
-    facing = np.einsum("ij,ij->i", normals, corners[:, 0]) < 0
+    facing = np.einsum("ij,ij->i", normals, corners[:, 0]) < 0  # normals point to the camera
     in_front = (corners[..., 2] > NEAR_M).any(axis=1)
     candidates = facing & in_front
     index = index[candidates]
@@ -362,7 +365,7 @@ def _visible_discs(
     index = np.flatnonzero(visible[mesh.disc_groups])
     centers = camera.to_camera(mesh.discs[index, :3])
     light = lighting.ambient + lighting.direct * max(0.0, float(lighting.sun[2]))
-    scale = 1 << SHIFT
+    scale = 1 << SHIFT  # fixed-point steps of OpenCV per pixel
     for k in np.flatnonzero(centers[:, 2] > 1.0):
         x, y = camera.to_pixels(centers[k])
         radius = float(mesh.discs[index[k], 3] * camera.intrinsics[0, 0] / centers[k, 2])

@@ -17,7 +17,7 @@ MOVED = "moved"
 MOVE_M = 1.0
 CROSSING_DEPTH_M = 3.2
 CROSSING_CLEARANCE_M = 4.0  # between an added crossing and the next crossing or stop line
-SHORTEST_PIECE_M = 0.1  # of a divider that a crossing cuts
+SHORTEST_PIECE_M = 0.1  # shorter pieces of a divider, cut off by a crossing, are ignored
 Spans = list[tuple[float, float]]
 
 
@@ -40,7 +40,7 @@ class Change:
     after: Array | None = None
 
     def feature(self, map_name: str) -> dict[str, Any]:
-        """Feature of a GeoJSON file of changes.
+        """Feature of the change for a GeoJSON file. A moved element has its new position.
 
         Args:
             map_name: Name of the town, in whose global frame the coordinates are.
@@ -91,7 +91,8 @@ def repaint_town(town: Town, seed: int, share: float) -> tuple[Town, list[Change
         share: Share of the streets, in [0, 1].
 
     Returns:
-        The town with other paint and lanes, and every change. Surfaces and houses are shared.
+        The town with other paint and lanes, and every change. It has the surfaces and houses of the
+        given town.
     """
     roads = list(town.roads)
     changes: list[Change] = []
@@ -167,6 +168,7 @@ def list_changes(before: Road, after: Road) -> list[Change]:
                 changes.append(_change(before.index, kind, class_name="ped_crossing", points=ring))
     if before.shift_m != after.shift_m:
         return changes + _moved_dividers(before, after)
+    # A new crossing interrupts the dividers, and a removed one no longer does.
     pieces_before = divider_pieces(before)
     pieces_after = divider_pieces(after)
     for kind, pieces in (
@@ -210,6 +212,7 @@ def _subtract(spans: Spans, others: Spans) -> Spans:
     for other_start, other_end in others:
         remaining = []
         for start, end in parts:
+            # The parts before and after the other span; they may have a negative length.
             remaining.append((start, min(end, other_start)))
             remaining.append((max(start, other_end), end))
         parts = [(start, end) for start, end in remaining if end - start > SHORTEST_PIECE_M]

@@ -37,6 +37,8 @@ class CameraMount:
         """Intrinsic matrix for an image of ``width`` x ``height`` pixels. (3, 3)"""
         x_scale = width / BASE_WIDTH
         y_scale = height / BASE_HEIGHT
+        # Pixel centres are at integers, so the image begins at -0.5. The principal point lies 8
+        # columns and 30 rows from the middle of the full-size image.
         cx = (BASE_WIDTH / 2 + 8.0 + 0.5) * x_scale - 0.5
         cy = (BASE_HEIGHT / 2 + 30.0 + 0.5) * y_scale - 0.5
         return np.array(

@@ -7,9 +7,9 @@ import numpy as np
 
 from minicity.curves import Array, arc_lengths, interpolate, left_normals, tangents
 
-CROSSING_GAP_M = 0.8
-STOP_GAP_M = 1.0
-STOP_LINE_M = 0.45
+CROSSING_GAP_M = 0.8  # least distance from the end of a road to a crossing
+STOP_GAP_M = 1.0  # distance from a crossing to its stop line
+STOP_LINE_M = 0.45  # width of a stop line
 
 
 @dataclass(frozen=True)
@@ -130,8 +130,8 @@ class Road:
         clear_end_m: Arc length at which divider paint ends.
         stop_forward: Arc lengths (start, end) of the stop line for forward lanes, or None.
         stop_backward: Arc lengths (start, end) of the stop line for backward lanes, or None.
-        shift_m: Offset of the lines between lanes from their places in ``section``, in metres,
-            positive to the left. Kerbs and medians stay.
+        shift_m: Shift of the painted lines between lanes from the offsets of ``section``, in
+            metres, positive to the left. Kerbs and medians are not shifted.
     """
 
     index: int
@@ -196,7 +196,8 @@ class Road:
     def band_with_mouths(self, right_m: float, left_m: float) -> Array:
         """Outline of the whole road between two offsets in metres, anticlockwise. (n, 2)
 
-        Its ends have every vertex of the junctions' mouths, so that the outlines join.
+        At its ends, the outline has every vertex of the mouths of the junctions (`mouth`), so that
+        it meets the outlines of the junctions without a gap.
         """
         start_points = []
         end_points = []
@@ -239,6 +240,8 @@ class Road:
         """Shift the edges that are painted lines between two lanes."""
         if self.shift_m == 0:
             return edges
+        # Edges go from the centre to the kerb: the first one is a line or the median, and the last
+        # one is no line between lanes.
         first = 0 if self.has_center_line else 1
         last = len(edges) - 1
         shifted = []
@@ -291,6 +294,7 @@ class Road:
             at_start: Whether the crossing lies at the start of the centre line.
             stop: Whether to add a stop line before the crossing.
         """
+        # Distances from this end of the road: far side of the crossing, and start of the paint.
         far = start_m + depth_m
         clear = far + (STOP_GAP_M + STOP_LINE_M if stop else 0.3)
         if at_start:

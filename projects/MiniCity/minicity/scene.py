@@ -53,11 +53,11 @@ class SceneTask:
         name: Official scene name of nuScenes, whose split the scene is in.
         index: Number of the scene in the data set.
         location: Name of the town.
-        index_in_town: Number of the street within the town; scenes of one street share it.
+        index_in_town: Number of the street within the town, equal in all passes of the street.
         route: Name of the first scene on this street, whose random numbers choose the drive.
         pass_index: Number of earlier passes of the street.
-        expansion: Name of the map file: the location or, before streets are repainted, a name that
-            differs from the location.
+        expansion: Name of the map file. It is the location, or another name for a pass before
+            streets are repainted.
     """
 
     name: str
@@ -115,6 +115,7 @@ class SceneMaker:
         return make_token(self.config.seed, self.task.name, *parts)
 
     def _add(self, table: str, **record: Any) -> None:
+        """Add a record to a table."""
         self.records[table].append(record)
 
     def _make_renderer(self) -> SceneRenderer:
@@ -169,7 +170,7 @@ class SceneMaker:
             )
             for mount in CAMERAS:
                 self._take_picture(k, mount)
-            cloud = self._sweep(k, j=0)
+            cloud = self._sweep(k, j=0)  # sweep 0 is taken at the key frame
             self._annotate(k, cloud)
             if k < last:
                 for j in range(1, self.config.sweeps_per_sample + 1):
@@ -326,7 +327,7 @@ class SceneMaker:
             if num_points == 0:
                 continue
             length, width, height = vehicle.size
-            half_turn = vehicle.yaw_rad / 2
+            half_turn = vehicle.yaw_rad / 2  # for the quaternion (w, x, y, z) of a rotation about z
             self._add(
                 "sample_annotation",
                 token=self._token("annotation", vehicle.identity, k),
@@ -382,7 +383,8 @@ def _points_in_box(points: Array, vehicle: Vehicle) -> int:
     dx = points[:, 0] - vehicle.center[0]
     dy = points[:, 1] - vehicle.center[1]
     dz = points[:, 2] - vehicle.center[2]
-    # Only points near the box are rotated. Half of its diagonal is shorter than its length.
+    # Only points near the box are rotated. A point inside is at most half of the diagonal from the
+    # centre, and this is shorter than the length of the box.
     near = (np.abs(dx) < vehicle.size[0]) & (np.abs(dy) < vehicle.size[0])
     dx = dx[near]
     dy = dy[near]

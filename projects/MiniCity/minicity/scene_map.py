@@ -52,7 +52,7 @@ class Marking:
 
 @dataclass(frozen=True)
 class HeightGrid:
-    """Ground height on a regular grid; a point outside takes the height of the nearest cell.
+    """Ground height on a regular grid. A point outside has the height of the nearest cell.
 
     Attributes:
         origin: World x, y of the centre of cell (0, 0), in metres. (2,)
@@ -82,8 +82,8 @@ class SceneMap:
     """Ground of a scene.
 
     Attributes:
-        surfaces: Surfaces in the order of painting, later ones over earlier ones; ground without
-            a surface is grass.
+        surfaces: Surfaces in the order of painting, so a later one covers earlier ones. Ground
+            without a surface is grass.
         kerbs: Kerb lines in the world, in metres. Each (n, 2)
         markings: Paint over the surfaces.
         height: Height of uneven ground; None for flat ground at ``ground_z_m``.
@@ -125,6 +125,7 @@ def dashed_line(line: Array, width_m: float, dash_m: float, gap_m: float) -> lis
         One outline per dash. Each (m, 2)
     """
     total = float(arc_lengths(line)[-1]) if len(line) > 1 else 0.0
+    # A dash begins at least 0.3 m before the end of the line.
     starts = np.arange(0.0, max(total - 0.3, 0.0), dash_m + gap_m)
     outlines = []
     for start in starts:

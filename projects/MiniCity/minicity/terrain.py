@@ -1,4 +1,8 @@
-"""Intersections of a camera's rays with uneven ground."""
+"""Intersections of a camera's rays with uneven ground.
+
+A ray of a pixel is followed over the ground in a vertical plane. The ground is sampled at fixed
+distances from the camera (``RINGS``), for a part of the image columns.
+"""
 
 from dataclasses import dataclass
 
@@ -12,10 +16,10 @@ from minicity.curves import Array
 from minicity.scene_map import HeightGrid
 
 COLUMNS_PER_PICTURE = 100
-NEAREST_M, FARTHEST_M = 0.7, 160.0
-RINGS = 224
+NEAREST_M, FARTHEST_M = 0.7, 160.0  # range of the distances of height samples
+RINGS = 224  # number of distances
 NEWTON_STEPS = 2
-_ROW = 1024
+_ROW = 1024  # number of points that `sample_height` puts into a row
 
 
 def sample_height(grid: HeightGrid, points: Array) -> Array:
@@ -53,7 +57,8 @@ class Terrain:
         grid: Height of the ground.
         columns: Image columns in pixels. (c,)
         distances_m: Horizontal distances of the height samples in metres, ascending. (RINGS,)
-        lowest_row: Topmost image row of the ground up to each distance, in pixels. (RINGS, c)
+        lowest_row: Smallest image row, that is the topmost one, that shows ground up to each
+            distance, in pixels. (RINGS, c)
     """
 
     camera: Camera
@@ -88,6 +93,7 @@ class Terrain:
             ahead = sample_height(self.grid, eye[:2] + (reach + step)[..., None] * direction)
             above = eye[2] + reach * fall - here
             closing = fall - (ahead - here) / step  # derivative of `above` by the distance
+            # `closing` is kept away from 0, and a step changes the distance by at most a tenth.
             move = -above / np.where(np.abs(closing) < 1e-3, -1e-3, closing)
             reach = np.clip(reach + np.clip(move, -0.1 * reach, 0.1 * reach), 0.1, FARTHEST_M)
         return reach
@@ -102,7 +108,8 @@ class Terrain:
             Points for all image columns, in metres. (h, W, 2)
         """
         direction, _ = self._rays(rows)
-        hits = self.camera.center[:2] + self.distances(rows)[..., None] * direction
+        hits = self.camera.center[:2] + self.distances(rows)[..., None] * direction  # (h, c, 2)
+        # Interpolate from `columns` to all image columns, each between `left` and `left + 1`.
         image_columns = np.arange(self.camera.width)
         left = np.clip(
             np.searchsorted(self.columns, image_columns, side="right") - 1, 0, len(self.columns) - 2
@@ -143,6 +150,7 @@ def make_terrain(camera: Camera, grid: HeightGrid) -> Terrain:
         raise InputError(f"the picture must be at least 2 pixels wide, got {camera.width}.")
     columns = np.linspace(0.0, last, num=min(last, COLUMNS_PER_PICTURE) + 1)
     distances = np.geomspace(NEAREST_M, FARTHEST_M, num=RINGS)
+    # The ground of a column is sampled in the direction of one of its pixels below the middle.
     middle = np.stack([columns, np.full_like(columns, 0.65 * camera.height), np.ones_like(columns)])
     rays = (camera.world_from_pixel @ middle)[:2].T
     direction = rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-9)
@@ -151,8 +159,8 @@ def make_terrain(camera: Camera, grid: HeightGrid) -> Terrain:
     points_cam = camera.to_camera(world)
     in_front = points_cam[..., 2] > NEAR_M
     rows = camera.to_pixels(np.where(in_front[..., None], points_cam, [0.0, 0.0, 1.0]))[..., 1]
-    # Rows of ground that is behind the camera or far below the image: they still descend with the
-    # distance.
+    # Ground that is behind the camera or far below the image gets rows below the image. They
+    # decrease with the distance, as `Terrain.distances` interpolates between them.
     below_image = 10.0 * camera.height + 10.0 * np.geomspace(1.0, 0.1, num=RINGS)[:, None]
     rows = np.where(in_front, np.minimum(rows, below_image), below_image)
     return Terrain(

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from minicity.curves import Array
 from minicity.scene_map import MATERIALS, PAINTS, SceneMap
 
-SHIFT = 4
-TILE_PX = 1024
+SHIFT = 4  # fractional bits of OpenCV's fixed-point coordinates
+TILE_PX = 1024  # edge of the noise tiles
 LEVELS = 6
-BLOTCH_WEIGHT = 0.16  # of the large noise in the brightness of the ground
-GRAIN_WEIGHT = 0.75  # of the fine noise in the brightness of the ground
+BLOTCH_WEIGHT = 0.16  # weight of the large noise in the brightness of the ground
+GRAIN_WEIGHT = 0.75  # weight of the fine noise in the brightness of the ground
 Image = MatLike
 
 
@@ -62,9 +62,9 @@ def _noise_tiles() -> tuple[Image, Image]:
         scale = TILE_PX // cells
         fine = cv2.resize(coarse, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
         blotches += weight * fine[scale : scale + TILE_PX, scale : scale + TILE_PX]
-    # Ranks in place of values: a threshold then covers a known share of the ground.
+    # Each value is replaced by its rank, so that a threshold covers a known share of the ground.
     order = np.argsort(blotches, axis=None, kind="stable")
-    rank = np.argsort(order, kind="stable")
+    rank = np.argsort(order, kind="stable")  # the inverse permutation
     uniform = (rank * (255.0 / rank.size)).astype(np.uint8).reshape(TILE_PX, TILE_PX)
     normal = rng.standard_normal((TILE_PX, TILE_PX))
     grain = np.clip(128 + 20 * normal, 0, 255).astype(np.uint8)
@@ -113,6 +113,8 @@ def paint_ground(
     color[:] = MATERIALS["grass"]
     _paint_surfaces(color, scene, origin=origin, resolution_m=resolution_m)
     _paint_kerbs(color, scene, origin=origin, resolution_m=resolution_m)
+    # The noise has a mean of 128, by which the brightness is divided. Blotches have a mean of
+    # 127.5, and grain has 128.
     mean = 128 - BLOTCH_WEIGHT * 127.5 - GRAIN_WEIGHT * 128
     noise = cv2.addWeighted(blotches, BLOTCH_WEIGHT, grain, beta=GRAIN_WEIGHT, gamma=mean)
     color = cv2.multiply(color, cv2.merge([noise] * 3), scale=1 / 128)
@@ -194,9 +196,10 @@ def _paint_coat(
     """
     if not outlines:
         return None
-    # Drawn twice as fine and averaged: OpenCV rounds level edges to whole pixels.
+    # OpenCV rounds edges along the axes to whole pixels, so the paint is drawn at twice the
+    # resolution and averaged.
     px = [_fixed_point_pixels(outline, origin, resolution_m / 2) for outline in outlines]
-    all_px = np.concatenate(px) >> (SHIFT + 1)  # whole pixels of the texture
+    all_px = np.concatenate(px) >> (SHIFT + 1)  # whole pixels of the texture, without half pixels
     low = np.maximum(all_px.min(axis=0) - 2, 0)
     high = np.minimum(all_px.max(axis=0) + 3, blotches.shape[::-1])  # columns, rows
     if (high <= low).any():
@@ -207,7 +210,7 @@ def _paint_coat(
     rows = bottom - top
     columns = right - left
     fine = np.zeros((2 * rows, 2 * columns), dtype=np.uint8)
-    shift = (2 * low << SHIFT).astype(np.int32)
+    shift = (2 * low << SHIFT).astype(np.int32)  # corner of the window in fixed-point coordinates
     for outline in px:
         cv2.fillPoly(fine, [outline - shift], color=(255.0,), lineType=cv2.LINE_AA, shift=SHIFT)
     mask = cv2.resize(fine, (columns, rows), interpolation=cv2.INTER_AREA)

@@ -15,12 +15,13 @@ from minicity.roads import CROSSING_GAP_M, STOP_LINE_M, Lane, Road
 
 LaneKey = tuple[int, bool, int]
 """Identity of a lane within its town: road, direction and index."""
-MAX_SIDE = 8
-LARGEST_HOUSE_M = 22.0
+MAX_SIDE = 8  # largest number of grid nodes along an edge of a town
+LARGEST_HOUSE_M = 22.0  # houses whose centres are farther apart, in x or y, cannot touch
 END_STOP_M = 0.6  # between a stop line without a crossing and the end of its road
 BAY_WIDTH_M = 2.6
 BAY_LENGTH_M = 5.0
 CARPARK_DEPTH_M = 15.0
+# Colours of the walls, BGR.
 WALLS = [
     (150, 165, 190),
     (120, 140, 175),
@@ -169,12 +170,12 @@ def _add_crossings(road: Road, rng: np.random.Generator) -> None:
         return
     for at_start in (True, False):
         lanes_in = road.section.backward if at_start else road.section.forward
-        if rng.random() < 0.62:
+        if rng.random() < 0.62:  # a crossing, often with a stop line
             gap_m = CROSSING_GAP_M + float(rng.choice([0.0, 2.0]))
             depth_m = float(rng.uniform(low=2.5, high=4.5))
             stop = lanes_in > 0 and rng.random() < 0.8
             road.add_crossing(gap_m, depth_m, at_start=at_start, stop=stop)
-        elif lanes_in and rng.random() < 0.6:
+        elif lanes_in and rng.random() < 0.6:  # a stop line alone
             if at_start:
                 road.stop_backward = (END_STOP_M, END_STOP_M + STOP_LINE_M)
                 road.clear_start_m = END_STOP_M + STOP_LINE_M
@@ -192,7 +193,7 @@ def road_surface(road: Road) -> list[Polygon]:
 
 
 def _add_surroundings(town: Town, rng: np.random.Generator) -> None:
-    """Add car parks, pavements, houses and furniture to the roads of a town, in place."""
+    """Add car parks, pavements, houses, trees and lamp posts to a town, in place."""
     surfaces = []
     medians = []
     pavements = []
@@ -265,6 +266,8 @@ def _make_carpark(road: Road, sign: int, middle_m: float, bays: int) -> Carpark:
         length_m=5.0,
         width_m=float(np.linalg.norm(mouth - inner)),
     )
+    # Corners of `rectangle`: front left, back left, back right, front right. `across` is the unit
+    # vector away from the road.
     along = outline[0] - outline[1]
     along = along / np.linalg.norm(along)
     across = sign * (outline[0] - outline[3]) / CARPARK_DEPTH_M

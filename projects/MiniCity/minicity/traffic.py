@@ -21,6 +21,7 @@ KINDS: list[tuple[str, tuple[float, float, float], float]] = [
     ("vehicle.bus.rigid", (10.8, 2.5, 3.2), 0.08),
 ]
 CAR_KIND = 0
+# Colours of vehicles and clothes, BGR.
 PAINTS: list[Color] = [
     (225, 225, 225),
     (40, 40, 42),
@@ -30,9 +31,9 @@ PAINTS: list[Color] = [
     (60, 110, 60),
     (70, 150, 200),
 ]
-REACH_M = 75.0
-SWING_M = 6.0
-PASS_START_M = 3.0  # largest distance between the starts of two passes, on each side
+REACH_M = 75.0  # largest distance of traffic from the drive of the ego vehicle
+SWING_M = 6.0  # distance in which the phase of a swing grows by 1 radian
+PASS_START_M = 3.0  # largest shift of the start of a pass, forwards or backwards
 
 
 @dataclass(frozen=True)
@@ -74,8 +75,8 @@ class Drive:
         dx = dx / norm
         dy = dy / norm
         phase = self.swing_rad + arc_m / SWING_M
-        side = self.shift_m + self.swing_m * math.sin(phase)
-        slope = self.swing_m * math.cos(phase) / SWING_M
+        side = self.shift_m + self.swing_m * math.sin(phase)  # offset to the left of the path
+        slope = self.swing_m * math.cos(phase) / SWING_M  # derivative of `side` by `arc_m`
         return x - side * dy, y + side * dx, math.atan2(dy, dx) + math.atan(slope)
 
 
@@ -120,6 +121,8 @@ def plan_ego(town: Town, scene: int, duration_s: float, rng: np.random.Generator
     Raises:
         RuntimeError: If the town has no path of sufficient length.
     """
+    # A fixed order of the roads spreads the scenes over the town. An attempt fails if the lanes end
+    # too early; the next one takes a road seven places further on.
     order = np.random.default_rng(len(town.roads)).permutation(len(town.roads))
     for attempt in range(60):
         road = town.roads[int(order[(scene + attempt * 7) % len(order)])]
@@ -313,7 +316,7 @@ def _parked_vehicles(
     Args:
         town: The town.
         track: Positions of the ego vehicle in metres. (T, 2)
-        density: Share of the places in use relative to dense traffic, in (0, 1].
+        density: Traffic relative to dense traffic, in (0, 1]; more places are then in use.
         rng: Source of all random choices.
     """
     actors: list[Actor] = []

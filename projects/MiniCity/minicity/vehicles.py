@@ -16,7 +16,7 @@ TROUSERS: Color = (70.0, 58.0, 52.0)
 SKIN: Color = (120.0, 150.0, 190.0)
 TAIL_LIGHT: Color = (40.0, 40.0, 215.0)
 HEAD_LIGHT: Color = (225.0, 235.0, 235.0)
-# indices of the faces from `prism_faces`
+# Indices of the faces of `prism_faces` over a rectangle that heads along +x.
 BACK_FACE = 1
 FRONT_FACE = 3
 TOP_FACE = 4
