@@ -10,7 +10,7 @@ from gsmap.utils.errors import InputError
 from mapdata.bag_images import image_size, trouble_with
 from mapdata.folders.rig import RigCamera
 
-# Words of a topic whose images are rectified, and words that negate the word after them.
+# Words in topics of rectified images, and words that negate the word after them.
 _RECTIFIED = ("rect", "rectified")
 _NOT = ("un", "non", "not", "no")
 _MOST_SIZES = 5  # number of images whose size is read
@@ -57,14 +57,18 @@ class ImageTopic:
         repeats = count - len(set(self.times_ns))
         if repeats:
             notes.append(
-                f"{repeats} of {count} images of {topic!r} are left out: their stamps repeat that "
-                "of another"
+                f"{repeats} of {count} images of {topic!r} are left out: their stamps repeat the "
+                "stamp of another image"
             )
         return notes
 
 
 def is_rectified(topic: str) -> bool:
-    """Whether images are rectified: a word of the last two parts of their topic is ``rect``."""
+    """Whether images are rectified, by the name of their topic.
+
+    One of the words in its last two parts must be ``rect`` or ``rectified``, without a negation
+    before it.
+    """
     last_parts = topic.rsplit("/", 2)[-2:]
     word_before = ""
     for word in re.split(r"[/_]", "/".join(last_parts).lower()):
@@ -145,6 +149,8 @@ def build_camera(
         )
     matrix = p if rectified else k
     if min(full_px) > 0 and not _is_pinhole(matrix):
+        # The driver has left this matrix empty: use the other one, which only an image without
+        # distortion allows.
         empty, used = ("P", "K") if rectified else ("K", "P")
         matrix = k if rectified else p
         if not _is_pinhole(matrix):
@@ -159,13 +165,14 @@ def build_camera(
         notes.append(f"{where} has no focal lengths in {empty}, it is 0: {used} is used")
     offset_px, binning, size_px = _window(info, full_px)
     image_sizes = images.sizes_px
-    if size_px in image_sizes or not image_sizes or min(full_px) < 1:
+    is_any_size_unknown = not image_sizes or min(full_px) < 1
+    if size_px in image_sizes or is_any_size_unknown:
         matrix = _crop(matrix, offset_px=offset_px, binning=binning)
     elif full_px in image_sizes:
         size_px = full_px
         notes.append(
             f"{where} has binning or a region of interest, but its images have all {full_px} "
-            "pixels: neither is applied"
+            "pixels, so that neither is applied"
         )
     else:
         raise InputError(
@@ -187,7 +194,16 @@ def build_camera(
 def _window(
     info: Any, full_px: tuple[int, int]
 ) -> tuple[tuple[int, int], tuple[int, int], tuple[int, int]]:
-    """Offset, binning and size of the images, for a sensor of ``full_px`` pixels."""
+    """Region of interest and binning of a camera info.
+
+    Args:
+        info: Message with the camera info.
+        full_px: Width and height of the sensor in pixels.
+
+    Returns:
+        Offset of the region (x, y) in pixels, binning (x, y), and size of the images (width,
+        height).
+    """
     binning_x = max(int(getattr(info, "binning_x", 1)), 1)
     binning_y = max(int(getattr(info, "binning_y", 1)), 1)
     offset_px = (0, 0)

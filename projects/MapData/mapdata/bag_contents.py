@@ -1,4 +1,4 @@
-"""First pass over a bag: calibrations, transforms, poses, and the times of all images."""
+"""First pass over a bag, for its calibrations, transforms, poses, and the times of all images."""
 
 import hashlib
 from collections import Counter, defaultdict
@@ -27,7 +27,7 @@ _RULES = b"2"
 
 @dataclass
 class BagContent:
-    """Everything of a bag but the images themselves.
+    """Content of a bag, except the images themselves.
 
     Args:
         infos: Camera info, by the topic of the images.
@@ -38,8 +38,8 @@ class BagContent:
         unread: Errors of messages that cannot be read, by topic.
         unreadable: Reason why no message of a topic can be read, by topic.
         unstamped: Number of transforms and poses with the stamp 0, by topic.
-        changed_infos: Number of camera infos that differ from the first, by the topic of the
-            images.
+        changed_infos: Number of camera infos that differ from the first one of the camera, by the
+            topic of the images.
     """
 
     infos: dict[str, Any] = field(default_factory=dict)
@@ -186,7 +186,7 @@ def _pose_matrix(position: Any, orientation: Any) -> np.ndarray:
 
 
 def read_content(bag: Bag, topics: Mapping[str, tuple[str, str]]) -> BagContent:
-    """Read everything of a bag but the images themselves.
+    """Read the content of a bag, except the images themselves.
 
     Args:
         bag: The bag, open.

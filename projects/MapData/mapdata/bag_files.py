@@ -16,8 +16,9 @@ Bag = RosBag | McapBag
 SUFFIXES = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"
 _MOST_BYTES = 300_000  # largest metadata; YAML takes some milliseconds for a thousand bytes
-_ALIAS = re.compile(r"(^|[\s\[{,:-])\*\w", flags=re.MULTILINE)
+_ALIAS = re.compile(r"(^|[\s\[{,:-])\*\w", flags=re.MULTILINE)  # alias of YAML, such as *name
 _PACKED = (".zstd", ".zst", ".lz4", ".gz", ".bz2", ".xz", ".zip", ".tar")
+# First bytes of a file, by its suffix.
 _STARTS = {".mcap": MAGIC, ".db3": b"SQLite format 3\0", ".bag": b"#ROSBAG V2.0"}
 
 
@@ -90,7 +91,7 @@ def _bag_of(parts: Sequence[Path], notes: list[str]) -> Bag:
 
 
 def _needs_mcap_reader(parts: Sequence[Path]) -> bool:
-    """Whether files are MCAP files, not all of which rosbags can read."""
+    """Whether files are MCAP files, and at least one of them is not readable by rosbags."""
     return parts[0].suffix == ".mcap" and not all(map(is_plain_ros2, parts))
 
 
@@ -206,6 +207,7 @@ def _damage_of(path: Path) -> str | None:
             " keeps what is readable"
         )
     if path.suffix == ".bag":
+        # The header holds the position of the index, which is 0 until the recorder ends.
         index = re.search(rb"index_pos=(.{8})", start, flags=re.DOTALL)
         position = struct.unpack("<Q", index[1])[0] if index else 0
         if not 0 < position <= size:

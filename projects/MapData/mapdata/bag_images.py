@@ -24,7 +24,7 @@ _TO_BGR: dict[str, int | None] = {
     "yuv422_yuy2": cv2.COLOR_YUV2BGR_YUYV, "yuyv": cv2.COLOR_YUV2BGR_YUYV,
     "yuv422": cv2.COLOR_YUV2BGR_UYVY, "uyvy": cv2.COLOR_YUV2BGR_UYVY,
 }  # fmt: skip
-_CHANNELS = {  # bytes of a pixel, by encoding; 1 for any other
+_CHANNELS = {  # bytes of a pixel, by encoding; an encoding that is not listed has 1
     "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4,
     "yuv422_yuy2": 2, "yuyv": 2, "yuv422": 2, "uyvy": 2,
 }  # fmt: skip
@@ -99,6 +99,7 @@ def _raw_image(message: Any, size_px: tuple[int, int]) -> np.ndarray:
         raise InputError(f"it has {(width, height)} pixels, and its camera info says {size_px}")
     encoding = message.encoding
     channels = _CHANNELS.get(encoding, 1)
+    # A row has `step` bytes, which may include padding at its end.
     rows = np.asarray(message.data, dtype=np.uint8).reshape(height, message.step)
     image = rows[:, : width * channels].reshape(height, width, channels)
     code = _TO_BGR[encoding]

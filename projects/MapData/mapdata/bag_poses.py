@@ -13,7 +13,7 @@ from mapdata.folders.rig import PoseTrack
 VEHICLE_FRAMES = ("base_footprint", "base_link")
 _GAP_NS = 10**9  # longest gap between two poses in which the pose is interpolated
 _FOREVER_NS = 10**20  # gap of a static transform, longer than any recording
-_SELDOM_NS = 500_000_000  # if the average step is longer, a transform holds until the next one
+_SELDOM_NS = 500_000_000  # transforms with a longer average step hold until the next one
 _STILL_M = 1e-3  # smaller changes of a pose do not count as a motion
 _STILL_JUMP_M = 0.1  # smaller distances of successive poses do not count as jumps
 
@@ -58,7 +58,10 @@ class Transforms:
 
     @cached_property
     def moves(self) -> bool:
-        """Whether a pose differs from the first by over a millimetre; read it after the last."""
+        """Whether a pose differs from the first one by more than a millimetre.
+
+        The value is cached, so it must only be read after all transforms are added.
+        """
         return bool(np.abs(np.array(self.poses) - self.poses[0]).max() > _STILL_M)
 
     def __str__(self) -> str:
@@ -198,6 +201,7 @@ class FrameTree:
         self.notes.clear()
 
         def rank(edge: Transforms) -> tuple[bool, int, str]:
+            """Sort key of a source of transforms; the smallest one is the best."""
             leads_to_vehicle = edge.child != vehicle and self._leads(edge.parent, vehicle)
             return not leads_to_vehicle, -edge.count, edge.topic
 
@@ -212,8 +216,8 @@ class FrameTree:
             others = [str(edge) for edge in sources.values() if edge is not best]
             if others:
                 self.notes.append(
-                    f"{child!r} has {len(sources)} sources of transforms: that to {best} is used, "
-                    f"that to {' and '.join(others)} is not"
+                    f"{child!r} has {len(sources)} sources of transforms: the one to {best} is "
+                    f"used, the one to {' and '.join(others)} is not"
                 )
 
     def _leads(self, frame: str, vehicle: str) -> bool:
@@ -258,9 +262,14 @@ class FrameTree:
         return invert_rigid(common_from_vehicle) @ common_from_frame
 
     def _pose_below(self, ancestor: str, names: Sequence[str], frame: str) -> np.ndarray:
-        """First pose of the start of a chain in one of its frames. (4, 4)
+        """Pose of the first frame of a chain in a frame above it, by their first transforms. (4, 4)
 
         Transforms that move are noted, as they affect where ``frame`` is on the vehicle.
+
+        Args:
+            ancestor: Name of the frame above.
+            names: Chain, from the first frame upwards.
+            frame: Name of the sensor's frame, for the notes.
         """
         pose = np.eye(4)
         for name in names[: names.index(ancestor)]:
@@ -288,6 +297,8 @@ class FrameTree:
         moving_edges = [edge for edge in edges if not edge.is_static]
         if not moving_edges:
             return None
+        # The poses are known where all moving transforms have a pose. The one next to the vehicle
+        # defines the span, which the others can only shorten.
         lowest = moving_edges[0]
         start_ns = min(lowest.times_ns)
         end_ns = max(lowest.times_ns)
@@ -298,6 +309,7 @@ class FrameTree:
             if edge.is_static:
                 steps.append(PoseTrack(edge.times_ns, edge.poses, gap_ns=_FOREVER_NS))
                 continue
+            # A transform such as map to odometry is only sent when it changes.
             count = len(edge.times_ns)
             is_seldom = count == 1 or count * _SELDOM_NS < drive_ns
             holds = edge is not lowest and is_seldom
@@ -318,6 +330,7 @@ def _jump_notes(track: PoseTrack, source: str) -> list[str]:
     places = track.poses[:, :3, 3]
     if len(places) < 5:
         return []
+    # If places alternate, the next one is far away, and the one after it is near again.
     to_next = float(np.median(np.linalg.norm(places[1:] - places[:-1], axis=1)))
     to_second = float(np.median(np.linalg.norm(places[2:] - places[:-2], axis=1)))
     if to_next < 2 * to_second + _STILL_JUMP_M:
@@ -334,7 +347,8 @@ def odometry_poses(
     """Poses of the ground below the vehicle, from the odometry of one topic.
 
     Odometry of the vehicle's frame is preferred, then odometry of a frame that is connected to it,
-    then odometry without a frame; of several, the one with the most poses.
+    then odometry without a frame. If several odometries are equal in this, the one with the most
+    poses is used.
 
     Args:
         odometries: All odometries of a bag.
@@ -343,7 +357,7 @@ def odometry_poses(
         ground: Pose of the ground in the vehicle's frame, in metres. (4, 4)
 
     Returns:
-        The poses, None without usable odometry, and notes on assumptions.
+        The poses, or None without usable odometry, and notes on assumptions.
     """
     # Rank (0 is the best), index in ``odometries``, and transform from the vehicle to the body.
     candidates: list[tuple[int, int, np.ndarray]] = []

@@ -8,9 +8,10 @@ from gsmap.utils.errors import InputError
 
 IMAGES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
 INFO = "sensor_msgs/msg/CameraInfo"
+# Last parts of a topic of images that do not name a camera.
 _GENERIC = ("compressed", "raw", "image", "image_raw", "image_color", "image_mono", "image_rect",
             "image_rect_color", "image_rect_raw")  # fmt: skip
-# words in a topic that do not distinguish cameras
+# Words in a topic that do not distinguish cameras.
 _WORDS = {
     "", "camera", "image", "img", "info", "camerainfo", "caminfo", "calibration", "raw", "color",
     "mono", "rect", "compressed",
@@ -19,7 +20,10 @@ _REMEDY = "say it by hand with --topics NAME=IMAGE_TOPIC,INFO_TOPIC for each cam
 
 
 def parse_topics(words: Sequence[str]) -> dict[str, tuple[str, str]]:
-    """Parse ``NAME=IMAGES,INFO`` of each camera; without ``INFO`` its topic is empty.
+    """Parse ``NAME=IMAGES,INFO`` of each camera. ``,INFO`` may be absent.
+
+    Returns:
+        Topics of the images and of the camera info, which may be empty, by camera.
 
     Raises:
         ValueError: If a word has another form, or the name of a camera repeats.
@@ -123,7 +127,7 @@ def camera_topics(kinds: Mapping[str, str], listing: str) -> dict[str, tuple[str
             "it has no camera with images (sensor_msgs Image or CompressedImage) and a CameraInfo: "
             f"give --calibration calibration.yaml, or --topics; it holds: {listing or 'no topic'}"
         )
-    claims = defaultdict(list)
+    claims = defaultdict(list)  # cameras by the topic of their camera info
     for name, topic in cameras.items():
         if len(candidates[topic]) > 1:
             raise InputError(f"which CameraInfo is that of {topic}, {candidates[topic]}? {_REMEDY}")
@@ -131,7 +135,8 @@ def camera_topics(kinds: Mapping[str, str], listing: str) -> dict[str, tuple[str
     topics = {}
     for info, names in claims.items():
         matching_names = [name for name in names if _words(cameras[name]) == _words(info)]
-        is_shared_namespace = info.count("/") == 1 and len(claims) > 1  # the root, of all cameras
+        # A camera info in the root could belong to any camera.
+        is_shared_namespace = info.count("/") == 1 and len(claims) > 1
         if len(matching_names) == 1:
             name = matching_names[0]
         elif len(names) > 1 or is_shared_namespace:
@@ -150,8 +155,8 @@ def _words(topic: str) -> list[str]:
 def _candidate_infos(topic: str, infos: Sequence[str]) -> list[str]:
     """Topics of camera info that may belong to images.
 
-    They are in the nearest namespace above the images. If several are, infos with the words of the
-    images are preferred.
+    They are in the nearest namespace above the images. If several camera infos are there, the ones
+    with the words of the images are preferred.
     """
     nearest = None
     for info in infos:

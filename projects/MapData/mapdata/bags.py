@@ -29,7 +29,7 @@ from mapdata.options import InputOptions
 from mapdata.ros_bag import library_errors
 
 _TOLERANCE_NS = 50_000_000  # largest difference in time of the images of one sample
-_REACH_NS = 100_000_000  # time for which the first and the last pose hold outside of their span
+_REACH_NS = 100_000_000  # time before the first and after the last pose for which it holds
 _CHOOSE = "choose cameras with --topics"
 
 
@@ -159,7 +159,7 @@ def _topic_of(
 
     Args:
         name: Name of the camera.
-        images_setting: Its setting ``images`` in the calibration file, a topic or anything else.
+        images_setting: Setting ``images`` of the camera in the calibration file. It may be a topic.
         images: Topics of images, by camera.
         kinds: Type of the messages, by topic.
     """
@@ -248,7 +248,7 @@ def _build_camera(
     if vehicle_from_cam is None:
         raise InputError(
             f"camera {name!r}: no transform leads from its frame {frame!r} to {vehicle!r}: give "
-            "--calibration calibration.yaml, or another --vehicle-frame; there are those of "
+            "--calibration calibration.yaml, or another --vehicle-frame; there are transforms of "
             f"{sorted(content.tree.edges)}"
         )
     cam_from_ground = invert_rigid(vehicle_from_cam) @ ground
@@ -267,7 +267,10 @@ def _poses(
 
 
 def _near_poses(times_ns: np.ndarray, pose_at: PoseChain | None) -> np.ndarray:
-    """Times within the span of the poses; all times if none is, or without poses. (n,) -> (m,)"""
+    """Select the times within the span of the poses. (n,) -> (m,)
+
+    All times are returned if no time is within the span, or if there are no poses.
+    """
     if pose_at is None:
         return times_ns
     start_ns, end_ns = pose_at.span_ns

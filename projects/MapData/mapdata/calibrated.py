@@ -24,9 +24,10 @@ def calibrated_records(
 ) -> Iterator[dict[str, Any]]:
     """Complete records with the cameras and the poses of a calibration file.
 
-    A record's cameras have ``name``, ``path`` and, if an image was taken at another time than the
-    record's ``timestamp_ns``, a ``timestamp_ns``. If the file names ``poses``, ``cam_from_frame``
-    then includes the vehicle's motion between the two times.
+    The cameras of a record have ``name`` and ``path``. A camera whose image was taken at another
+    time than ``timestamp_ns`` of the record also has a ``timestamp_ns``. If the file names
+    ``poses``, ``cam_from_frame`` of such a camera includes the vehicle's motion between the two
+    times.
 
     Args:
         records: Records, as `from_records` takes them.

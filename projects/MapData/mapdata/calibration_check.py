@@ -130,4 +130,4 @@ def _field_of_view(camera: CameraRecord, frame_from_ground: np.ndarray) -> np.nd
     outline = np.array([centre, *tips, centre])
     outline[:, 2] = 0  # down to the road
     homogeneous = np.column_stack([outline, np.ones(4)])
-    return homogeneous @ frame_from_ground.T[:, :3]
+    return homogeneous @ frame_from_ground.T[:, :3]  # without the fourth coordinate, which is 1

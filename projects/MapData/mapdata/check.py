@@ -23,7 +23,7 @@ _MOST_PROBLEMS = 10  # number of broken files that a message names
 
 
 def _open(path: Path) -> AnnotationFile:
-    """Open and check an annotation file, and compare its parts with its footer.
+    """Open and check an annotation file, and compare its batches with those that its footer lists.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -34,7 +34,7 @@ def _open(path: Path) -> AnnotationFile:
         reader = pa.ipc.open_file(pa.memory_map(str(path)))
         for number, batch in enumerate(file.batches):
             if not reader.get_batch(number).equals(batch):
-                raise InputError(f"part {number} is another one")
+                raise InputError(f"it lists another part {number}")
     except (pa.ArrowException, OSError, ValueError) as error:
         if is_machine_error(error):
             raise
@@ -71,7 +71,7 @@ def _broken_files(sample: MapSample, root: Path) -> list[str]:
 def _describe_content(file: AnnotationFile) -> list[str]:
     """Number of the elements, and warnings about implausible elements and cameras."""
     counts = file.instance_counts()
-    counts = counts[counts >= 0]  # without samples whose ground truth is not known
+    counts = counts[counts >= 0]  # a sample whose ground truth is not known has -1
     lines = []
     if len(counts):
         elements = format_count(int(counts.sum()), "map element")

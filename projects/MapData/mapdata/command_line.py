@@ -88,7 +88,7 @@ def fingerprint(sizes: Mapping[str, int], contents: Iterable[Path] = ()) -> str:
     """Digest of the sources of a file.
 
     Args:
-        sizes: Number of records by name.
+        sizes: Size of each file in bytes, by its name.
         contents: Files whose content is part of the digest.
 
     Returns:
@@ -126,16 +126,21 @@ def add_split_options(parser: argparse.ArgumentParser, names: tuple[str, ...]) -
     text = f"a published split by place: {', '.join(names)}"
     add("--split-name", default="", choices=names, metavar="NAME", help=text)
     add("--split-file", type=Path, help="own splits as JSON (docs/data.md)")
-    text = "convert a published split of which scenes are missing"
+    text = "convert a published split even if scenes of it are missing"
     add("--allow-missing", action="store_true", help=text)
 
 
 def add_range_options(
     parser: argparse.ArgumentParser, ranges: tuple[tuple[float, float], ...] | None
 ) -> None:
-    """Add the options for the range of the ground truth; the command sets a default of None."""
+    """Add the options for the range of the ground truth.
+
+    Args:
+        parser: Parser of the command, changed in place.
+        ranges: Default range of x, then of y, in metres. None leaves the default to the command.
+    """
     for axis, name in enumerate("xy"):
-        default = ranges and ranges[axis]
+        default = None if ranges is None else ranges[axis]
         usual = f"{default[0]:g} {default[1]:g}" if default else "the data set's usual"
         parser.add_argument(
             f"--{name}-range", type=float, nargs=2, default=default, metavar=("MIN", "MAX"),
@@ -150,7 +155,14 @@ def add_workers_option(parser: argparse.ArgumentParser) -> None:
 
 
 def add_log_options(parser: argparse.ArgumentParser, usual_rate: str) -> None:
-    """Add the options that select Argoverse 2 logs and their rate, which has no default entry."""
+    """Add the options that select Argoverse 2 logs and their rate.
+
+    Without the option ``--rate``, the parsed arguments have no ``rate_hz``.
+
+    Args:
+        parser: Parser of the command, changed in place.
+        usual_rate: Description of the rate that the command uses by default.
+    """
     add = parser.add_argument
     add("--root", type=Path, required=True, help="folder that holds train, val and test")
     add("--split", default="val", choices=("train", "val", "test"))

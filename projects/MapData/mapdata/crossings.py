@@ -19,7 +19,7 @@ def long_edges(polygons: np.ndarray) -> np.ndarray:
     for polygon in polygons:
         ring = shapely.get_coordinates(polygon.exterior)
         lengths = np.linalg.norm(np.diff(ring, axis=0), axis=1)
-        for start in np.argsort(lengths, kind="stable")[-2:]:
+        for start in np.argsort(lengths, kind="stable")[-2:]:  # edge i begins at vertex i
             edges.append(ring[start : start + 2])
     return shapely.linestrings(np.array(edges)) if edges else np.empty(0, dtype=object)
 
@@ -27,7 +27,8 @@ def long_edges(polygons: np.ndarray) -> np.ndarray:
 def open_outlines(pieces: np.ndarray, owner: np.ndarray, patch: LocalPatch) -> np.ndarray:
     """Outlines of crossings, with parallel neighbours united, open where the patch cuts them.
 
-    They run anticlockwise, and holes are left out. The parts of one crossing are one geometry.
+    They run anticlockwise, and holes are left out. An outline that is cut into several lines is
+    returned as one line through all of them.
 
     Args:
         pieces: Valid parts of crossings inside the patch, in its frame, in metres. (pieces,)
@@ -45,6 +46,7 @@ def open_outlines(pieces: np.ndarray, owner: np.ndarray, patch: LocalPatch) -> n
         return lines
     has_z = bool(shapely.has_z(lines).any())
     points, line_of_point = shapely.get_coordinates(lines, include_z=has_z, return_index=True)
+    # The lines of one ring become one line: `indices` are consecutive numbers of the rings.
     _, outline_of_line = np.unique(ring_of_line, return_inverse=True)
     return shapely.linestrings(points, indices=outline_of_line[line_of_point])
 

@@ -72,8 +72,9 @@ def from_records(
     - ``instances`` (without it, no ground truth is known): mappings with ``label`` (name or index)
       and ``points`` (n, 2 or 3) in metres, with equal first and last points of rings. Elements are
       clipped to the range of ``meta``; rings stay rings;
-    - ``global_instances``: such elements in the global frame instead, such as a whole map. Position
-      and yaw of ``global_from_frame`` place them; with heights the whole pose does;
+    - ``global_instances``: elements in the global frame in place of ``instances``, such as a whole
+      map. They are transformed to the frame by the position and the yaw of ``global_from_frame``
+      or, in annotation files with heights, by the whole pose;
     - ``lidar``: mapping with ``path``, ``frame_from_lidar`` (4, 4) and ``sweeps``, mappings with
       ``path``, ``timestamp_ns``, ``frame_from_lidar``;
     - ``ego_from_frame`` (4, 4): pose of the frame ``lidar`` on the vehicle, whose z = 0 is the
@@ -193,10 +194,10 @@ def join_lines(instances: Sequence[MapInstance]) -> list[MapInstance]:
 
 
 def _snap_ends(lines: Sequence[Points]) -> None:
-    """Move ends of lines that meet to one place, in place. each (n, dim)"""
+    """Move ends of lines that meet to one place. The lines are changed. each (n, dim)"""
     places: list[np.ndarray] = []
     for line in lines:
-        for end in (0, -1):
+        for end in (0, -1):  # first and last vertex
             other_end = line[-1 - end]
             place = _nearby_place(places, line[end])
             if place is None:
@@ -265,14 +266,14 @@ def _transform_elements(record: Mapping[str, Any], meta: AnnotationMeta) -> dict
     for item in record[_GLOBAL]:
         points = np.array(item["points"], np.float64)[:, : meta.dim]
         offsets = points - pose[: points.shape[1], 3]
-        instances.append({**item, "points": offsets @ rotation})
+        instances.append({**item, "points": offsets @ rotation})  # rows times R: inverse rotation
     local_record = {name: value for name, value in record.items() if name != _GLOBAL}
     local_record["instances"] = instances
     return local_record
 
 
 def _create_record(kind: type[Record], values: Mapping[str, Any]) -> Record:
-    """Create a record from a mapping; keys that are not fields are ignored."""
+    """Create a record from a mapping. Keys of the mapping that are not fields are ignored."""
     arguments = {field.name: values[field.name] for field in fields(kind)}  # type: ignore[arg-type]
     return kind(**arguments)
 

@@ -12,9 +12,11 @@ ROUND_DECIMALS = 3  # points closer than a millimetre are one node of the graph
 SIMPLIFY_TOLERANCE_M = 0.2
 MAX_PATHS = 20_000
 
-# An edge leads to a node by way of points of one lane: (interior point ids, end point id).
+# Edge of the graph, without its start: ids of the points on the way, and id of the point at which
+# it ends.
 Edge = tuple[tuple[int, ...], int]
-# For each lane of a map, its links: positions of a lane and of the one that follows it.
+# For each lane of a map, the list of its links. A link has the positions of two lanes in the list
+# of lanes, of which the second follows the first, and the lane is one of the two.
 LaneLinks = Sequence[Sequence[tuple[int, int]]]
 
 
@@ -69,10 +71,11 @@ class LanePaths:
         self._points, nodes, uses = np.unique(
             rounded, axis=0, return_inverse=True, return_counts=True
         )  # (nodes, 3)
+        # Ids of the points of each lane; `split` returns an empty part after the last lane.
         ends = np.cumsum(list(map(len, polylines)), dtype=np.int64)
         lanes = [lane.tolist() for lane in np.split(nodes, ends)[:-1]]
         self._edges = [_fold_points(lane, uses=uses) for lane in lanes]
-        # For each lane its links: the two lanes, and (start point id, edge).
+        # For each lane its links: the two lanes, and the edge between them with its start point.
         self._links: list[list[tuple[int, int, tuple[int, Edge]]]] = []
         for lane_links in links:
             link_edges: list[tuple[int, int, tuple[int, Edge]]] = []
@@ -109,7 +112,7 @@ class LanePaths:
         paths: list[list[int]] = []
         for node, edges in graph.items():
             if not edges or node in targets:
-                continue
+                continue  # no path starts here
             for path in _paths_from(node, graph):
                 paths.append(path)
                 if len(paths) > MAX_PATHS:
@@ -170,7 +173,10 @@ def _next_edge(edges: Iterator[Edge], visited: set[int]) -> Edge | None:
 
 
 def _paths_from(source: int, graph: dict[int, list[Edge]]) -> Iterator[list[int]]:
-    """Yield the nodes of every simple path from a node to a node without outgoing edges."""
+    """Yield the nodes of every simple path from a node to a node without outgoing edges.
+
+    This is a depth-first search with an explicit stack.
+    """
     path = [source]
     visited = {source}
     # (length of the path up to the node, node, edges still to try)

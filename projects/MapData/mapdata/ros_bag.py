@@ -1,4 +1,4 @@
-"""Bags of ROS 1 and ROS 2, read with rosbags; an unreadable topic leaves the others readable."""
+"""Bags of ROS 1 and ROS 2, read with rosbags. Other topics stay readable if one is not."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -108,6 +108,7 @@ class RosTypes:
                 return 1
             if node == nodes.NAME:
                 return count_values_of_type(description)
+            # An array has a length; a sequence has any length, and counts as one value.
             (item_node, item_description), length = description
             values = count_values(item_node, item_description)
             if not values:
@@ -116,6 +117,7 @@ class RosTypes:
             return 1 if node == nodes.SEQUENCE or is_plain else values * length
 
         def count_values_of_type(name: str) -> int:
+            """Least number of values of a message of a type, which is counted on first use."""
             if name not in known_types:
                 return 1  # rosbags raises an error for it
             if name not in counts:

@@ -14,10 +14,15 @@ from mapdata.overlap import Places, read_places, sample_overlap
 
 
 def _near_scenes(scenes: np.ndarray, positions: np.ndarray, distance_m: float) -> np.ndarray:
-    """Mask of pairs of scenes that have samples within a distance, also of a scene with itself.
+    """Find the pairs of scenes that have samples within a distance of each other.
 
-    ``scenes`` are indices of the samples' scenes (n,), ``positions`` are (x, y) in metres (n, 2).
-    Returns (S, S) bool.
+    Args:
+        scenes: Index of the scene of each sample. (n,)
+        positions: (x, y) of each sample in metres. (n, 2)
+        distance_m: The distance in metres.
+
+    Returns:
+        True for pairs of near scenes; a scene is near itself. (S, S)
     """
     count = scenes.max() + 1
     near = np.zeros((count, count), dtype=bool)
@@ -32,7 +37,15 @@ def _near_scenes(scenes: np.ndarray, positions: np.ndarray, distance_m: float) -
 def _select_scenes(
     near: np.ndarray, count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Select scenes of a map, from a random one on, each so that training loses the fewest scenes.
+    """Select scenes of a map for validation, one after another.
+
+    The first scene is random. Each further one is the scene with which training loses the fewest
+    scenes, as scenes near validation are not used for training.
+
+    Args:
+        near: Whether two scenes are near each other. (S, S)
+        count: Number of scenes to select.
+        rng: Source of the random order.
 
     Returns:
         Mask of the selected scenes (S,), and mask of scenes that are not near a selected one (S,).

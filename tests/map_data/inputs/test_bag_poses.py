@@ -40,7 +40,7 @@ def test_of_two_sources_of_a_frame_one_is_used_and_both_are_named(
 
     source, places = read(straight.write(poses=poses), tmp_path)
     (note,) = source.notes
-    assert note.startswith("'base_link' has 2 sources of transforms: that to ")
+    assert note.startswith("'base_link' has 2 sources of transforms: the one to ")
     assert f"messages on {topic})" in note
     assert f"'{parent}' (11" in note
     if used == "/tf":
@@ -57,7 +57,7 @@ def test_of_two_parents_of_a_camera_that_on_the_vehicle_is_used(straight, tmp_pa
     source, _ = read(straight.write(before=before), tmp_path)
     assert {len(sample.cameras) for sample in source.samples} == {2}
     (note,) = source.notes
-    assert "that to 'base_link' (1 messages on /tf_static) is used, that to 'mast' (2" in note
+    assert "the one to 'base_link' (1 messages on /tf_static) is used, the one to 'mast' (2" in note
 
 
 def test_a_footprint_without_poses_gives_way_to_a_base_link_with_some(straight, tmp_path):

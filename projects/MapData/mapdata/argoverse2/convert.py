@@ -108,7 +108,7 @@ def _listed_logs(
             f"{', '.join(split_list.scenes)} with --split."
         )
     log_by_name = {log.name: log for log in find_all_logs(options.root)}
-    names = {name: name for name in log_by_name}
+    names = {name: name for name in log_by_name}  # the name of a log is also its token
     source = options.split_file or f"split {split_list.name!r}"
     with explain_errors(source, "list each log in one split"):
         part_by_name, absent = resolve_scenes(split_list.scenes, names)

@@ -104,8 +104,9 @@ class Argoverse2Map:
     def _add_neighbours(self, lanes: Sequence[LaneSegment], links: LaneLinks) -> None:
         """Prepare the left and the right lines of the lanes, and the lanes beyond these lines."""
         position = {lane.id: i for i, lane in enumerate(lanes)}
-        self._side_paths = []  # left, right
-        self._neighbours = []  # left, right: position of each lane's neighbour. (lanes,)
+        # Both lists have an entry for the left side, then one for the right side.
+        self._side_paths = []
+        self._neighbours = []  # position of each lane's neighbour on this side. each (lanes,)
         for side in ("left", "right"):
             lines = []
             neighbours = []
@@ -204,8 +205,10 @@ class Argoverse2Map:
         with_right_line = lanes[right_neighbours[lanes] != NO_LANE]
         # Two neighbouring lanes share a line. It is taken once: from the lane on the right of the
         # line if that lane is in the patch, else from the lane on the left.
+        # Drop the right line of a lane that is the left neighbour of another lane with a left line.
         is_shared = np.isin(with_right_line, left_neighbours[with_left_line])
         with_right_line = with_right_line[~is_shared]
+        # Drop the left line of a lane whose left neighbour still gives this line.
         is_shared = np.isin(with_left_line, right_neighbours[with_right_line])
         with_left_line = with_left_line[~is_shared]
         left_paths, right_paths = self._side_paths

@@ -15,7 +15,8 @@ from av2.map.pedestrian_crossing import PedestrianCrossing
 from gsmap.datasets.errors import explain_errors
 from gsmap.utils.errors import InputError
 
-# by key of the file: name in messages, constructor, and least number of points of each line
+# For each layer, by its key in the file: name of an element in messages, constructor of an element,
+# and the least number of points of each of its lines.
 _LAYERS: dict[str, tuple[str, Callable[[Any], Any], dict[str, int]]] = {
     "lane_segments": (
         "lane segment",

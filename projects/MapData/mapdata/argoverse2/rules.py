@@ -84,16 +84,17 @@ def _possible_duplicates(bounds: np.ndarray, area: np.ndarray) -> tuple[np.ndarr
     """
     low = np.maximum(bounds[:, None, :2], bounds[None, :, :2])
     high = np.minimum(bounds[:, None, 2:], bounds[None, :, 2:])
+    # Two strips cannot share more than their bounding boxes share, nor more than the smaller strip.
     common = np.prod(np.maximum(high - low, 0.0), axis=-1)  # (n, n)
     common = np.minimum(common, np.minimum(area[:, None], area[None]))
     union = area[:, None] + area[None] - common
     is_possible = (common >= DUPLICATE_IOU * union) & (union > 0)
-    first, second = np.nonzero(np.triu(is_possible, k=1))
+    first, second = np.nonzero(np.triu(is_possible, k=1))  # each pair once, with first < second
     return first, second
 
 
 def merge_until_stable(lines: np.ndarray) -> np.ndarray:
-    """Node lines where they meet and join them at their ends until their number is stable.
+    """Cut lines where they meet, and join them at their ends, until their number is stable.
 
     Args:
         lines: Lines in metres. (n,)

@@ -30,7 +30,8 @@ from mapdata.argoverse2.map import Argoverse2Map, check_rules, find_map
 from mapdata.command_line import FileOptions
 
 THIN_OVER = ("log", "split")  # values of the option ``thin_over``
-_NEEDS_NONE = "`create_data.py av2 --at poses:10` needs none"  # hint on missing sensor data
+# Hint on missing sensor data.
+_NEEDS_NONE = "`create_data.py av2 --at poses:10` needs none"
 
 
 @dataclass(frozen=True)
@@ -388,5 +389,5 @@ def _lidar(
         if time in log.poses:
             path = f"{folder}/sensors/lidar/{time}.feather"
             sweeps.append(SweepRecord(path, time, frame_from_lidar=ego_from_city @ log.poses[time]))
-    closest = sweeps[0]
+    closest = sweeps[0]  # the latest one, for which there is a pose
     return LidarRecord(closest.path, closest.frame_from_lidar, sweeps=sweeps[1:])

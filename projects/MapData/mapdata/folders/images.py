@@ -180,6 +180,8 @@ def _group_images(
 ) -> tuple[list[RigFrame], dict[str, int], list[str]]:
     """Group the images of all cameras by the times in their names, or by equal names.
 
+    If every camera has a single image without a time, these images form one frame.
+
     Returns:
         The frames, the time of each file name that has one, and notes on assumptions.
     """
@@ -198,6 +200,8 @@ def _group_images(
             time_of[path.stem] = 0
         return [RigFrame(token=f"{scene}_0", time_ns=0, images=single_images)], time_of, []
 
+    # Images with equal names form a frame. Frames follow each other in the order of the first
+    # camera's images, at a fixed rate.
     rate = rate_hz or _RATE_HZ
     first_images = next(iter(images.values()))
     time_of = {}

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from mapdata.unix_times import unix_time_ns
 
+# The last digits of a name, as a whole number of 10, 13, 16 or 19 digits, and a fraction.
 _TIME = re.compile(r"(?:^|\D)(\d{10}(?:\d{3}|\d{6}|\d{9})?)(?:\.(\d{1,9}))?$")
 _DATE = re.compile(  # 2023100512, with minutes, with seconds and their fractions
     r"20\d\d(0[1-9]|1[0-2])(0[1-9]|[12]\d|3[01])([01]\d|2[0-3])([0-5]\d([0-5]\d*)?)?"
@@ -14,7 +15,7 @@ _DATE = re.compile(  # 2023100512, with minutes, with seconds and their fraction
 
 def natural_sort_key(path: Path) -> list[str | int]:
     """Sort key of a file's path, in which digits count as numbers: 2 before 10."""
-    parts = re.split(r"(\d+)", path.as_posix())
+    parts = re.split(r"(\d+)", path.as_posix())  # text and digits alternate, beginning with text
     return [int(part) if number % 2 else part for number, part in enumerate(parts)]
 
 
@@ -45,7 +46,8 @@ def times_of_names(stems: Collection[str]) -> dict[str, int] | None:
 def _time_ns(whole: str, fraction: str | None) -> int | None:
     """Time in nanoseconds from the digits before and after the point; None if it is no time."""
     if fraction is not None and len(whole) > 10:
-        return None
+        return None  # only seconds have a fraction
+    # 10 digits are seconds, and each further digit is a tenth of the unit.
     time_ns = unix_time_ns(int(whole), unit_ns=10 ** (19 - len(whole)))
     if time_ns is None:
         return None

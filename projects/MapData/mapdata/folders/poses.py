@@ -82,7 +82,7 @@ def _rows(text: str) -> Iterator[tuple[int, dict[str, str]]]:
     start = next((number for number, line in enumerate(lines) if line.strip()), None)
     if start is None:
         raise InputError("it is empty")
-    separator = max(_SEPARATORS, key=lines[start].count)
+    separator = max(_SEPARATORS, key=lines[start].count)  # the most frequent one of the first line
     table = csv.reader(lines[start:], delimiter=separator, skipinitialspace=True)
     try:
         names = [name.strip() for name in next(table)]

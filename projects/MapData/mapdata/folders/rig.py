@@ -109,6 +109,7 @@ class RigCamera:
         lens = cv2.fisheye if self.model in FISHEYE_MODELS else cv2
         width, height = self.size_px
         small_intrinsics = np.diag([_GRID / width, _GRID / height, 1.0]) @ self.intrinsics
+        # Position in the original image of each pixel of a small rectified image.
         x, y = lens.initUndistortRectifyMap(
             self.intrinsics,
             self.distortion,
@@ -177,11 +178,13 @@ class PoseTrack:
     """Poses of a vehicle over time.
 
     Args:
-        times_ns: Times of the poses, in any order; of equal times the first counts. (n,)
+        times_ns: Times of the poses, in any order. Among poses of equal times, the first is used.
+            (n,)
         poses: Transforms from the vehicle to the global frame, in metres. (n, 4, 4)
-        gap_ns: Longest gap in which poses are interpolated. Before the first and after the last
-            pose, these hold for a tenth of it.
-        holds: Whether each pose holds until the next one if the gap is longer.
+        gap_ns: Longest gap between two poses in which poses are interpolated. The first pose also
+            holds for a tenth of this time before it, and the last pose for a tenth after it.
+        holds: Whether each pose holds until the next one, where the gap is longer than ``gap_ns``,
+            and the last pose for ever.
 
     Raises:
         ValueError: If there is no pose, or one is not finite.
@@ -206,12 +209,12 @@ class PoseTrack:
     def at(self, time_ns: int) -> np.ndarray | None:
         """Interpolate the pose at a time; None if no pose is near. (4, 4)"""
         count = len(self.times_ns)
-        after = int(np.searchsorted(self.times_ns, time_ns))
+        after = int(np.searchsorted(self.times_ns, time_ns))  # first pose at or after the time
         if after < count and self.times_ns[after] == time_ns:
             return self.poses[after]
         if self.holds and after == count:
             return self.poses[-1]
-        if after in (0, count):
+        if after in (0, count):  # before the first pose or after the last one
             nearest = max(after - 1, 0)
             is_near = abs(int(self.times_ns[nearest]) - time_ns) <= self.gap_ns // 10
             return self.poses[nearest] if is_near else None

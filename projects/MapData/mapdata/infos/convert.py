@@ -40,8 +40,8 @@ from mapdata.summary import ConversionSummary
 from mapdata.unix_times import in_nanoseconds
 
 NUSCENES_SIZE = (1600, 900)  # width and height of the images in pixels
-_RING_SIZE = (2048, 1550)  # the same for Argoverse 2
-_RING_FRONT_SIZE = (1550, 2048)  # the same for Argoverse 2's upright front camera
+_RING_SIZE = (2048, 1550)  # width and height of the images of Argoverse 2
+_RING_FRONT_SIZE = (1550, 2048)  # for its front camera, which is mounted upright
 _NEEDED = {
     "lidar": "token, timestamp, lidar_path, lidar2ego_* and ego2global_* (translation, rotation), "
     "and cams with data_path, cam_intrinsic and sensor2lidar_*",
@@ -60,7 +60,7 @@ def _relative(path: str, root: Path) -> str:
     posix_path = Path(path.replace("\\", "/"))
     parts = posix_path.parts
     for anchor in ("samples", "sweeps", "train", "val", "test"):
-        if anchor in parts:
+        if anchor in parts:  # keep the parts from its last occurrence on
             last_anchor = len(parts) - 1 - parts[::-1].index(anchor)
             parts = parts[last_anchor:]
             break
@@ -149,7 +149,9 @@ def _nuscenes_sample(
         )
         sweeps.append(sweep_record)
     can_bus = info.get("can_bus")
-    if can_bus is not None:  # MapTR also adds the pose on loading
+    if can_bus is not None:
+        # The signals are position (3), quaternion (4) and measurements (9), then the yaw. MapTR,
+        # too, adds position, quaternion and yaw only on loading.
         measurements = np.asarray(can_bus, np.float64)[7:16]
         can_bus = pose_signals(global_from_ego)
         can_bus[3:7] = np.asarray(info["ego2global_rotation"])
@@ -244,8 +246,8 @@ def _samples(
 ) -> Iterator[MapSample]:
     """Yield the samples of an info file.
 
-    Ground truth is read from the file or, for nuScenes, extracted from the map expansion; samples
-    without either have none.
+    Ground truth is read from the file. If the file has none, it is extracted from the map
+    expansion, for nuScenes, or else the sample has none.
 
     Args:
         entries: Entries of the info file with their position in it.

@@ -23,7 +23,9 @@ _KEY_PARTS = 8  # limit of the length of a tuple as key
 _KEYS = (str, bytes, int, float, np.generic, type(None))
 _CONTAINERS = (list, tuple, dict, set, frozenset)
 _MAX_DEPTH = 50
-_VALUES_PER_BYTE = 20  # limit of the values, counted once for each container that holds them
+# Limit of the number of values, per byte of the file. A value counts once for each container that
+# holds it, so a small file cannot describe a huge structure by repetition.
+_VALUES_PER_BYTE = 20
 _DAMAGE = (
     pickle.UnpicklingError, EOFError, struct.error, LookupError, TypeError, ValueError,
     AttributeError, ArithmeticError,
@@ -31,7 +33,11 @@ _DAMAGE = (
 
 
 class _PlainUnpickler(pickle._Unpickler):
-    """Unpickler of the standard library without the opcodes that call functions or make objects."""
+    """Unpickler of the standard library without the opcodes that call functions or make objects.
+
+    The methods below stand for opcodes. They check the types of the values on the stack, which a
+    malicious file could choose.
+    """
 
     stack: list[Any]
     append: Callable[[Any], None]

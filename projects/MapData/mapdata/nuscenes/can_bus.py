@@ -33,7 +33,7 @@ def signals_at(timestamp_ns: int, global_from_ego: np.ndarray, messages: Message
     times_us, measurements = messages
     latest = int(np.searchsorted(times_us, timestamp_ns // 1000, side="right")) - 1
     if latest >= 0:
-        signals[7:16] = measurements[latest]
+        signals[7:16] = measurements[latest]  # after the position (3) and the quaternion (4)
     return signals
 
 

@@ -130,8 +130,8 @@ def _select_splits(options: NuScenesOptions) -> tuple[SplitList, str]:
             )
         for part in _OFFICIAL_SPLITS[version_name]:
             scenes[part] = official[part]
-    # The identity is that of these three splits, also for the mini version, as the mini splits are
-    # parts of them.
+    # The identity is computed from these three splits for every version. The splits of the mini
+    # version are parts of them.
     all_scenes = {part: official[part] for part in ("train", "val", "test")}
     return SplitList(OFFICIAL, scenes), list_identity(OFFICIAL, all_scenes)
 

@@ -94,9 +94,12 @@ def cuts_sight(origin: Array, points: Array, boxes: Boxes) -> NDArray[np.bool_]:
         to_lower = (-boxes.halves_m - start) / direction  # (n, B, 3)
         to_upper = (boxes.halves_m - start) / direction  # (n, B, 3)
     crossings = np.stack([to_lower, to_upper])  # fractions of the segment. (2, n, B, 3)
+    # A line is inside of the box where it is inside of all three slabs.
     enter = crossings.min(axis=0).max(axis=-1)  # (n, B)
     leave = crossings.max(axis=0).min(axis=-1)  # (n, B)
-    return (enter <= leave) & (leave > 0) & (enter < 1)
+    is_line_in_box = enter <= leave
+    is_between_ends = (leave > 0) & (enter < 1)
+    return is_line_in_box & is_between_ends
 
 
 def _map_points(sample: MapSample) -> Array:
@@ -108,7 +111,9 @@ def _map_points(sample: MapSample) -> Array:
         ValueError: If the sample has no ground truth.
     """
     if sample.instances is None:
-        raise InputError(f"sample {sample.token!r} has no ground truth, of which parts could hide.")
+        raise InputError(
+            f"sample {sample.token!r} has no ground truth: give a file with map elements."
+        )
     frame_height_m = 0.0 if sample.ego_from_frame is None else sample.ego_from_frame[2, 3]
     elements = [np.empty((0, 3))]
     for instance in sample.instances:
@@ -116,7 +121,7 @@ def _map_points(sample: MapSample) -> Array:
         num_steps = max(math.ceil(length_m / _STEP_M), 1)
         points = resample(instance.points, num_steps + 1)
         ground = np.full(len(points), -frame_height_m)
-        elements.append(np.column_stack([points, ground])[:, :3])
+        elements.append(np.column_stack([points, ground])[:, :3])  # points with heights keep them
     return np.concatenate(elements)
 
 
@@ -128,7 +133,8 @@ def _in_image(points: Array, camera: CameraRecord) -> NDArray[np.bool_]:
         camera: Camera record.
     """
     projection = camera.img_from_frame
-    u, v, depth = (points @ projection[:3, :3].T + projection[:3, 3]).T  # pixels times depth
+    # `u` and `v` are pixels times depth, so no division by a depth of 0 is needed.
+    u, v, depth = (points @ projection[:3, :3].T + projection[:3, 3]).T
     inside = (u >= 0) & (u < depth * camera.width) & (v >= 0) & (v < depth * camera.height)
     return inside & (depth > _NEAR_M)
 

@@ -22,7 +22,8 @@ CAMERAS = (
     "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT",
 )  # fmt: skip
 LIDAR = "LIDAR_TOP"
-# fields of each table that are read, with their type or, for a list of numbers, its length
+# Fields that are read from each table. The value is the type of the field or, for a list of
+# numbers, its length (`_has_kind`).
 _POSE: dict[str, type | int] = {"translation": 3, "rotation": 4}
 _FIELDS: dict[str, dict[str, type | int]] = {
     "sensor": {"channel": str},
@@ -38,7 +39,7 @@ _FIELDS: dict[str, dict[str, type | int]] = {
     },
     "sample_annotation": {"sample_token": str, "size": 3, **_POSE},
 }  # fmt: skip
-# fields that hold the token of a record, with the table of this record
+# Fields that hold the token of a record of another table, with the name of this table.
 _LINKS = {
     "calibrated_sensor": {"sensor_token": "sensor"},
     "scene": {"log_token": "log", "first_sample_token": "sample"},

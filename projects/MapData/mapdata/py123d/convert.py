@@ -147,7 +147,8 @@ def _all_records(
     logs: Progress, options: Py123dOptions, summary: ConversionSummary
 ) -> Iterator[dict[str, Any]]:
     """Yield the records of all logs; a log that cannot be read is left out."""
-    maps: dict[Path, Map] = {}  # the latest one alone, as logs of one town follow each other
+    # Only the latest map is kept, as the logs of a town follow each other.
+    maps: dict[Path, Map] = {}
     for log in logs:
         try:
             path = log.map_file(options.root)

@@ -15,12 +15,12 @@ from mapdata.py123d.log import REMEDY
 from mapdata.py123d.packed import unpack
 
 CLASSES = ("divider", "ped_crossing", "boundary", "centerline")
-# py123d's numbers of layers and of kinds of road lines
+# Numbers of layers in py123d.
 _LANE = 0
 _CROSSWALK = 3
 _ROAD_EDGE = 8
 _ROAD_LINE = 9
-_NO_PAINT = 0
+_NO_PAINT = 0  # number of a kind of road line
 _LAYERS = {"divider": _ROAD_LINE, "ped_crossing": _CROSSWALK, "boundary": _ROAD_EDGE}
 _LAYERS["centerline"] = _LANE
 
@@ -28,8 +28,8 @@ _LAYERS["centerline"] = _LANE
 class Map:
     """Lines of a map with a spatial index.
 
-    Road lines are dividers unless they are without paint, road edges are boundaries, outlines of
-    crosswalks are crossings, and centre lines are those of the lanes.
+    Dividers are the road lines with paint, boundaries are the road edges, crossings are the
+    outlines of crosswalks, and centre lines are taken from the lanes.
 
     Args:
         path: Map of py123d.

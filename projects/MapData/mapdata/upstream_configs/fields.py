@@ -96,7 +96,7 @@ class Fields:
         Args:
             section: Dotted name of the section of the settings.
             names: Names of settings to remove, separated by spaces.
-            fixed: Settings to remove if they have this value, which GSMap has always.
+            fixed: Settings to remove if they have the given value, the only one in GSMap.
         """
         values = self.section(section)
         for name in names.split():

@@ -16,7 +16,7 @@ from mapdata.upstream_configs.fields import Fields
 _KEY = re.compile(r"[a-zA-Z][\w.-]*", re.ASCII)
 _TYPE = re.compile(r"(mmdet\.)?\w+")
 METHODS = ("MapTR", "MapTRv2", "GeMap", "GeMapFull")
-# top-level names that configure a run; other names are variables of the file
+# Top-level names that configure a run. Other names are variables of the file.
 TOP_LEVEL_NAMES = (
     "_base_", "model", "data", "optimizer", "optimizer_config", "lr_config", "total_epochs",
     "runner", "evaluation", "fp16", "checkpoint_config", "log_config", "load_from",
@@ -152,7 +152,10 @@ def convert_upstream(names: dict[str, Any]) -> Conversion:
         fixed_values = FIXED_VALUES.get(section, {})
         fields.drop(section, names=IGNORED_NAMES.get(section, ""), **fixed_values)
     has_depth = settings.pop("with_depth")
-    base = _base_config(encoder, is_argoverse2=sides[0] == -30.0, has_depth=has_depth)
+    # The map of Argoverse 2 has 60 m along x, which is ahead in its frame. The map of nuScenes has
+    # 30 m along x.
+    is_argoverse2 = sides[0] == -30.0
+    base = _base_config(encoder, is_argoverse2=is_argoverse2, has_depth=has_depth)
     return Conversion(
         base=base,
         settings=settings,
@@ -464,12 +467,13 @@ def _margin_settings(fields: Fields, settings: dict[str, Any], sides: tuple[floa
         settings: Converted settings, to which the margin is added.
         sides: Smallest and largest x, then y, of the map in metres.
     """
-    # smallest x, y, x, y, then largest x, y, x, y of a prediction
+    # Smallest x and y of both corners of a prediction's box, then their largest x and y.
     limits = fields.section(f"{_PTS_HEAD}.bbox_coder").get("post_center_range", ())
     if len(limits) != 8:
         return
     x_min, x_max, y_min, y_max = sides
     margins = {x_min - limits[0], y_min - limits[1], limits[4] - x_max, limits[5] - y_max}
-    if len(margins) == 1 and limits[:2] == limits[2:4] and limits[4:6] == limits[6:]:
+    have_corners_equal_limits = limits[:2] == limits[2:4] and limits[4:6] == limits[6:]
+    if len(margins) == 1 and have_corners_equal_limits:
         fields.drop(f"{_PTS_HEAD}.bbox_coder", names="post_center_range")
         settings[_HEAD + "coder.margin_m"] = float(margins.pop())
