@@ -1,6 +1,7 @@
-"""A node of ROS 2: rectified images and their CameraInfo in, markers of the map elements out.
+"""Node of ROS 2 that takes rectified images and their CameraInfo, and publishes map elements.
 
-Copy this file, and name your cameras as the model does or number them as you like.
+The map elements are published as markers. Copy this file, and replace the constants below by the
+cameras and frames of your vehicle.
 """
 
 from collections.abc import Iterator
@@ -21,11 +22,14 @@ from gsmap import MapElements, MapInferencer
 from gsmap.structures.rigid import rigid
 
 MODEL = "gsmap_r18_minicity"
-CAMERAS = {"CAM_FRONT": "/front", "CAM_BACK": "/rear"}  # namespaces of image_rect and camera_info
+# Name of each camera, as in the data of the model or any other, and namespace of its topics
+# image_rect and camera_info.
+CAMERAS = {"CAM_FRONT": "/front", "CAM_BACK": "/rear"}
 VEHICLE = "base_footprint"  # x ahead, y left, on the road below the rear axle
 MIN_SCORE = 0.3
 PERIOD_S = 0.5
-COLOURS = [(0.2, 0.6, 1.0), (1.0, 0.6, 0.1), (0.2, 0.8, 0.3)]  # divider, ped_crossing, boundary
+# RGB of the classes divider, ped_crossing and boundary.
+COLOURS = [(0.2, 0.6, 1.0), (1.0, 0.6, 0.1), (0.2, 0.8, 0.3)]
 
 
 class MapNode(Node):
@@ -33,9 +37,12 @@ class MapNode(Node):
 
     def __init__(self) -> None:
         super().__init__("gsmap")
-        self.inferencer, self.live = MapInferencer(MODEL), None
-        self.images, self.infos = {}, {}
+        self.inferencer = MapInferencer(MODEL)
+        self.live = None  # function from images to map elements, made once the cameras are known
+        self.images = {}
+        self.infos = {}
         for name, topic in CAMERAS.items():
+            # Store the latest message of each topic by the name of its camera.
             keep_image = partial(self.images.__setitem__, name)
             keep_info = partial(self.infos.__setitem__, name)
             self.create_subscription(Image, f"{topic}/image_rect", keep_image, 1)
@@ -46,22 +53,28 @@ class MapNode(Node):
         self.create_timer(PERIOD_S, self.step)
 
     def cam_from_vehicle(self, info: Any) -> np.ndarray:
-        """Transform from the vehicle to a camera, (4, 4). One that is missing is an error."""
+        """Transform from the vehicle to a camera, in metres. (4, 4)
+
+        An error is raised if tf has no such transform.
+        """
         camera = info.header.frame_id
-        found = self.transforms.lookup_transform(camera, VEHICLE, Time()).transform
-        turn, shift = found.rotation, found.translation
+        transform = self.transforms.lookup_transform(camera, VEHICLE, Time()).transform
+        turn = transform.rotation
+        shift = transform.translation
         rotation = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
         return rigid(rotation, [shift.x, shift.y, shift.z])
 
     def step(self) -> None:
-        """Predict and publish, once every camera has spoken."""
+        """Predict and publish the map, once every camera has sent an image and its CameraInfo."""
         if len(self.images) < len(CAMERAS) or len(self.infos) < len(CAMERAS):
             return
         if self.live is None:
-            intrinsics = {
-                name: np.reshape(info.p, (3, 4))[:, :3] for name, info in self.infos.items()
-            }
-            mounting = {name: self.cam_from_vehicle(info) for name, info in self.infos.items()}
+            intrinsics = {}
+            mounting = {}
+            for name, info in self.infos.items():
+                projection = np.reshape(info.p, (3, 4))
+                intrinsics[name] = projection[:, :3]
+                mounting[name] = self.cam_from_vehicle(info)
             self.live = self.inferencer.live(
                 intrinsics, mounting, "vehicle", allow_missing_cameras=True
             )
@@ -74,6 +87,7 @@ class MapNode(Node):
 
 def rgb(message: Any) -> np.ndarray:
     """Pixels of an image message of 8 bits. (H, W, 3)"""
+    # A row has `step` bytes, which may include padding at its end.
     rows = np.frombuffer(message.data, np.uint8).reshape(message.height, message.step)
     pixels = rows[:, : 3 * message.width].reshape(message.height, message.width, 3)
     return pixels[..., ::-1] if message.encoding == "bgr8" else pixels
@@ -83,10 +97,13 @@ def markers(elements: MapElements, stamp: Any) -> Iterator[Any]:
     """A line for each element, in the vehicle's frame."""
     for number, (line, label) in enumerate(zip(elements.polylines, elements.labels, strict=True)):
         marker = Marker(id=number, type=Marker.LINE_STRIP)
-        marker.header.frame_id, marker.header.stamp = VEHICLE, stamp
+        marker.header.frame_id = VEHICLE
+        marker.header.stamp = stamp
         marker.points = [Point(x=x, y=y, z=0.0) for x, y in line[:, :2].tolist()]
         marker.color.r, marker.color.g, marker.color.b = COLOURS[label]
-        marker.color.a, marker.scale.x, marker.pose.orientation.w = 1.0, 0.1, 1.0
+        marker.color.a = 1.0
+        marker.scale.x = 0.1  # width of the line in metres
+        marker.pose.orientation.w = 1.0  # no rotation
         yield marker
 
 

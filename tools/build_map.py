@@ -55,11 +55,13 @@ from gsmap.visualization.figure import save_figure
 from gsmap.visualization.style import MapStyle
 
 FORMATS = ("geojson", "osm", "rrd", "mcap", "mp4", "png", "svg")
-_LON_LAT = "_lonlat"  # ends the name of a map in degrees
+_LON_LAT = "_lonlat"  # the name of a map in degrees ends in this
 _SCORES = "scores.json"
 _CHANGES = "changes"  # name of the file of changes, without a suffix
-_MARK = b"gsmap"  # in all maps
-_MARK_OF_SCORES = b'"merged"'
+# Bytes that every output of this command holds, by which outputs of other programs are recognized:
+_MARK = b"gsmap"  # in maps
+_MARK_OF_SCORES = b'"merged"'  # in scores
+# Package and extra that a format needs.
 EXTRAS = {"rrd": ("rerun", "viz"), "mcap": ("foxglove", "viz"), "mp4": ("av", "viz")}
 
 
@@ -169,7 +171,7 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
 
 
 def check_options(args: argparse.Namespace, ann: AnnotationFile) -> None:
-    """Check, before the first file is written, that each format has its package and an origin.
+    """Check, before the first file is written, that the formats have their packages and an origin.
 
     Raises:
         ImportError: If a package is missing.
@@ -190,7 +192,8 @@ def check_options(args: argparse.Namespace, ann: AnnotationFile) -> None:
         if origin is None:
             unknown.append(name)
     has_poses = ann.meta.options.get("poses", True)
-    if not has_poses and (args.formats != ["mp4"] or args.prior or args.changes):
+    needs_poses = args.formats != ["mp4"] or args.prior or args.changes
+    if needs_poses and not has_poses:
         raise InputError(
             f"the samples of {args.ann} have no poses, so there is no map of the drive: --formats "
             "mp4 shows the single frames."
@@ -210,7 +213,7 @@ def require_own_files(args: argparse.Namespace, names: Iterable[str], scored: bo
 
     Args:
         args: The options of the command.
-        names: Names of the files of each drive, without suffixes.
+        names: Name of the files of each drive, without a suffix.
         scored: Whether the maps are scored.
 
     Raises:

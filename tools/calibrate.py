@@ -1,14 +1,15 @@
 #!/usr/bin/env python
 r"""Fit the sigmas of a model's Gaussians to its errors, and write a calibrated checkpoint.
 
-RESULTS are predictions of this checkpoint on samples that are not in its training. The fit gives a
-factor per class for sigma along the line and one for sigma across: 68.3 % of the errors then lie
-within one sigma, or with ``--sigmas 2``, 95.4 % within two. With ``--law laplace`` the intervals
-are those quantiles of a Laplace distribution with this sigma (0.81 and 2.18 sigma to each side),
-whose tails are longer. The law and the number of sigmas are recorded as ``calibration`` in the meta
-of the checkpoint and in its results.
+RESULTS are predictions of this checkpoint on samples that are not in its training. For each class,
+the fit gives a factor for sigma along the line and a factor for sigma across it. Sigma times its
+factor is such that 68.3 % of the errors lie within one sigma or, with ``--sigmas 2``, 95.4 % within
+two. With ``--law laplace``, these shares of the errors lie within the interval of a Laplace
+distribution with this sigma, which has longer tails: 0.81 sigma to each side, or 2.18 sigma with
+``--sigmas 2``. The law and the number of sigmas are recorded as ``calibration`` in the meta of the
+checkpoint and in its results.
 
-Results of another checkpoint and samples of the training's split are refused.
+Results of another checkpoint are refused, and so are samples of the split of the training.
 
 Example:
     python tools/test.py gsmap_r18_minicity --eval --out half.json \

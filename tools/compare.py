@@ -117,7 +117,7 @@ def training_command(row: dict[str, Any]) -> str:
 
 
 def published_figures(table: dict[str, Any], row: dict[str, Any]) -> str:
-    """Mean APs and costs of a row in the paper; all figures if the table has no mean."""
+    """Mean APs and costs of a row in the paper, or the APs of the classes without a mean."""
     if row["paper"] is None:
         return "no figure"
     figures = dict(zip(table["columns"], row["paper"], strict=True))
@@ -141,7 +141,7 @@ def listing(tables: list[dict[str, Any]]) -> Iterator[str]:
 
 
 def slurm_commands(runs: list[Run], partition: str) -> str:
-    """Commands for the unfinished runs, one per line: this command with ``--only``."""
+    """Commands for the unfinished runs, one per line: this command with ``--only`` for each run."""
     slurm_option = argparse.ArgumentParser(add_help=False)
     slurm_option.add_argument("--slurm")
     _, other_words = slurm_option.parse_known_args()

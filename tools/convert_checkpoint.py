@@ -1,4 +1,4 @@
-"""Convert a checkpoint of the original systems to our format, or one of ours to theirs."""
+"""Convert a checkpoint of an original repository to the format of GSMap, or back to its format."""
 
 from pathlib import Path
 

@@ -1,8 +1,8 @@
 #!/usr/bin/env python
-"""Convert a config of the original MapTR, or of a method built on its code, to ours.
+"""Convert a config of the original MapTR, or of a method built on its code, to a config of GSMap.
 
-The file is read, not run. Settings without a counterpart are printed; those of the model are an
-error unless --allow-changes is given. Example:
+The file is read, not run. Settings without a counterpart are printed. If settings of the model are
+among them, the conversion ends with an error, unless --allow-changes is given. Example:
     python tools/convert_config.py maptr_tiny_r50_24e.py configs/mine/maptr_tiny.py
 """
 
@@ -26,7 +26,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument(
         "--allow-changes",
         action="store_true",
-        help="write a model that is another one without the settings that have no counterpart",
+        help="leave out settings of the model without a counterpart, which changes the model",
     )
     return parser.parse_args()
 

@@ -52,7 +52,7 @@ def make() -> str | None:
     if getattr(arguments, "executor", None):
         return run_on_ray(arguments, sys.argv)
     module, _ = COMMANDS[arguments.command]
-    words = without_options(sys.argv, "--shard")  # the command of the whole file
+    words = without_options(sys.argv, "--shard")  # the command that writes the whole file
     arguments.command = printable(shlex.join(["python", *words]))
     return importlib.import_module(module).run(arguments)
 

@@ -1,10 +1,10 @@
 #!/usr/bin/env python
 """Test a trained GSMap on MiniCity, then train one of your own (``make demo``).
 
-First the model that ships is tested on validation towns, and its predictions are drawn. Then a
-GSMap is trained on other towns, starting from the MapTR that ships (with ``--from-scratch`` another
-one from nothing), and compared with it. The next run skips finished steps, and an interrupted
-training continues.
+First the GSMap that ships with the project is tested on validation towns, and its predictions are
+drawn. Then another GSMap is trained on other towns. It starts from the MapTR that ships; with
+``--from-scratch``, a third one starts from random weights. A table compares all of them. When the
+command is given again, it skips finished steps and continues an interrupted training.
 """
 
 import hashlib
@@ -232,7 +232,7 @@ def data_steps(folder: Path, budget: Budget, split: str) -> Iterable[Step]:
 
 
 def prior_step(folder: Path, budget: Budget) -> Step:
-    """Step that scores the best map for all samples alike."""
+    """Step that scores the best fixed map, which is predicted for every sample."""
     truth = annotations(folder, budget, "val")
     train = annotations(folder, budget, "train")
     metrics = folder / "prior.json"

@@ -56,7 +56,7 @@ from gsmap.utils.ray_shards import run_on_ray
 from gsmap.utils.shards import digest, digest_of_common, read_shard
 from gsmap.utils.words import format_count
 
-# Reports that their analyses print themselves.
+# Names of reports that are printed where they are made.
 PRINTED = ("intervals", "by", "uncertainty", "changes")
 
 
@@ -163,7 +163,7 @@ def match_shard(args: argparse.Namespace, evaluator: MapEvaluator, settings: Met
         A line with the number of samples and the file.
     """
     require_own_matches(args.out, args.shard)
-    # The results are one file for all shards, or have a shard of their own for this one.
+    # The results are one file for all shards, or a file of results for this shard.
     results = args.results
     results_shard = args.shard.path_of(args.results)
     if args.results.exists() or not results_shard.exists():

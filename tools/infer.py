@@ -3,7 +3,7 @@
 
 Example: ``python tools/infer.py INPUT --model gsmap_r18_minicity --out map.json --show-dir
 pictures``, or ``--model CONFIG CHECKPOINT``. INPUT is an annotation file (.arrow), an info file of
-mmdet3d (.pkl), a nuScenes-format root, an Argoverse 2 log or a folder of some, a folder of images
+mmdet3d (.pkl), a nuScenes-format root, an Argoverse 2 log or a folder of logs, a folder of images
 with calibration.yaml, or a bag of ROS 1 or 2 (docs/inference.md).
 """
 
@@ -49,8 +49,8 @@ if TYPE_CHECKING:  # slow to import
     from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
     from gsmap.prior.opening import AnyPrior
 
-_ONE_SAMPLE_HZ = 1e-4  # rate at which a drive has one sample
-_SAMPLES = ".arrow"  # suffix of the file with the samples, in place of the one of --out
+_ONE_SAMPLE_HZ = 1e-4  # at this rate, only one sample is read of a drive
+_SAMPLES = ".arrow"  # the file of the samples is named like --out, with this suffix
 SKIPPED = 1  # exit code after broken frames
 IMPLAUSIBLE = 1  # exit code for an implausible calibration
 
@@ -171,8 +171,8 @@ def read_input(args: argparse.Namespace, frames: Path | None = None) -> Source:
 
     Args:
         args: The options of the command.
-        frames: Folder for extracted frames, for a look at few samples. None extracts all samples
-            into a folder beside the output.
+        frames: Folder for the images of a single sample of each drive. None reads all samples, and
+            writes their images into a folder beside the output.
 
     Raises:
         ValueError: If the input is not a recording.
@@ -180,7 +180,8 @@ def read_input(args: argparse.Namespace, frames: Path | None = None) -> Source:
     rate_hz = _ONE_SAMPLE_HZ
     if frames is None:
         rate_hz = args.rate
-        stem = args.out.with_suffix("") if args.out else (args.show_dir or Path()) / "input"
+        usual_stem = (args.show_dir or Path()) / "input"
+        stem = args.out.with_suffix("") if args.out else usual_stem
         frames = register_folder(stem.with_name(f"{stem.name}_frames"))
     options = InputOptions(
         data_root=args.data_root,
@@ -203,21 +204,21 @@ def read_input(args: argparse.Namespace, frames: Path | None = None) -> Source:
 
 
 def require_own_samples(path: Path) -> None:
-    """Check that an annotation file may be replaced: an earlier run of this command wrote it.
+    """Check that an annotation file may be replaced, as an earlier run of this command wrote it.
 
     Raises:
-        ValueError: If the file is there and another command wrote it.
+        ValueError: If the file exists and another command wrote it.
     """
     from gsmap.apis.input_dataset import INFERENCE_COMMAND
 
     if not path.exists():
         return
-    with suppress(ValueError):  # not an annotation file
+    with suppress(ValueError):  # a file that is not an annotation file is refused below
         if AnnotationFile(path).meta.command == INFERENCE_COMMAND:
             return
     raise InputError(
         f"{path} is there, and not from an earlier run of this command, which writes the samples "
-        "of its input to that name: give another --out."
+        "of its input to a file of this name: give another --out."
     )
 
 
@@ -305,8 +306,8 @@ def open_log(
 
     Args:
         args: The options of the command.
-        settings: Settings that determine the predictions. Predictions of an earlier run are used
-            if its settings are equal.
+        settings: Settings that determine the predictions. If an earlier run had equal settings, its
+            predictions are used.
         tokens: Tokens of the samples to predict, in their order.
         classes: Names of the classes.
     """
@@ -348,7 +349,8 @@ def predict(
         if results and done:
             bar.write(f"going on after {len(done)} of {format_count(len(chosen), 'sample')}")
             broken.update(results.broken)
-            if not remembers(inferencer):  # memory needs the frames before
+            # A model that uses earlier frames must see all of them again.
+            if not remembers(inferencer):
                 bar.update(len(done))
                 chosen = [index for index in chosen if tokens[index] not in done]
 
@@ -380,7 +382,7 @@ def predict(
 
 
 def remembers(inferencer: "MapInferencer") -> bool:
-    """Whether predictions of a model depend on the samples before."""
+    """Whether the predictions of a model depend on earlier samples, by frames or by a prior."""
     return inferencer.model.temporal is not None or inferencer.model.prior is not None
 
 
@@ -398,7 +400,7 @@ def read_priors(
         inferencer: The model.
         dataset: The samples.
         chosen: Indices of the samples to predict.
-        stack: Closes the files.
+        stack: Stack that closes the files at its end.
     """
     if not args.prior:
         return []
@@ -488,15 +490,18 @@ def main(argv: list[str] | None = None) -> str | None:
     inferencer = open_model(args)
     if args.shard.count and remembers(inferencer):
         raise InputError(
-            "--shard cuts drives, which a model with memory needs whole: leave it out."
+            "--shard cuts drives, which a model that uses earlier frames or a prior needs whole: "
+            "leave it out."
         )
     dataset = inferencer.dataset(source)
     tokens = dataset.annotations.column("token")
     chosen = args.shard.part(select_samples(tokens, args.token, args.max_samples))
     settings = run_settings(args)
     samples_digest = digest(dataset.annotations.path)
+    # Settings that also identify the input. The name of the folder of images depends on their
+    # content and on the calibration.
     run = {**settings, "input": str(args.input.resolve()), "samples": samples_digest}
-    run["images"] = str(source.data_root)  # the folder name depends on content and calibration
+    run["images"] = str(source.data_root)
     chosen_tokens = [tokens[index] for index in chosen]
     classes = dataset.metainfo["classes"]
     with ExitStack() as stack:
@@ -520,7 +525,12 @@ def main(argv: list[str] | None = None) -> str | None:
 
 
 def no_usable_frame(broken: dict[str, str], notes: Sequence[str]) -> InputError:
-    """Error for a recording without a usable frame, with the first reason and the last note."""
+    """Error for a recording without a usable frame, with the first reason and the last note.
+
+    Args:
+        broken: Reasons of broken frames, by token.
+        notes: Notes of the reader of the input.
+    """
     reason = next(iter(broken.values()))
     if notes:
         reason = f"{reason}; as said: {notes[-1]}"

@@ -1,8 +1,9 @@
 #!/usr/bin/env python
 """Join the parts that commands with ``--shard I/N`` wrote: ``python tools/merge.py FILE ...``.
 
-FILE is the output of a command without ``--shard``: an annotation file, results or metrics. Its N
-parts must lie in its folder. The joined file is identical, byte for byte (docs/scale.md).
+FILE is the output that the command would write without ``--shard``: an annotation file, results or
+metrics. Its N parts must lie in its folder. The joined file is identical to this output, byte for
+byte (docs/scale.md).
 """
 
 from importlib import import_module

@@ -196,7 +196,7 @@ def other_figures(
 
 
 def require_own_split(checkpoint: Path, settings: Any) -> None:
-    """Refuse a data set whose split is not the one of the training."""
+    """Refuse a data set if its split list is not the list that the model was trained on."""
     from gsmap.checkpoints.reading import read_checked
 
     meta = AnnotationFile(Path(settings["data_root"], settings["ann_file"])).meta
@@ -219,8 +219,11 @@ def main() -> str:
     if not args.allow_other_split:
         require_own_split(checkpoint, model.cfg.test_dataloader.dataset)
     if model.temporal is not None and args.samples:
-        raise InputError("--samples tears drives apart, which a model with memory needs whole.")
-    MMLogger.get_instance("robustness", log_level="ERROR")  # one table for each run is too much
+        raise InputError(
+            "--samples tears drives apart, which a model that uses earlier frames needs whole: "
+            "leave it out."
+        )
+    MMLogger.get_instance("robustness", log_level="ERROR")  # without the table of each case
     cases = [(CLEAN, 1), *product(args.kinds, SEVERITIES)]
     measured: dict[str, list[dict[str, float]]] = {}
     with (

@@ -49,7 +49,7 @@ def parse_args() -> argparse.Namespace:
         "--shuffle-images",
         type=int,
         metavar="SEED",
-        help="give every sample the images of another one, to see what a model scores without them",
+        help="give every sample the images of another one, to measure the score without them",
     )
     parser.add_argument(
         "--allow-other-split",

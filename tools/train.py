@@ -51,7 +51,7 @@ def parse_args() -> argparse.Namespace:
 
 
 def choose_start(cfg: Config, resume: str | None) -> None:
-    """Set the checkpoint that the run resumes or starts from, and check that file."""
+    """Set and check the checkpoint that the run resumes, or whose weights it starts from."""
     from gsmap.checkpoints.reading import read_weights
     from gsmap.engine.launch import newest_checkpoint
 
@@ -67,8 +67,8 @@ def choose_start(cfg: Config, resume: str | None) -> None:
         read_weights(cfg.load_from)  # raises an error for a file that cannot be loaded
         if not cfg.resume and Path(cfg.load_from).resolve().parent == Path(cfg.work_dir).resolve():
             raise InputError(
-                f"{cfg.load_from}, from which this run is to start, lies in its work folder, whose "
-                "checkpoints it would replace: give another --work-dir, or --resume."
+                f"{cfg.load_from}, from which this run is to start, lies in its work folder, and "
+                "the run would replace the checkpoints there: give another --work-dir, or --resume."
             )
 
 

@@ -123,7 +123,7 @@ def test_memory_sees_the_frames_before_after_a_kill_too(
     assert "going on after 2 of 4 samples" in capsys.readouterr().out
     assert len(calls) == 5  # three, and the two that were not there
     assert results(tmp_path / "killed.json") == results(tmp_path / "whole.json")
-    with pytest.raises(ValueError, match="--shard cuts drives, which a model with memory needs"):
+    with pytest.raises(ValueError, match="--shard cuts drives, which a model that uses earlier"):
         infer.main([*words, str(tmp_path / "part.json"), "--shard", "1/2"])
 
 

@@ -21,12 +21,12 @@ from gsmap.utils.files import lock_folder, open_to_append, require_no_link, writ
 from gsmap.utils.parallel import die_with_parent
 from gsmap.utils.progress import Progress
 
-_PAUSE_S = 2.0  # between two polls of the runs
-_MESSAGE_LENGTH = 200  # characters of a failed run's error
+_PAUSE_S = 2.0  # pause between two polls of the runs
+_MESSAGE_LENGTH = 200  # largest number of characters of a failed run's error
 
 
 def devices() -> list[str | None]:
-    """Values of ``CUDA_VISIBLE_DEVICES`` for single GPUs; only None, the CPU, without a GPU."""
+    """Values of ``CUDA_VISIBLE_DEVICES`` that select single GPUs; without a GPU, one None (CPU)."""
     count = torch.cuda.device_count()
     if not count:
         return [None]
@@ -190,7 +190,7 @@ def execute(runs: Sequence[Run]) -> Iterator[tuple[Run, str]]:
                 summary = f"{num_done} of {len(runs)} runs done"
                 bar.set_description(", ".join([summary, *stages]), refresh=False)
                 iterations = sum(run.iterations_so_far for run in runs)
-                bar.update(iterations - bar.n)  # takes the increment
+                bar.update(iterations - bar.n)  # the argument is an increment
                 if jobs:
                     time.sleep(_PAUSE_S)
         finally:

@@ -66,7 +66,8 @@ def parse_entry(text: str) -> Entry:
     Raises:
         ValueError: If the name is not valid for a folder, or an override has no value.
     """
-    first, *options = re.split(r",(?![^\[(]*[\])])", text)  # at commas outside of brackets
+    # Split at commas outside of brackets: no closing bracket follows before an opening one.
+    first, *options = re.split(r",(?![^\[(]*[\])])", text)
     name, separator, config = first.rpartition("=")
     if not separator:
         name = Path(config).stem
@@ -132,7 +133,7 @@ class Run:
         """Number of iterations in the log."""
         if self.is_done:
             return self.iterations
-        # MMEngine names the folder of each start by its time, such as 20261127_093000.
+        # MMEngine names a folder by the time of each start, such as 20261127_093000.
         logs = sorted(self.folder.glob("2*/vis_data/scalars.json"))
         if not logs:
             return 0
@@ -145,9 +146,9 @@ class Run:
         train += ["--work-dir", str(self.folder), "--resume"]
         python = [sys.executable, "-u"]
         launcher = python
-        if self.processes > 1:  # alone, torchrun chooses a free port
+        if self.processes > 1:
             launcher = [str(shipped_path("tools/dist_run.sh")), str(self.processes)]
-            launcher += ["--standalone", "--local_addr=127.0.0.1"]
+            launcher += ["--standalone", "--local_addr=127.0.0.1"]  # torchrun chooses a free port
             train += ["--launcher", "pytorch"]
         test = [str(shipped_path("tools/test.py")), self.config, str(self.checkpoint)]
         test += ["--work-dir", str(self.folder / "test")]
@@ -184,9 +185,9 @@ class Protocol:
 def plan(entries: Sequence[Entry], protocol: Protocol) -> list[Run]:
     """Plan all runs and check them, before anything trains.
 
-    On a GPU a run has one process. On a CPU it has as many as earlier runs of the comparison, or
-    else one per core; the number divides the batch. Batch normalization uses the samples of one
-    process.
+    On a GPU a run has one process. On a CPU it has as many processes as earlier runs of the
+    comparison, or else at most one per core. The number divides the batch. It affects the results,
+    as batch normalization uses the samples of one process.
 
     Args:
         entries: The configs with their overrides.
@@ -245,7 +246,7 @@ def _processes(protocol: Protocol) -> int:
 def _plan_run(entry: Entry, seed: int, protocol: Protocol, processes: int) -> Run:
     """Plan one run; build its data set and its model once, so that faults are found early."""
     initial_weights = None
-    own_options = [  # of the comparison; the overrides of the user come after them
+    own_options = [  # overrides by the comparison, which overrides of the user replace
         f"train_dataloader.batch_size={protocol.batch // processes}",
         "val_evaluator.eval=chamfer,raster",
         f"randomness.seed={seed}",
@@ -269,7 +270,8 @@ def _plan_run(entry: Entry, seed: int, protocol: Protocol, processes: int) -> Ru
     with building(cfg):
         MODELS.build(cfg.model)
     dataset = plain(cfg.train_dataloader.dataset)
-    for key in ("data_root", "ann_file"):  # the data may move; its digest is part of "data"
+    # The data may be moved to other paths; "data" below has a digest of its content.
+    for key in ("data_root", "ann_file"):
         dataset.pop(key, None)
     settings = {key: plain(cfg.get(key)) for key in _TRAINING_KEYS}
     settings["processes"] = processes

@@ -31,7 +31,7 @@ from gsmap.visualization.style import RUN_COLOURS
 from mapdata.upstream_configs.fields import Fields
 from mapdata.upstream_configs.reader import read_assignments
 
-_COSTS = {  # formats of the costs in the table
+_COSTS = {  # number formats of the costs in the table, by cost
     "iterations": ".0f",
     "million parameters": ".2f",
     "seconds a step": ".3f",
@@ -52,8 +52,8 @@ class Result:
         state: ``done``, or the fault.
         figures: All figures of the test, by flat key; empty if the run is not done.
         costs: Iterations, million parameters, seconds per step and per tested sample, peak memory
-            in MiB, as far as they are known.
-        record: Machine, load and commands, if the comparison has run it.
+            in MiB, as far as they are known; keys of ``_COSTS``.
+        record: Machine, load and commands; empty unless `execute` has run the run.
         log: The training log; None if there is none.
     """
 
@@ -128,7 +128,7 @@ def _count_parameters(checkpoint: Path) -> int:
 
 
 def _json(path: Path) -> dict[str, Any]:
-    """Read a JSON object; empty if there is no such file."""
+    """Read a JSON object; an empty one if there is no such file."""
     content = read_json(path) if path.is_file() else {}
     if not isinstance(content, dict):
         raise InputError(f"{path} must hold a JSON object, got {content!r:.60}.")
@@ -251,7 +251,11 @@ def _cell(values: Sequence[float], factor: float = 1.0, form: str = ".1f") -> st
 
 
 def differences_to_first(results: Sequence[Result]) -> dict[str, dict[str, list[float]]]:
-    """Differences of each config to the first one, seed by seed, by name and figure."""
+    """Differences of each config to the first one, seed by seed.
+
+    Returns:
+        List of the differences, one for each seed, by name of the config and then by figure.
+    """
     done = _finished(results)
     if not done:
         return {}
@@ -383,7 +387,7 @@ def plot_iterations(results: Sequence[Result]) -> Figure | None:
             for log in runs:
                 steps, values = log.series(f"{metric}/mAP", validation=True)
                 last = log.train[-1]
-                if "epoch" in last:  # validation counts epochs
+                if "epoch" in last:  # validation counts epochs, which become iterations here
                     steps = last["step"] / last["epoch"] * steps
                 panel.plot(steps, 100 * values, ".-", color=colour, label=label)
                 label = None  # one entry of the legend for all seeds
@@ -395,7 +399,10 @@ def plot_iterations(results: Sequence[Result]) -> Figure | None:
 def apply_rescoring(
     results: Sequence[Result], changes: Mapping[str, Any]
 ) -> dict[str, list[MetricReport]]:
-    """Score runs again: with changed rules all runs, else one of each config, for its curves.
+    """Score runs again.
+
+    With changed rules, all runs are scored. Otherwise one run of each config is scored, for its
+    precision-recall curves.
 
     Args:
         results: Results of all runs. Their figures are replaced if rules change.

@@ -89,7 +89,7 @@ def _records(path: Path) -> list[dict[str, float]]:
 
 
 def read_run(path: str | Path, name: str | None = None) -> RunLog:
-    """Read the log of a run. A step that was logged twice, as after a resume, has its later record.
+    """Read the log of a run. Of a step that was logged twice, as after a resume, the later counts.
 
     Args:
         path: Work folder of the run, or a ``scalars.json``.
@@ -127,6 +127,7 @@ def read_run(path: str | Path, name: str | None = None) -> RunLog:
 
 def smooth(values: np.ndarray) -> np.ndarray:
     """Centred moving average over a tenth of the values; the window narrows at both ends. (n,)"""
+    # The sum of the values i to j - 1 is total[j] - total[i].
     total = np.cumsum(np.concatenate([[0.0], values]))
     index = np.arange(len(values))
     to_nearest_end = np.minimum(index, index[::-1])

@@ -270,7 +270,7 @@ def check_prior(parser: argparse.ArgumentParser, args: argparse.Namespace) -> No
 
 
 def check_shard(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
-    """Refuse options that need all samples, of which ``--shard`` matches a part."""
+    """Refuse options that need all samples, as ``--shard`` matches only a part of them."""
     if not args.out:
         parser.error("--shard needs --out")
     for name in ("pr_curves", "bootstrap", "against", "by", "consistency", "uncertainty"):

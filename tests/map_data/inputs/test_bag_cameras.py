@@ -73,7 +73,7 @@ def test_binning_and_region_of_interest_count_as_in_image_geometry(
 def test_binning_is_not_applied_to_images_that_have_all_pixels():
     camera, (note,) = made((320, 180), binning_x=2, binning_y=2)
     np.testing.assert_array_equal(camera.intrinsics, PINHOLE)
-    assert "its images have all (320, 180) pixels: neither is applied" in note
+    assert "its images have all (320, 180) pixels, so that neither is applied" in note
 
 
 def test_images_of_a_size_that_nothing_explains_are_refused_with_the_topic():
