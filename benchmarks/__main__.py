@@ -5,8 +5,8 @@ import sys
 
 from gsmap.utils.cli import CommandParser, run_command
 
-# Module of each command. A module is imported only for its command: libraries of the others would
-# count in the measured memory.
+# Module of each command. Only the module of the requested command is imported, as the libraries of
+# other commands would add to the measured memory.
 COMMANDS = {
     "data": "data_commands",
     "eval": "evaluation",
@@ -34,7 +34,7 @@ def main() -> None:
     """Run the benchmark of the command line."""
     parser = CommandParser(description=__doc__)
     subparsers = parser.add_subparsers(required=True)
-    requested = COMMANDS.keys() & set(sys.argv[1:2])
+    requested = COMMANDS.keys() & set(sys.argv[1:2])  # empty, such as for --help: all commands
     for name in sorted(requested or COMMANDS):
         module = importlib.import_module(f"benchmarks.{COMMANDS[name]}")
         text = str(module.__doc__)

@@ -19,7 +19,7 @@ _SETS = {
 
 
 def measure_extraction(root: Path, split: str = "val", stride: int = 10) -> dict[str, float]:
-    """Measure the extraction at every N-th pose of a split's logs, in CPU time of this process.
+    """Measure the processor time of the extraction at every N-th pose of the logs of a split.
 
     Args:
         root: Root folder of the data set.
@@ -27,8 +27,9 @@ def measure_extraction(root: Path, split: str = "val", stride: int = 10) -> dict
         stride: N, >= 1.
 
     Returns:
-        Milliseconds per frame by set of classes, milliseconds per log for its preparation, the
-        number of frames, and the largest resident memory of the process in MB.
+        By name: milliseconds per frame for each set of classes, milliseconds per log for the
+        preparation of its map, the number of frames, and the largest resident memory of the process
+        in MB.
     """
     log_dirs = find_logs(root, split)
     start = time.process_time()
@@ -48,6 +49,7 @@ def measure_extraction(root: Path, split: str = "val", stride: int = 10) -> dict
 
     result = {}
     for name, classes in _SETS.items():
+        # `c=classes` binds the classes of this iteration.
         result[f"maptrv2_{name}_ms"] = ms_per_frame(lambda m, pose, c=classes: m.extract(pose, c))
     result["maptr_three_classes_ms"] = ms_per_frame(lambda m, pose: m.extract(pose, compat="maptr"))
     result["preparation_ms_per_log"] = 1e3 * preparation_s / len(maps)

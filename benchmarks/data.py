@@ -46,7 +46,7 @@ def _unique_bytes() -> int:
 
 
 def _read_in_worker(file: AnnotationFile, reads: int) -> tuple[int, int, int, int]:
-    """Read random samples in a fresh process.
+    """Read random samples, in a process that has read nothing before.
 
     Args:
         file: Annotation file.
@@ -73,9 +73,11 @@ def measure_loading(path: Path, reads: int = 5000) -> dict[str, float]:
         reads: Number of random samples that the extra process reads.
 
     Returns:
-        CPU times ``open_s``, and ``read_ms`` per sample; ``worker_mb``, the unique memory of an
-        extra process with the interpreter and its libraries; ``worker_growth_mb``, its growth by
-        reading; ``worker_rss_mb``, with shared pages; ``file_mb``; and ``samples``.
+        By name: the processor times ``open_s``, and ``read_ms`` per sample; the unique memory of
+        the extra process after reading, ``worker_mb``, which includes the interpreter and its
+        libraries; the growth of this memory by reading, ``worker_growth_mb``; the resident memory
+        with shared pages, ``worker_rss_mb``; the size of the file, ``file_mb``; and the number of
+        ``samples``.
     """
     start = time.process_time()
     file = AnnotationFile(path)
@@ -98,10 +100,10 @@ def measure_loading(path: Path, reads: int = 5000) -> dict[str, float]:
 
 
 class PerItemGroundTruth:
-    """Ground truth made for each item by a walk over all records of the map, with the devkit.
+    """Ground truth that is made for each item by a walk over all records of the map.
 
-    Code that makes ground truth in the data loader works like this. It is compared with
-    ``NuScenesLocalMap``.
+    It is made with the devkit, as in data loaders that make ground truth while they load. It is
+    compared with ``NuScenesLocalMap``, which is prepared once for each map.
 
     Args:
         nusc_map: Map of the devkit.
@@ -251,7 +253,9 @@ def _cpu_ms(work: Callable[[], Any]) -> float:
 
 
 def measure_ground_truth(root: Path, annotations: Path, repeats: int = 3) -> dict[str, float]:
-    """Measure ground truth per frame, prepared once per map and made per item, in turns.
+    """Measure ground truth per frame, from maps that are prepared once, and made per item.
+
+    Both are measured in turns.
 
     Args:
         root: Data root with the map expansion.
@@ -288,10 +292,11 @@ def measure_ground_truth(root: Path, annotations: Path, repeats: int = 3) -> dic
 
 
 def measure_pipeline(config: Any, root: Path, count: int = 20) -> dict[str, float]:
-    """Measure the training pipeline, with ground truth from the file and made per item, in turns.
+    """Measure the training pipeline with ground truth from the file, and made per item.
 
-    Made per item means: elements from the map by a walk over its records, and their point orders
-    by one call per point, as in MapTR's data set. Both share the transforms of images.
+    Ground truth that is made per item comes from a walk over the records of the map, and its orders
+    of points are resampled by one call per point, as in MapTR's data set. Both pipelines have equal
+    transforms of images, and are measured in turns.
 
     Args:
         config: Config of a ``VectorizedMapDataset``.
@@ -299,14 +304,14 @@ def measure_pipeline(config: Any, root: Path, count: int = 20) -> dict[str, floa
         count: Number of samples of each pass, >= 1.
 
     Returns:
-        CPU time in milliseconds per sample (``file_ms``, ``per_item_ms``) and the ratio.
+        CPU time in milliseconds per sample (``file_ms``, ``per_item_ms``) and their ratio.
     """
     from mmdet3d.registry import DATASETS
 
     dataset = DATASETS.build(deepcopy(config))
     meta = dataset.metainfo
     _, per_item = open_maps(root, meta["x_range"], y_range=meta["y_range"])
-    dataset[0]
+    dataset[0]  # opens the files, outside of the measured time
 
     def run_from_file() -> None:
         for number in range(count):

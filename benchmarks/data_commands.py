@@ -61,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     command.add_argument("annotations", type=Path)
     command.add_argument("--samples", type=int, default=28_130)
     command.set_defaults(measure=loading)
-    command = commands.add_parser("ground-truth", help="per frame, prepared and per item")
+    command = commands.add_parser("ground-truth", help="ground truth, prepared and made per item")
     command.add_argument("root", type=Path)
     command.add_argument("annotations", type=Path)
     command.set_defaults(measure=ground_truth)

@@ -73,13 +73,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def generated_frames(
     count: int, seed: int = 0, size_m: Sequence[float] = (30.0, 60.0)
 ) -> list[Record]:
-    """Frames like the ones of a validation set: lines across the range and crossings, with noise.
+    """Random frames like those of a validation set: lines across the range, and crossings.
+
+    Predictions are the ground truth with noise.
 
     Args:
         count: Number of frames.
         seed: Seed of the generator.
-        size_m: Size of the map along x and y in metres; lengths of elements are in proportion,
-            their number is not.
+        size_m: Size of the map along x and y in metres. The lengths of elements grow in proportion,
+            and their number does not.
 
     Returns:
         Frames with ``token``, ``gt`` and ``pred``.
@@ -108,6 +110,7 @@ def _random_element(rng: np.random.Generator, label: int) -> np.ndarray:
     if label == 1:
         w, h = rng.uniform(low=1.5, high=7, size=2)
         return centre + np.array([[0, 0], [w, 0], [w, h], [0, h], [0, 0]])
+    # A parabola along y, cut to the range.
     start = -rng.uniform(low=3, high=28)
     end = rng.uniform(low=3, high=28)
     t = np.linspace(start, end, num=20)
@@ -233,7 +236,7 @@ def _frame(record: Record) -> tuple[MapElements, MapElements]:
 
 
 def _reference_table(frames: list[Record], count: int, grid: BEVGrid) -> str:
-    """Compare the reference's algorithms with ours on a few samples, in this process.
+    """Compare the algorithms of the reference with those of GSMap on a few samples.
 
     Args:
         frames: Frames to repeat.
@@ -289,7 +292,7 @@ def _reference_table(frames: list[Record], count: int, grid: BEVGrid) -> str:
 
 
 def _print_progress(text: str) -> None:
-    """Print a measurement while the others still run."""
+    """Print a measurement to the standard error at once, before the others are done."""
     print(text, file=sys.stderr, flush=True)
 
 

@@ -1,4 +1,4 @@
-"""Time of a frame of exported models in ONNX Runtime and in torch, batch 1, on the CPU."""
+"""Time of a frame of exported models in ONNX Runtime and in torch, with batch size 1 on the CPU."""
 
 import argparse
 import tempfile
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def onnx_cost(path: str, args: argparse.Namespace, eight_bits: bool) -> Cost:
-    """Measure a config's inference in ONNX Runtime, without the time to read the file.
+    """Measure the inference of a config's model in ONNX Runtime, without the time of loading.
 
     Args:
         path: Config file.

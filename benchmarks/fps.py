@@ -1,4 +1,4 @@
-"""Frames per second of whole models, batch 1."""
+"""Frames per second of whole models, with batch size 1."""
 
 import argparse
 from functools import partial
@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--cuda-graphs",
         action="store_true",
-        help="on a GPU: frames that are recorded once and replayed, pixels to samples on the host",
+        help="on a GPU, record the launches of a frame once and replay them",
     )
 
 
@@ -51,7 +51,9 @@ def run(args: argparse.Namespace) -> None:
 
 
 def frame_cost(path: str, args: argparse.Namespace, cuda_graphs: bool = False) -> Cost:
-    """Measure a config's inference from images to decoded elements, with memory if it has any.
+    """Measure the inference of a config's model, from images to decoded elements.
+
+    A temporal model uses the features of the previous frame.
 
     Args:
         path: Config file.
@@ -65,6 +67,7 @@ def frame_cost(path: str, args: argparse.Namespace, cuda_graphs: bool = False) -
     model.eval()
     if cuda_graphs:
         return _replayed_frame_cost(model, inputs, samples=samples, args=args)
+    # In half precision, the backbone of a GPU has half weights; on a CPU, autocast is used.
     halved = args.fp16 and args.device != "cpu"
     if halved:
         model.halve_backbone()
@@ -87,6 +90,6 @@ def _replayed_frame_cost(
         model.halve_backbone()
     device = torch.device(args.device)
     frames = FastFrames(StaticFrame(model), device)
-    images = (inputs["imgs"][0] * 50 + 120).clamp(0, 255).to(torch.uint8)
+    images = (inputs["imgs"][0] * 50 + 120).clamp(0, 255).to(torch.uint8)  # about the pixels
     batch = {"inputs": {"img": [images]}, "data_samples": samples[:1]}
     return measure(partial(frames, batch), device, repeats=args.repeats)

@@ -1,10 +1,10 @@
 """Ablate the map head alone, on stored BEV features of a common checkpoint, in paired runs.
 
-Backbone, neck and BEV encoder are frozen and run once (the pipeline must not augment), so a run
-costs a fraction of fine-tuning the whole model. Every variant starts from the head of the
-checkpoint (or, with ``--from-scratch``, from a new one). All variants are trained on equal batches
-in equal order and tested on equal features. ``shape`` reads the predictions,
-``NAME-SEED/results.json``.
+Backbone, neck and BEV encoder are frozen. They run once for each sample, and their features are
+stored, so a run costs a fraction of fine-tuning the whole model; the data pipeline must not augment
+images. Every variant starts from the head of the checkpoint or, with ``--from-scratch``, from
+random weights. All variants are trained on equal batches in equal order, and tested on equal
+features. ``python -m benchmarks shape`` reads their predictions, ``NAME-SEED/results.json``.
 """
 
 import argparse
@@ -79,7 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--from-scratch",
         action="store_true",
-        help="train new heads on the features, not trained ones",
+        help="start from random weights of the head, not from the checkpoint",
     )
     parser.add_argument("--workers", type=int, default=1, help="runs at the same time")
 

@@ -64,12 +64,14 @@ def measure_images(folder: Path, count: int = 10, workers: Sequence[int] = ()) -
     Args:
         folder: Folder of six JPEG files or more, such as a frame of nuScenes; the first six are
             read.
-        count: Samples of each measurement, and of each process, >= 1.
-        workers: Numbers of processes to measure with training samples.
+        count: Number of samples of a measurement, >= 1. With several processes, each of them reads
+            this number of samples.
+        workers: Numbers of processes whose speed is measured, with training samples.
 
     Returns:
-        By pipeline the processor time of one thread in milliseconds per sample; by number of
-        processes the samples per second in batches of four, in pinned memory if there is a GPU.
+        For each pipeline, the processor time of one thread in milliseconds per sample. For each
+        number of processes, the samples per second in batches of four, in pinned memory if there is
+        a GPU.
 
     Raises:
         ValueError: If there are fewer than six images.

@@ -1,9 +1,10 @@
 """Errors of Triton kernels against float64, and their times relative to plain torch.
 
 Sizes come from the published configs. Each line is printed, and written to ``--out``, as soon as it
-is measured; a line names the kernel that fails, and the command then ends with 1. The last line
-lists the correct kernels in the format of ``GSMAP_TRITON_KERNELS``. With ``--reduced`` sizes are
-small, so that Triton's interpreter can run them on a CPU (``TRITON_INTERPRET=1``).
+is measured. If a kernel fails, its line gives the reason, the other kernels are still measured, and
+the command ends with exit code 1. The last line lists the correct kernels in the format of
+``GSMAP_TRITON_KERNELS``. With ``--reduced`` sizes are small, so that Triton's interpreter can run
+them on a CPU (``TRITON_INTERPRET=1``).
 """
 
 import argparse
@@ -36,10 +37,10 @@ COLUMNS = (
     "plain backward (ms)",
     "backward (ms)",
 )
-# Relative errors in the norm: sums of float32 are accurate to 1e-6, and a raster's gradient, a
-# difference of large sums, to 1e-5.
+# Largest relative error, by the norm, of a correct kernel. Sums of float32 are accurate to 1e-6,
+# and the gradient of a raster, which is a difference of large sums, to 1e-5.
 LARGEST_ERROR = 1e-4
-FEW = 8  # instances in the test of errors: plain torch in float64 takes much memory
+FEW = 8  # number of instances in the test of errors, as plain torch in float64 takes much memory
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class Case:
         kernel: Name in ``TRITON_KERNELS``.
         size: Size in words.
         function: Function of the backend and the inputs.
-        inputs: Tensors; gradients are computed for the ones of floating point.
+        inputs: Tensors. Gradients are computed for the floating-point ones.
         instances: Whether the first dimension of the inputs counts instances.
         differentiable: Whether there is a gradient.
         largest_error: Relative error in the norm up to which values and gradients are correct.
@@ -134,7 +135,7 @@ def measure_case(case: Case, device: torch.device, reduced: bool) -> tuple[list[
     Returns:
         Cells of the table after kernel and size, and whether the errors are small enough.
     """
-    backends.AUTO_KERNELS = {case.kernel}  # chooses among kernels for one function
+    backends.AUTO_KERNELS = {case.kernel}  # if a function has several kernels, this one is used
     inputs = [x.to(device) for x in case.inputs]
     few = [x[:FEW] for x in inputs] if case.instances else inputs
     exact = [x.double() if x.is_floating_point() else x for x in few]
@@ -166,7 +167,7 @@ def time_case(case: Case, backend: str, inputs: list[Tensor], reduced: bool) -> 
         reduced: Whether to time a single call.
 
     Returns:
-        Both times in milliseconds; the second is not a number if there is no gradient.
+        Time of forward and of backward in milliseconds. The second is NaN if there is no gradient.
     """
     device = inputs[0].device
     forward = median_ms(lambda: case.compute(backend, inputs), device, reduced=reduced)
@@ -186,7 +187,7 @@ def time_case(case: Case, backend: str, inputs: list[Tensor], reduced: bool) -> 
 
 
 def differentiable_leaves(case: Case, inputs: list[Tensor]) -> list[Tensor]:
-    """Copies of inputs that require a gradient, if the case has one, where of floating point."""
+    """Copies of inputs. If the case has gradients, the floating-point ones require a gradient."""
     leaves = []
     for value in inputs:
         requires_grad = case.differentiable and value.is_floating_point()
@@ -203,7 +204,7 @@ def results(case: Case, backend: str, inputs: list[Tensor]) -> list[Tensor]:
         inputs: Inputs of the function.
 
     Returns:
-        Values, then the gradient of each input of floating point, if the case has gradients.
+        Values and, if the case has gradients, the gradient of each floating-point input.
     """
     leaves = differentiable_leaves(case, inputs)
     out = case.compute(backend, leaves)
@@ -230,7 +231,7 @@ def median_ms(function: Callable[[], object], device: torch.device, reduced: boo
         reduced: Whether to time a single call.
 
     Returns:
-        Milliseconds; of a single call on the CPU.
+        Milliseconds; on the CPU, of a single call.
     """
     if device.type == "cuda":
         from triton.testing import do_bench

@@ -32,8 +32,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Measure and print the shortest time of one frame.
 
-    ``live`` prepares the calibration once, before the measurement. ``predict_images`` prepares it
-    in each call.
+    Two functions are compared. ``live`` prepares the calibration once, before the measurement, and
+    ``predict_images`` prepares it in each call.
 
     Args:
         args: Parsed options of ``add_arguments``.

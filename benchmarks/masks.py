@@ -1,4 +1,4 @@
-"""Effect of the raster loss on Gaussians off their line, for each reduction over pixels."""
+"""Effect of the raster loss on Gaussians that lie off their line, by its reduction over pixels."""
 
 import argparse
 import math
@@ -70,7 +70,9 @@ def straight_line(length_m: float) -> Tensor:
 def scale_gradients(
     reduction: str, band_m: float, error_m: float, scale_m: float, seeds: int = 64
 ) -> tuple[float, float]:
-    """Measure the gradient of the loss in the scales of round Gaussians along a line of 60 m.
+    """Measure the gradient of the loss with respect to the scales of round Gaussians.
+
+    The Gaussians lie along a line of 60 m.
 
     Args:
         reduction: Key of ``REDUCTIONS``.
@@ -91,6 +93,7 @@ def scale_gradients(
     normalize, weight = REDUCTIONS[reduction]
     loss = raster_loss(preds, targets, foreground_weight=weight, normalize=normalize).sum()
     (gradient,) = torch.autograd.grad(loss, scales)
+    # dL / d log sigma = sigma * dL / d sigma.
     along, across = (-scale_m * gradient.sum((0, 1)) / seeds).tolist()
     return along, across
 

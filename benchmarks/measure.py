@@ -36,7 +36,10 @@ class Cost:
     peak_bytes: int
 
     def time_s(self, device: torch.device) -> float:
-        """Processor time on the CPU, where other processes disturb the clock, else wall time."""
+        """Time of a call in seconds: processor time on the CPU, and wall-clock time on a GPU.
+
+        On the CPU, other processes would disturb the wall-clock time.
+        """
         return self.cpu_s if device.type == "cpu" else self.wall_s
 
     def scale(self, factor: float) -> "Cost":
@@ -88,7 +91,7 @@ def in_own_process(function: Callable[..., Result], *arguments: object) -> Resul
     Returns:
         Result of the function.
     """
-    # One worker would be this process; of two workers, a single task starts only one.
+    # With one worker, the task would run in this process. With two, it starts one other process.
     call = partial(_call, function)
     (result,) = ordered_map(call, [arguments], workers=2, timeout_s=None)
     return result
@@ -115,7 +118,8 @@ def _peak_bytes(function: Callable[[], object], device: torch.device) -> int:
     if platform.system() != "Linux":
         raise WorkError("Peak memory on the CPU is read from /proc, which only Linux has.")
     libc = ctypes.CDLL(None)
-    # Freed tensors go back to the system: memory kept for reuse would hide the next use of it.
+    # Freed tensors go back to the system. Memory that malloc kept for reuse would be counted as in
+    # use before the call.
     libc.mallopt(M_MMAP_THRESHOLD, 64 * 1024)
     libc.malloc_trim(0)
     Path("/proc/self/clear_refs").write_text("5")  # resets the peak

@@ -51,7 +51,7 @@ def tile_tables(source: Path, version: str, target: Path, copies: int) -> int:
 
 
 def _rename(record: dict[str, Any], references: tuple[str, ...], copy: int) -> dict[str, Any]:
-    """Copy a record with the number of the copy in its token, its name and its references."""
+    """Copy a record, and append the number of the copy to its token, its name and references."""
     renamed = dict(record, token=f"{record['token']}_{copy}")
     if "name" in record:
         renamed["name"] = f"{record['name']}_{copy}"

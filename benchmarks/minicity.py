@@ -1,7 +1,7 @@
-"""Speed of generating MiniCity, in images per second of one core's processor time.
+"""Speed of generating MiniCity, in images per second of processor time on one core.
 
-The time includes town, ground, six cameras with JPEG, LiDAR sweeps, boxes and records. Processor
-time hardly depends on other work of the machine.
+The time includes towns, textures of the ground, images of six cameras with their JPEG files, LiDAR
+sweeps, boxes and records. Processor time hardly depends on other work of the machine.
 """
 
 import argparse

@@ -23,7 +23,8 @@ from gsmap.structures.grid import BEVGrid
 from gsmap.structures.rigid import rigid
 from gsmap.utils.errors import InputError
 
-# Transforms of images, cameras and LiDAR: `add_auxiliary_targets` makes random targets instead.
+# Transforms that make targets from images, cameras or LiDAR, which random inputs lack. Random
+# targets of `add_auxiliary_targets` take their place.
 RANDOM_TARGETS = {"MakeBEVMask", "MakePVMask", "MakeDepthMap"}
 
 
@@ -55,8 +56,8 @@ def measure_each(
 ) -> list[tuple[str, Cost]]:
     """Call a task with each tuple of arguments, one after another.
 
-    On a CPU each call has a fresh process: memory that an earlier model leaves in the allocator
-    would count as memory of the next one. Memory of a GPU is counted by torch.
+    On a CPU each call has a process of its own, as memory that an earlier model leaves in the
+    allocator would count as memory of the next model. Memory of a GPU is counted by torch.
 
     Args:
         task: Function that can be pickled.
@@ -209,7 +210,7 @@ def model_and_batch(
 
 
 def advance_samples(samples: Sequence[Det3DDataSample]) -> None:
-    """Advance samples by half a second and 4 m, in place, for models with temporal memory."""
+    """Advance samples by half a second and 4 m, in place; temporal models expect the next frame."""
     step = rigid(np.eye(3), [0.0, 4.0, 0.0])
     for sample in samples:
         sample.set_metainfo(
@@ -289,7 +290,8 @@ def ring_of_cameras(num_cams: int, height: int, width: int) -> np.ndarray:
     intrinsics[:3, :3] = [[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1]]
     matrices = []
     for angle in np.arange(num_cams) * (2 * np.pi / num_cams):
-        camera = np.eye(4)  # camera x right, y down, z forward; frame x right, y forward, z up
+        # Rows: the camera's axes right, down and forward in the frame (x right, y forward, z up).
+        camera = np.eye(4)
         camera[0, :2] = [np.cos(angle), np.sin(angle)]
         camera[1, :3] = [0, 0, -1]
         camera[2, :3] = [-np.sin(angle), np.cos(angle), 0]

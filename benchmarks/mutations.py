@@ -1,10 +1,10 @@
 """Share of small changes of the code that the tests detect (mutation testing).
 
 Each mutant changes one place of one module: a comparison, a sign, a number, a truth value, `min` or
-`max`, `and` or `or`, a `not`. A room is a package, or a folder of the package ``gsmap``, that has a
-folder of tests. The test files of the room that import the module run on the mutant, and if none of
-them fails, all other test files of the room. A mutant exists in the memory of a child process
-alone: no file changes.
+`max`, `and` or `or`, a `not`. Code is grouped by rooms: a room is a package, or a folder of the
+package ``gsmap``, that has a folder of tests. On a mutant, the test files of the room that import
+the module are run first. If none of them fails, all other test files of the room are run. No file
+is changed, as a mutant exists only in the memory of a child process.
 """
 
 import argparse
@@ -27,14 +27,16 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.shipped import shipped_path
 
 REPO = shipped_path()
-TESTS = {"mapdata": "map_data", "drivemaps": "drive_maps"}  # test folder by room
+TESTS = {"mapdata": "map_data", "drivemaps": "drive_maps"}  # test folders with another name
 FOLDERS = ("GSMap/gsmap", "MapData/mapdata", "DriveMaps/drivemaps")
 ROOMS = ("models", "ops", "structures", "evaluation", "datasets", "mapdata", "drivemaps")
 CAUGHT = "caught"
 SURVIVED = "not caught"
 LATE = "timed out"
 VERDICTS = (CAUGHT, SURVIVED, LATE)
+# Modules that are imported once, before the child processes fork.
 PRELOADED = ["gsmap", "pytest", "scipy.ndimage", "shapely", "mmdet3d.models", "mmdet3d.datasets"]
+# Replacement of each operator, and of each name of a function.
 OPERATORS: dict[type[ast.AST], type[ast.AST]] = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq,
     ast.NotEq: ast.Eq, ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In,
@@ -75,6 +77,7 @@ def run(args: argparse.Namespace) -> None:
             modules[name] = path
             for index in range(count_places(path.read_text())):
                 places.append((name, index))
+        # Over all rooms, these numbers add up to `args.number`.
         num_mutants = (args.number + number) // len(args.rooms)
         order = rng.permutation(len(places))
         unchanged = verdict(module="", source="", tests=tests_of(room, None), seconds=None)
@@ -95,9 +98,12 @@ def run(args: argparse.Namespace) -> None:
 
 
 def modules_of(room: str) -> dict[str, Path]:
-    """Files of the modules of a room that some test file of the room imports, by module name.
+    """Files of the modules of a room that at least one test file of the room imports.
 
-    Modules of numba and Triton are left out: these compile the source of the file.
+    Modules with code for numba or Triton are left out, as these compile the unchanged file.
+
+    Returns:
+        Path by name of the module.
     """
     modules = {}
     for folder in FOLDERS:
@@ -129,7 +135,7 @@ def tests_of(room: str, module: str | None) -> list[str]:
 
 
 def _imported_names(source: str) -> Iterator[str]:
-    """Names of the modules that a file imports from, and of their imported members."""
+    """Names in the ``from`` imports of a file: of the modules, and ``MODULE.MEMBER``."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.ImportFrom) and node.module:
             yield node.module
@@ -192,7 +198,7 @@ def _changes(node: ast.expr) -> list[dict[str, object]]:
         case ast.BinOp(op=op) | ast.BoolOp(op=op) if type(op) in OPERATORS:
             return [{"op": OPERATORS[type(op)]()}]
         case ast.UnaryOp(op=ast.Not() | ast.Invert() | ast.USub() as op, operand=operand):
-            return [{"operand": ast.UnaryOp(op, operand)}]  # applied twice, it has no effect
+            return [{"operand": ast.UnaryOp(op, operand)}]  # twice, so that it has no effect
         case ast.Constant(value=bool(value)):
             return [{"value": not value}]
         case ast.Constant(value=int(value) | float(value)):
@@ -205,13 +211,13 @@ def _changes(node: ast.expr) -> list[dict[str, object]]:
 
 
 def verdict_of_room(room: str, module: str, source: str, seconds: float) -> str:
-    """Run the tests that import a module on a mutant, and if they pass, the others of the room.
+    """Run the tests that import a module on a mutant and, if they pass, the others of the room.
 
     Args:
         room: One of ``ROOMS``.
         module: Name of the module.
         source: Source of the mutant.
-        seconds: Time limit of the former tests, and of the latter.
+        seconds: Time limit of each of the two groups of tests.
 
     Returns:
         One of ``VERDICTS``.

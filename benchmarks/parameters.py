@@ -45,8 +45,8 @@ def count_parameters(model: nn.Module, depth: int = 2) -> dict[str, tuple[int, i
 
     Returns:
         By module, the number of parameters, of trainable parameters, and of entries in a
-        checkpoint: these include buffers such as the statistics of batch norms, and count a
-        parameter with two names twice.
+        checkpoint. Entries include buffers, such as the statistics of batch norms, and a parameter
+        with two names is counted twice.
 
     Raises:
         ValueError: If ``depth`` is negative.

@@ -20,8 +20,8 @@ from gsmap.structures.grid import BEVGrid
 GRID = BEVGrid(x_range=(-15, 15), y_range=(-30, 30), height=200, width=100)
 SETTINGS = PriorSettings(("divider", "boundary", "ped_crossing"), "benchmark")
 RULES: tuple[WriteRule, ...] = (KeepMaximum(), LastSeen(), HitMissCounts())
-LINES_M = (-10.0, -3.5, 0.0, 3.5, 10.0)  # across the road
-STEP_M = 5.0  # between frames
+LINES_M = (-10.0, -3.5, 0.0, 3.5, 10.0)  # position of each line across the road
+STEP_M = 5.0  # distance between frames
 ROW_M = 10_000.0  # length of a straight road; the next one is 200 m beside it
 
 
@@ -57,21 +57,21 @@ def run(args: argparse.Namespace) -> None:
         f"One thread, {GRID.height} x {GRID.width} cells, {len(SETTINGS.classes)} classes. Reading "
         "and writing: processor time, the shortest of several frames, each at another pose. Drive: "
         f"{args.km:g} km with a frame every {STEP_M:g} m are written, saved, opened and read; "
-        "processor time and peak memory of all that.\n"
+        "processor time and peak memory of this whole work.\n"
     )
     table = markdown_table(header, rows)
     publish(f"{text}\n{table}\n\n{compare(args.compared_km)}", args.out)
 
 
 def prediction(index: int) -> NDArray[np.float32]:
-    """Noisy lines along the road, which change from frame to frame. (C, H, W)"""
+    """Raster of noisy lines along the road, which change from frame to frame. (C, H, W)"""
     rng = np.random.default_rng(index)
     values = np.zeros((len(SETTINGS.classes), GRID.height, GRID.width), dtype=np.float32)
     for number, line_m in enumerate(LINES_M):
         shifts_m = 0.3 * np.sin(np.arange(GRID.height) / 20 + rng.uniform(0, 6))
         columns = np.round((line_m + shifts_m - GRID.x_range[0]) / GRID.pixel_size_m[0])
-        for width in (-1, 0, 1):
-            column = columns.astype(np.int64) + width
+        for offset in (-1, 0, 1):  # each line is three pixels wide
+            column = columns.astype(np.int64) + offset
             values[number % 2, np.arange(GRID.height), column] = rng.uniform(0.4, 1)
     if index % 20 == 0:
         values[2, 90:105, 20:80] = 0.9  # a crossing every 100 m

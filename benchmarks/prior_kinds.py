@@ -23,22 +23,29 @@ GRID = BEVGrid((-15, 15), (-30, 30), 200, 100)
 SETTINGS = PriorSettings(("divider", "boundary"), "benchmark")
 RULES: tuple[WriteRule, ...] = (KeepMaximum(), LastSeen(), HitMissCounts())
 PASSES = 3
-STEP_M = 5.0  # between frames
-NOISE_M = 0.25  # standard deviation of a predicted line across its direction
-MISSED = 0.15  # share of the lines that a frame does not predict
-FALSE = 0.3  # lines that a frame predicts in addition, on average
-WIDTH_M = 0.6  # of lines in rasters and in the truth
+STEP_M = 5.0  # distance between frames
+NOISE_M = 0.25  # standard deviation of the error of a predicted line, across its direction
+MISSED = 0.15  # share of the true lines that a frame does not predict
+FALSE = 0.3  # average number of false lines that a frame predicts
+WIDTH_M = 0.6  # width of lines in rasters and in the truth
 # Offset of each line in metres, positive to the right of the road, and its class.
 _LINES = ((-7.0, 1), (-3.5, 0), (0.0, 0), (3.5, 0), (7.0, 1))
-_NUM_POINTS = 20  # of a predicted line
+_NUM_POINTS = 20  # number of points of a predicted line
 Frame = tuple[NDArray[np.float64], MapElements]
 """Pose (4, 4) and elements in the frame."""
 
 
 def road(distance_m: NDArray[np.float64], offset_m: float) -> NDArray[np.float64]:
-    """Points beside a winding road. (n,) -> (n, 2)"""
+    """Points beside a winding road. (n,) -> (n, 2)
+
+    Args:
+        distance_m: Position of each point along y, in metres.
+        offset_m: Distance of the points from the middle of the road, positive to the right.
+    """
     x = 90 * (1 - np.cos(distance_m / 300))
-    slope = 0.3 * np.sin(distance_m / 300)
+    slope = 0.3 * np.sin(
+        distance_m / 300
+    )  # derivative of x by y, so the road runs along (slope, 1)
     right = np.stack([np.ones_like(slope), -slope], axis=1)
     right /= np.linalg.norm(right, axis=1, keepdims=True)
     return np.stack([x, distance_m], axis=1) + offset_m * right
@@ -51,7 +58,12 @@ def true_lines(length_m: float) -> list[tuple[NDArray[np.float64], int]]:
 
 
 def pose_on_road(distance_m: float, beside_m: float) -> NDArray[np.float64]:
-    """Pose of a vehicle that looks along the road, y ahead. (4, 4)"""
+    """Pose of a vehicle on the road, whose y axis is ahead. (4, 4)
+
+    Args:
+        distance_m: Position along the road, in metres.
+        beside_m: Distance from the middle of the road, positive to the right.
+    """
     yaw_rad = -math.atan(0.3 * math.sin(distance_m / 300))
     cos = math.cos(yaw_rad)
     sin = math.sin(yaw_rad)
@@ -96,6 +108,7 @@ def predict(truth: MapElements, rng: np.random.Generator) -> MapElements:
         index = np.linspace(0, len(line) - 1, _NUM_POINTS)
         x = np.interp(index, np.arange(len(line)), line[:, 0])
         y = np.interp(index, np.arange(len(line)), line[:, 1])
+        # The error is a constant plus a wave, each of variance 1, scaled to NOISE_M in all.
         phase = rng.uniform(0, 2 * math.pi)
         bend = math.sqrt(2) * np.sin(np.linspace(0, 6, _NUM_POINTS) + phase)
         shift = NOISE_M * (rng.normal() + bend) / math.sqrt(2)
@@ -110,7 +123,7 @@ def predict(truth: MapElements, rng: np.random.Generator) -> MapElements:
 
 
 def drives(length_m: float) -> list[Frame]:
-    """Predictions of several drives along the road, each beside the others."""
+    """Predictions of several drives along the road, whose frames lie at different places."""
     lines = true_lines(length_m)
     rng = np.random.default_rng(0)
     frames = []
@@ -171,8 +184,8 @@ def compare(length_km: float) -> str:
     text = (
         f"The same {len(frames)} frames of {PASSES} drives along {length_km:g} km of road with "
         f"{len(_LINES)} lines: predictions err by {NOISE_M:g} m, {MISSED:.0%} are missed and "
-        f"{FALSE:g} a frame are false. Processor time of a frame, the mean; rasters draw the "
-        "predictions first. IoU with true lines of "
+        f"{FALSE:g} a frame are false. Times are mean processor times of a frame; for rasters, "
+        "writing includes drawing the predictions. IoU with true lines of "
         f"{WIDTH_M:g} m, at the best threshold.\n"
     )
     return f"{text}\n{markdown_table(header, rows)}"
@@ -232,7 +245,11 @@ def _figures(
 
 
 def _share_within_2_sigma(prior: GaussianPrior, length_m: float) -> float:
-    """Share of the drawn Gaussians near a true line that are within two standard deviations."""
+    """Share of the Gaussians near a true line whose error is at most two standard deviations.
+
+    The error is the distance along x, which is about the distance across the road. Only Gaussians
+    that are drawn when the prior is read are counted.
+    """
     distances_m = np.arange(-60.0, length_m + 60.0, 0.1)
     num_within = 0
     num_near = 0

@@ -1,7 +1,7 @@
-"""Time of one forward pass of a config's model by part, each also as a ratio to the image backbone.
+"""Time of one forward pass of a config's model by part, also as a ratio to the image backbone.
 
-Weights and images are random, and the cameras form a ring; the batch has one sample in float32. The
-time is the processor time of all threads, or on a GPU the wall-clock time. It is the shortest of
+Weights and images are random, and the cameras form a ring. The batch has one sample in float32. The
+time is the processor time of all threads or, on a GPU, the wall-clock time. It is the shortest of
 all repeats, because other processes can only slow a part down.
 """
 

@@ -1,4 +1,7 @@
-"""Time and memory of the rasterizers and their losses, with lower bounds of the time (floors)."""
+"""Time and memory of the rasterizers and their losses, compared with lower bounds of the time.
+
+A lower bound is called a floor.
+"""
 
 import argparse
 import math
@@ -23,8 +26,8 @@ POINTS = 20
 TRAINING_SIZE = (200, 100)
 RATE_REPEATS = 20
 # Time and memory of the reference are linear in the number of instances. They are measured on as
-# many instances as fill a tensor of this size, and scaled up. Freed tensors of smaller sizes stay
-# with malloc and blur the peak memory.
+# many instances as fill a tensor of this size, and scaled up. With smaller tensors, memory that
+# malloc keeps after they are freed would blur the peak memory.
 REFERENCE_BYTES = 36 * MIB
 FLOOR_DENSITY = 1e-6  # a pixel with a smaller density of a Gaussian needs no exponential
 Gaussians = tuple[Tensor, Tensor, Tensor]
@@ -127,6 +130,7 @@ def ellipse_pixels(gaussians: Gaussians, grid: BEVGrid) -> int:
 
 def byte_seconds(device: torch.device) -> float:
     """Measure the seconds to write a byte to new memory and to read it again."""
+    # Number of values, of four bytes each.
     size = 8 * MIB if device.type == "cpu" else 512 * MIB  # far beyond a GPU's cache
     data = torch.ones(size, device=device)
 
@@ -139,7 +143,10 @@ def byte_seconds(device: torch.device) -> float:
 
 
 def exponential_seconds(device: torch.device) -> float:
-    """Measure the seconds of an exponential of the CPU kernels; 0 on a GPU, bound by its memory."""
+    """Measure the seconds of an exponential of the CPU kernels.
+
+    The result is 0 on a GPU, whose kernels are limited by its memory.
+    """
     if device.type != "cpu":
         return 0.0
     import numba
@@ -192,7 +199,8 @@ def rendering_table(args: argparse.Namespace) -> str:
                 gaussians, grid, upstream=upstream, backend=backend, repeats=args.repeats
             )
             pixels = ellipse_pixels(few, grid) * factor
-            # No renderer is faster: masks written and read once, two exponentials per pixel.
+            # Any renderer writes and reads the masks once, and computes two exponentials per pixel,
+            # in the forward and in the backward pass.
             floor_s = 4 * upstream.numel() * per_byte_s + 2 * pixels * per_exponential_s
             cells = rendering_cells(
                 reference=reference.scale(factor),

@@ -22,7 +22,7 @@ from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import FloatArray, MapElements
 
 MIN_SCORE = 0.2
-FOLD_DEG = 90.0  # least turn at a vertex where a line leads back
+FOLD_DEG = 90.0  # a vertex with a larger turn is a fold, at which the line leads back
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -89,7 +89,7 @@ def line_shapes(results: Path, truth: Path) -> dict[str, FloatArray]:
             continue
         truth_lines = truths[matches.token].polylines
         pred_lines = predictions[matches.token].polylines
-        truth_indices = matches.matched_gt[:, -1]
+        truth_indices = matches.matched_gt[:, -1]  # at the largest threshold; -1 without a match
         for index, label, score, truth_index in zip(
             matches.pred_index, matches.labels, matches.scores, truth_indices, strict=True
         ):
@@ -119,5 +119,5 @@ def turns(line: FloatArray) -> tuple[float, float]:
     """
     edges = np.diff(line[:, :2], axis=0)
     headings = np.degrees(np.arctan2(edges[:, 1], edges[:, 0]))
-    angles = np.abs((np.diff(headings) + 180.0) % 360.0 - 180.0)
+    angles = np.abs((np.diff(headings) + 180.0) % 360.0 - 180.0)  # differences in [0, 180]
     return float(angles.mean()), float((angles > FOLD_DEG).mean())

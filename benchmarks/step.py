@@ -1,7 +1,7 @@
 """Time and memory of a whole training step, from pixels on the host to new weights.
 
-On a GPU, time is the mean over steps in a row, as in a training: the host prepares a step while the
-GPU computes the one before.
+On a GPU, the time is the mean over several steps in a row. As in a training, the host then prepares
+a step while the GPU computes the previous one.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from benchmarks.measure import MIB, Cost, measure
 from gsmap.engine.figures import keep_figures
 from gsmap.engine.launch import read_config
 
-STEPS_IN_A_ROW = 8  # on a GPU, which is awaited only after the last one
+STEPS_IN_A_ROW = 8  # on a GPU; the host waits for the GPU only after the last one
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -84,12 +84,12 @@ def step_cost(path: str, args: argparse.Namespace, raster: str = "") -> Cost:
     wrapper = build_optim_wrapper(model, read_config(path, args.cfg_options).optim_wrapper)
     images = []
     for normalized in inputs["imgs"]:
-        pixels = (normalized * 50 + 120).clamp(0, 255)  # an approximate inverse
+        pixels = (normalized * 50 + 120).clamp(0, 255)  # undoes the normalization, approximately
         images.append(pixels.to("cpu", torch.uint8))
     batch = [sample.cpu() for sample in samples]
 
     def step() -> None:
-        models.advance_samples(batch)  # a model with memory expects the next frame
+        models.advance_samples(batch)  # a temporal model expects the next frame
         data = {
             "inputs": {"img": list(images)},
             "data_samples": [sample.clone() for sample in batch],

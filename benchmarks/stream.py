@@ -1,4 +1,4 @@
-"""Size of the state that a model with memory keeps for each stream, part by part."""
+"""Size of the state that a temporal model keeps for each stream of frames, part by part."""
 
 import argparse
 
@@ -54,7 +54,7 @@ def state_bytes(config: str, options: list[str]) -> dict[str, int]:
         raise InputError(f"{config} has no memory: give --cfg-options model.temporal=...")
     exported = ExportedDetector(model)
     inputs = exported.example_inputs(len(cfg.test_dataloader.dataset.cameras), _IMAGES)
-    state = inputs[len(inputs) - len(exported.memory) :]  # the last inputs
+    state = inputs[len(inputs) - len(exported.memory) :]  # the state comes last among the inputs
     sizes = {}
     for name, value in zip(exported.memory, state, strict=True):
         sizes[name] = value.numel() * value.element_size()

@@ -28,7 +28,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure and print the processor time of a frame, without the first one, which compiles.
+    """Measure and print the processor time of a frame.
+
+    The first frame is left out, as it compiles the kernels.
 
     Args:
         args: Parsed options of ``add_arguments``.
