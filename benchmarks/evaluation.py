@@ -73,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def generated_frames(
     count: int, seed: int = 0, size_m: Sequence[float] = (30.0, 60.0)
 ) -> list[Record]:
-    """Random frames like those of a validation set: lines across the range, and crossings.
+    """Random frames, similar to a validation set: lines across the range, and crossings.
 
     Predictions are the ground truth with noise.
 
@@ -236,7 +236,7 @@ def _frame(record: Record) -> tuple[MapElements, MapElements]:
 
 
 def _reference_table(frames: list[Record], count: int, grid: BEVGrid) -> str:
-    """Compare the algorithms of the reference with those of GSMap on a few samples.
+    """Compare the algorithms of the reference and of GSMap on a few samples.
 
     Args:
         frames: Frames to repeat.
