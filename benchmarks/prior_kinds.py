@@ -43,9 +43,7 @@ def road(distance_m: NDArray[np.float64], offset_m: float) -> NDArray[np.float64
         offset_m: Distance of the points from the middle of the road, positive to the right.
     """
     x = 90 * (1 - np.cos(distance_m / 300))
-    slope = 0.3 * np.sin(
-        distance_m / 300
-    )  # derivative of x by y, so the road runs along (slope, 1)
+    slope = 0.3 * np.sin(distance_m / 300)  # derivative of x: the road runs along (slope, 1)
     right = np.stack([np.ones_like(slope), -slope], axis=1)
     right /= np.linalg.norm(right, axis=1, keepdims=True)
     return np.stack([x, distance_m], axis=1) + offset_m * right
