@@ -11,7 +11,8 @@ from drivemaps.truth import components, polygons_of
 from gsmap.structures.elements import FloatArray, IntArray
 
 _MAJORITY = 0.5  # share of the votes above which a spot belongs to an area
-_MIN_OVERLAP = 0.3  # two detections are of one object if they share this part of the smaller one
+# Two detections are of one object if they share at least this part of the smaller one.
+_MIN_OVERLAP = 0.3
 _SIMPLIFY_M = 0.15  # tolerance of simplification: outlines follow the edges of several frames
 
 

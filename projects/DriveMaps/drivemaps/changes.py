@@ -52,8 +52,8 @@ def find_changes(
       percent with it. An element of any class of the old map must lie within 30 m, for elsewhere
       the old map may not cover the ground.
     * Moved: a part of a line of the old map whose predictions lie at least 0.5 m beside it, all on
-      one side, or an area of the old map whose centre moved by at least 0.75 m. Both shifts must
-      also be at least three standard errors.
+      one side, or an area of the old map whose centre moved by at least 0.75 m. The shift must also
+      be at least three standard errors.
 
     The confidence of a removed or moved element is multiplied by its score in the old map, as an
     element that never was there cannot be removed.

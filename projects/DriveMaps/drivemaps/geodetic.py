@@ -204,9 +204,9 @@ def require_near(positions: FloatArray, where: str) -> None:
 def known_origin(meta: AnnotationMeta, map_name: str) -> MapOrigin | None:
     """Look up the origin of a map in the devkit of its data set.
 
-    The poses of nuScenes start from the south-western corner of a map, whose latitude and longitude
-    the devkit calls the reference coordinate. Argoverse 2 has UTM coordinates minus the origin of
-    the city.
+    The origin of the poses of nuScenes is the south-western corner of a map. The devkit calls its
+    latitude and longitude the reference coordinate. The poses of Argoverse 2 are UTM coordinates
+    minus the origin of the city.
 
     Args:
         meta: Metadata of the annotation file.

@@ -140,7 +140,7 @@ def dense_predictions(drive: Drive, label: int, config: MergeConfig) -> DenseLin
 def normals_of(lines: DenseLines) -> FloatArray:
     """Unit vector to the left of the line at each vertex. (M, 2)"""
     vertices = np.arange(len(lines.points))
-    # The ends of a line have one neighbour, and are their own second one.
+    # An end of a line has only one neighbour. The end itself takes the place of the other one.
     following = vertices + 1
     following[lines.offsets[1:] - 1] -= 1
     previous = vertices - 1

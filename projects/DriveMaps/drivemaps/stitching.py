@@ -69,8 +69,8 @@ def _candidates(lines: Sequence[FloatArray]) -> list[tuple[int, int]]:
     cosine = (outward[first] * outward[second]).sum(axis=1)
     gap = np.linalg.norm(points[first] - points[second], axis=1)
     rounded_gap = np.round(gap / _GAP_STEP_M)
-    # Sort by gap, then by direction: a line goes straight on if its ends point at each other, with
-    # a cosine of -1. The indices of the ends decide last, for a fixed order.
+    # Sort by gap, then by cosine. It is -1 if the outward directions of both ends are opposite, so
+    # that the joined line goes straight on. The indices of the ends come last, for a fixed order.
     order = np.lexsort((second, first, cosine.round(6), rounded_gap))
     continues = cosine[order] < 0.0  # turns by less than a right angle
     return [(int(a), int(b)) for a, b in pairs[order[continues]]]

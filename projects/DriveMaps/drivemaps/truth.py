@@ -13,7 +13,7 @@ from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
 
 # Vertices are rounded to this grid, so that a point that two samples have in common becomes equal
-# in both. By rounding errors of the poses, it differs by far less.
+# in both. The rounding errors of the poses are far smaller than the grid.
 GRID_M = 0.002
 _OVERLAP_M = 0.2  # pieces that share more length than this belong to one line
 
@@ -87,7 +87,7 @@ def _unite_areas(rings: Sequence[FloatArray]) -> list[FloatArray]:
 
 
 def _unite_lines(pieces: Sequence[FloatArray]) -> list[FloatArray]:
-    """Unite pieces that run along each other to lines. each (n, 2)"""
+    """Unite the pieces that run along each other, and return the lines. each (n, 2)"""
     lines = np.array([shapely.LineString(piece) for piece in pieces], dtype=object)  # (N,)
     # The length of a line inside of the strip around another line is their shared length.
     strips = shapely.buffer(lines, 2 * GRID_M, cap_style="flat")
