@@ -135,7 +135,7 @@ def image_shape(path: str, args: argparse.Namespace) -> tuple[int, int, int]:
     divisor = cfg.model.data_preprocessor.get("pad_size_divisor", 1)
     sides = []
     for side in cfg._file_size:
-        scaled = int(side * scale + 1e-6)
+        scaled = int(side * scale + 1e-6)  # a product just below a whole number is rounded up
         sides.append(math.ceil(scaled / divisor) * divisor)
     width, height = sides
     return cameras, height, width

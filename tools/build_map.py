@@ -458,7 +458,7 @@ def write_gaussian_prior(
 
     drive = passes[0].drive
     prior = GaussianPrior(PriorSettings(drive.classes, place))
-    extent = BEVGrid(drive.x_range, drive.y_range, height=1, width=1)
+    extent = BEVGrid(drive.x_range, drive.y_range, height=1, width=1)  # only its range is used
     samples = [frame.sample for one_pass in passes for frame in one_pass.drive.frames]
     samples.sort(key=lambda sample: sample.timestamp_ns)
     for sample in samples:

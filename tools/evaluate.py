@@ -207,6 +207,7 @@ def print_reports(reports: list[MetricReport], notes: list[str], args: argparse.
         from gsmap.visualization.figure import save_figure  # matplotlib takes a second
         from gsmap.visualization.plots import plot_result
 
+        # Metrics with an AP per sample have no curve over all samples.
         with_curves = [report for report in reports if report.detections and not report.sample_aps]
         print(f"curves: {save_figure(plot_result(with_curves), args.pr_curves)}")
 

@@ -99,6 +99,7 @@ def read_result(name: str, folder: Path, seed: int | None = None) -> Result:
     newest = newest_checkpoint(folder) if figures else None
     if newest:
         costs["million parameters"] = _count_parameters(newest) / 1e6
+    # The last line of the log of a test has the mean times of a sample.
     tests = sorted(folder.glob("test/*/[0-9]*.json"))
     if tests:
         timing = json.loads(tests[-1].read_text().splitlines()[-1])

@@ -103,7 +103,7 @@ def change_report(args: argparse.Namespace) -> MetricReport:
         for key in ("precision", "recall"):
             value = figures[f"{name}/{key}"]
             row.append("-" if value == UNDEFINED else f"{100 * value:.1f}")
-        for key in ("num_found", "num_true"):
+        for key in ("num_found", "num_true"):  # changes of any kind have the numbers of all
             row.append(f"{figures.get(f'{name}/{key}', figures[f'all/{key}']):.0f}")
         rows.append(row)
     print(markdown_table(["changes", "precision", "recall", "found", "true in view"], rows) + "\n")

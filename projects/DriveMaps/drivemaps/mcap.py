@@ -179,7 +179,7 @@ class _Log:
         for index, label in enumerate(vertex_labels.tolist()):
             x, y, z = centres[index].tolist()
             half_length, half_width = half_axes[index].tolist()
-            _, _, turn_z, turn_w = quaternions[index].tolist()
+            _, _, turn_z, turn_w = quaternions[index].tolist()  # a rotation about z
             pose = messages.Pose(
                 position=messages.Vector3(x=x, y=y, z=z),
                 orientation=messages.Quaternion(z=turn_z, w=turn_w),

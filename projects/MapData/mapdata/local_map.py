@@ -14,7 +14,7 @@ from gsmap.utils.errors import InputError
 LINE = 1
 POLYGON = 3
 COLLECTION = 7
-_CHUNK_SEGMENTS = 32
+_CHUNK_SEGMENTS = 32  # number of segments in a chunk of `OutlineIndex`
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +146,7 @@ def rings_of(polygons: np.ndarray) -> np.ndarray:
     rings, owner = shapely.get_rings(polygons, return_index=True)
     is_hole = np.zeros(len(rings), dtype=bool)
     is_hole[1:] = owner[1:] == owner[:-1]  # a polygon's first ring is its exterior
-    is_reversed = shapely.is_ccw(rings) != is_hole
+    is_reversed = shapely.is_ccw(rings) != is_hole  # holes must be anticlockwise, exteriors not
     rings[is_reversed] = shapely.reverse(rings[is_reversed])
     return rings
 
@@ -202,6 +202,8 @@ class OutlineIndex:
         chunks_of_ring = np.flatnonzero(self._owners == self._owners[chunks[0]])
         touches_start = chunks[0] == chunks_of_ring[0]
         touches_end = chunks[-1] == chunks_of_ring[-1]
-        if len(runs) > 1 and touches_start and touches_end:  # a run crosses the ring's start
-            runs[0] = np.concatenate([runs.pop(), runs[0]])
+        if len(runs) > 1 and touches_start and touches_end:
+            # The last run goes on beyond the start of the ring, where the first run continues it.
+            last_run = runs.pop()
+            runs[0] = np.concatenate([last_run, runs[0]])
         return runs

@@ -181,6 +181,7 @@ def resolve_scenes(
     Raises:
         ValueError: If a scene is in two splits, by its name or its token.
     """
+    # An entry of a list is the name or the token of a scene.
     name_of = {name: name for name in names.values()} | dict(names)
     split_of: dict[str, str] = {}
     missing = []

@@ -119,9 +119,9 @@ def _choose_target(source: Lane, lanes_in: int, targets: list[Lane]) -> Lane | N
         The lane. None if drivers make this turn from another lane than ``source``.
     """
     angle = _turning_angle(source, targets[0])
-    if angle > STRAIGHT_RAD:
+    if angle > STRAIGHT_RAD:  # a left turn, from the innermost lane to the innermost one
         return targets[0] if source.index == 0 else None
-    if angle < -STRAIGHT_RAD:
+    if angle < -STRAIGHT_RAD:  # a right turn, from the outermost lane to the outermost one
         return targets[-1] if source.index == lanes_in - 1 else None
     return targets[min(source.index, len(targets) - 1)]
 

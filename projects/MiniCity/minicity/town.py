@@ -287,7 +287,7 @@ def _make_carpark(road: Road, sign: int, middle_m: float, bays: int) -> Carpark:
 def _add_buildings(town: Town, blocked: Polygon, rng: np.random.Generator) -> None:
     """Add houses along both sides of every road, clear of surfaces and of one another, in place."""
     shapely.prepare(blocked)
-    centers = np.full((0, 2), np.inf)
+    centers = np.zeros((0, 2))  # of the houses so far
     for road in town.roads:
         dense = rng.random() < 0.75
         for sign, kerb in ((1, road.section.left_m), (-1, -road.section.right_m)):

@@ -155,6 +155,7 @@ class NuScenesTables:
         self.frame = frame
         self._folder = dataroot / version
         self._max_sweeps = max_sweeps
+        # Messages of the CAN bus by scene; only the latest scene is kept.
         self._messages = lru_cache(maxsize=1)(partial(read_messages, dataroot))
         self._records: dict[str, dict[str, dict[str, Any]]] = {}
         for table in ("sensor", "calibrated_sensor", "log", "sample", "scene"):
