@@ -78,9 +78,11 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--list", action="store_true", help="print the papers' tables")
     parser.add_argument("--tables", default="*", metavar="PATTERN", help="names of tables to list")
     args = parser.parse_args()
-    if not args.list and (not args.out or not (args.configs or args.runs)):
+    has_runs = bool(args.configs or args.runs)
+    if not args.list and not (has_runs and args.out):
         parser.error("give configs or --runs, and --out")
-    if args.configs and (args.budget or 0) < 1:
+    has_budget = args.budget is not None and args.budget >= 1
+    if args.configs and not has_budget:
         parser.error("give --budget, the iterations of every run")
     if args.seeds < 1 or args.batch < 1:
         parser.error("--seeds and --batch must be at least 1")

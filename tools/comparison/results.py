@@ -383,7 +383,8 @@ def plot_iterations(results: Sequence[Result]) -> Figure | None:
     metrics = [metric for metric in METRIC_NAMES if f"{metric}/mAP" in logged]
     figure, axes = panel_grid(1, max(len(metrics), 1))
     for panel, metric in zip(axes[0], metrics, strict=False):
-        for (name, runs), colour in zip(logs.items(), RUN_COLOURS * 9, strict=False):
+        colours = RUN_COLOURS * 9  # they repeat if there are more configs than colours
+        for (name, runs), colour in zip(logs.items(), colours, strict=False):
             label: str | None = name
             for log in runs:
                 steps, values = log.series(f"{metric}/mAP", validation=True)

@@ -126,7 +126,7 @@ def lane_graph(centerlines: Iterable[FloatArray], borders: Sequence[FloatArray])
     nodes = _Nodes(
         ends=np.array(ends),
         directions=np.array(end_directions),
-        half_widths_m=np.repeat(half_widths, 2, axis=0),
+        half_widths_m=np.repeat(half_widths, 2, axis=0),  # equal at both ends of a lane
     )
     lanelets: list[Lanelet] = []
     lanes_between: dict[tuple[int, int], list[shapely.LineString]] = {}

@@ -199,7 +199,7 @@ def _moved(
 
 def _first_lines(lines: DenseLines, num_vertices: int) -> DenseLines:
     """The first lines, which have ``num_vertices`` vertices in all."""
-    last = int(np.searchsorted(lines.offsets, num_vertices))
+    last = int(np.searchsorted(lines.offsets, num_vertices))  # number of these lines
     return DenseLines(
         points=lines.points[:num_vertices],
         offsets=lines.offsets[: last + 1],

@@ -52,7 +52,8 @@ class DenseLines:
     @cached_property
     def segment_starts(self) -> IntArray:
         """Vertices at which a segment starts: all but the last one of each line. (S,)"""
-        return np.setdiff1d(np.arange(len(self.points)), self.offsets[1:] - 1)
+        last_vertices = self.offsets[1:] - 1
+        return np.setdiff1d(np.arange(len(self.points)), last_vertices)
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,7 +271,7 @@ def _select_matches(lines: DenseLines, candidates: Matches) -> Matches:
     vertices = candidates.vertices
     in_one_frame = lines.frames[vertices] == lines.frames[candidates.segments]
     is_selected = ~in_one_frame
-    distinct, rows = np.unique(vertices, return_inverse=True)
+    distinct, rows = np.unique(vertices, return_inverse=True)  # vertices[i] is distinct[rows[i]]
     for side in (1.0, -1.0):  # left and right
         distances = side * candidates.distances
         is_rival = in_one_frame & (distances >= 0.0)

@@ -123,6 +123,7 @@ def _select_parts(
     line_bounds = np.searchsorted(
         lines.line_indices[matches.segments], np.arange(len(lines.offsets))
     )
+    # Sum of the confidence of the vertices of each line. (N,)
     support = np.add.reduceat(confidence * is_confident, lines.offsets[:-1])
     is_free = is_confident.copy()
     parts = []

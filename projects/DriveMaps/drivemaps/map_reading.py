@@ -142,7 +142,8 @@ class ElementCollector:
             raise InputError(
                 f"{self._path} has more than {_MOST_VERTICES:,} vertices: cut the map to the place."
             )
-        if len(line) < 2 or not np.ptp(line, axis=0).any():
+        has_length = len(line) > 1 and bool(np.ptp(line, axis=0).any())
+        if not has_length:
             self.unused[f"{name} without length"] += 1
             return
         is_area = name in AREA_CLASSES

@@ -129,7 +129,8 @@ def _check_parts(parts: Sequence[Path]) -> None:
     for part in parts:
         patterns.add(re.sub(r"\d+", repl="0", string=part.name))
         numbers.add(_part_number(part))
-    if len(parts) > 1 and (len(patterns) > 1 or len(numbers) < len(parts)):
+    are_numbered = len(patterns) == 1 and len(numbers) == len(parts)
+    if len(parts) > 1 and not are_numbered:
         names = ", ".join(part.name for part in parts)
         raise InputError(f"it holds several bags ({names}): name one of them")
 

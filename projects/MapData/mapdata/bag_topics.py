@@ -161,7 +161,8 @@ def _candidate_infos(topic: str, infos: Sequence[str]) -> list[str]:
     nearest = None
     for info in infos:
         namespace = info.rsplit("/", maxsplit=1)[0]
-        if topic.startswith(f"{namespace}/") and (nearest is None or len(namespace) > len(nearest)):
+        is_above = topic.startswith(f"{namespace}/")
+        if is_above and (nearest is None or len(namespace) > len(nearest)):
             nearest = namespace
     neighbours = []
     matching_infos = []

@@ -194,7 +194,9 @@ def _choose_vehicle(content: BagContent, wanted: str | None) -> str:
 def _require_messages(name: str, topics: tuple[str, str], content: BagContent) -> None:
     """Raise a ``ValueError`` if a camera has no images, or lacks its camera info."""
     topic, info = topics
-    if not content.images[topic].times_ns or (info and topic not in content.infos):
+    has_images = bool(content.images[topic].times_ns)
+    lacks_info = bool(info) and topic not in content.infos
+    if not has_images or lacks_info:
         raise InputError(
             f"camera {name!r} has no message on {topic} or {info or 'its info'}: choose others "
             f"with --topics, or give --calibration. {content.reason(topics)}".rstrip(" .")

@@ -79,7 +79,8 @@ class FileOptions:
 
         Without a tag, the file name of a published split ends in its name.
         """
-        tag = self.tag or (f"_{self.split_name}" if self.split_name else "")
+        split_tag = f"_{self.split_name}" if self.split_name else ""
+        tag = self.tag or split_tag
         name = file_name(f"gsmap_{dataset}_{split}{tag}")
         return (self.out_dir or self.root) / f"{name}.arrow"
 

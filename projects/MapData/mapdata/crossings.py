@@ -83,7 +83,7 @@ def merge_parallel(pieces: np.ndarray, owner: np.ndarray) -> np.ndarray:
     Returns:
         The united crossings, one entry for each part of a crossing. (polygons,)
     """
-    _, crossing_of_piece = np.unique(owner, return_inverse=True)
+    _, crossing_of_piece = np.unique(owner, return_inverse=True)  # consecutive numbers from 0
     crossings = shapely.multipolygons(pieces, indices=crossing_of_piece)
     bounds = shapely.bounds(crossings)  # smallest x, y and largest x, y (n, 4)
     # Two boxes touch if each of them begins before the other ends, along both axes.
@@ -116,6 +116,7 @@ def _long_side(geometry: shapely.Geometry) -> np.ndarray:
     edge_lengths = np.hypot(edges[:, 0], edges[:, 1])
     along = edges / edge_lengths[:, None]  # a side of the rectangle lies on the hull
     across = np.stack([-along[:, 1], along[:, 0]], axis=-1)
+    # Extents of the hull along and across each edge, the sides of the rectangle on this edge.
     length = np.ptp(hull @ along.T, axis=0)
     width = np.ptp(hull @ across.T, axis=0)
     best = (length * width).argmin()

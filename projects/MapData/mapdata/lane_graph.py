@@ -68,6 +68,8 @@ class LanePaths:
             if not np.isfinite(line).all():
                 raise InputError(f"polylines[{i}] holds NaN or infinity.")
         rounded = np.round(np.concatenate([np.empty((0, 3)), *polylines]), decimals=ROUND_DECIMALS)
+        # Distinct points, the id of the point at each vertex of all lanes, and the number of
+        # vertices at each point.
         self._points, nodes, uses = np.unique(
             rounded, axis=0, return_inverse=True, return_counts=True
         )  # (nodes, 3)

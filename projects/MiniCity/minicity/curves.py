@@ -57,6 +57,7 @@ def subline(points: Array, start_m: float, end_m: float) -> Array:
         Vertices of the part. (m, 2)
     """
     lengths = arc_lengths(points)
+    # Vertices strictly between the ends; a vertex at an end would be repeated.
     inner = lengths[(lengths > start_m + 1e-6) & (lengths < end_m - 1e-6)]
     return interpolate(points, lengths, at=np.concatenate([[start_m], inner, [end_m]]))
 

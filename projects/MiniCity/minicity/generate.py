@@ -175,7 +175,8 @@ def is_complete(root: Path, config: MiniCityConfig) -> bool:
             f"{root} holds another MiniCity data set ({differences}): "
             "choose another --root or remove that folder."
         )
-    if root.exists() and (not root.is_dir() or any(root.iterdir())):
+    is_empty_folder = root.is_dir() and not any(root.iterdir())
+    if root.exists() and not is_empty_folder:
         raise InputError(
             f"{root} exists and is not a complete MiniCity data set: "
             "choose another --root or remove it."

@@ -61,8 +61,8 @@ def _entry_distances(origin: Array, directions: Array, boxes: Array) -> Array:
     Returns:
         Distances in metres, inf where a ray misses the rectangle. (A, n)
     """
-    start = boxes[:, :8].reshape(-1, 4, 2) - origin
-    edge = np.roll(start, -1, axis=1) - start
+    start = boxes[:, :8].reshape(-1, 4, 2) - origin  # corners, from which the edges start
+    edge = np.roll(start, -1, axis=1) - start  # to the next corner. (n, 4, 2)
     dx = directions[:, 0, None, None]
     dy = directions[:, 1, None, None]
     cross = dx * edge[None, ..., 1] - dy * edge[None, ..., 0]

@@ -196,6 +196,7 @@ def vehicle_shadow(vehicle: Vehicle, lighting: Lighting) -> Array:
 
 def _fixed_point(px: Array) -> NDArray[np.int32]:
     """Convert pixels to OpenCV's fixed-point format. (..., 2) -> (..., 2)"""
+    # Points far outside of the image are moved to the limit, as they would overflow int32.
     return np.round(np.clip(px, -2e4, 2e4) * (1 << SHIFT)).astype(np.int32)
 
 

@@ -206,6 +206,7 @@ class Road:
                 line = self.line(offset_m)
                 start_points.append(line[0])
                 end_points.append(line[-1])
+        # Along the right side, across the end, back along the left side, and across the start.
         start = np.array(start_points[::-1]).reshape(-1, 2)
         end = np.array(end_points).reshape(-1, 2)
         return np.concatenate([self.line(right_m), end, self.line(left_m)[::-1], start])

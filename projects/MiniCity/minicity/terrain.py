@@ -126,7 +126,7 @@ class Terrain:
         """
         u, v = np.meshgrid(self.columns, rows)
         rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ self.camera.world_from_pixel.T
-        level = np.maximum(np.linalg.norm(rays[..., :2], axis=-1), 1e-9)
+        level = np.maximum(np.linalg.norm(rays[..., :2], axis=-1), 1e-9)  # horizontal length
         return rays[..., :2] / level[..., None], rays[..., 2] / level
 
 
@@ -158,6 +158,7 @@ def make_terrain(camera: Camera, grid: HeightGrid) -> Terrain:
     world = np.concatenate([spots, sample_height(grid, spots)[..., None]], axis=-1)
     points_cam = camera.to_camera(world)
     in_front = points_cam[..., 2] > NEAR_M
+    # Points behind the camera are replaced by a point in front of it, whose row is not used.
     rows = camera.to_pixels(np.where(in_front[..., None], points_cam, [0.0, 0.0, 1.0]))[..., 1]
     # Ground that is behind the camera or far below the image gets rows below the image. They
     # decrease with the distance, as `Terrain.distances` interpolates between them.

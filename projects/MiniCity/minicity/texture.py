@@ -58,6 +58,8 @@ def _noise_tiles() -> tuple[Image, Image]:
     rng = np.random.default_rng(20)
     blotches = np.zeros((TILE_PX, TILE_PX), dtype=np.float32)
     for cells, weight in ((16, 1.0), (64, 0.8), (256, 0.6), (512, 0.5)):
+        # Random values on a coarse grid, enlarged by smooth interpolation. One more cell on each
+        # side, from the opposite side, makes the noise periodic.
         coarse = np.pad(rng.random((cells, cells), dtype=np.float32), 1, mode="wrap")
         scale = TILE_PX // cells
         fine = cv2.resize(coarse, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)

@@ -68,6 +68,7 @@ class Drive:
         lengths: list[float] = self._lengths  # type: ignore[attr-defined]
         rows: list[list[float]] = self._rows  # type: ignore[attr-defined]
         arc_m = min(max(self.start_m + self.speed * time_s, 0.0), lengths[-1])
+        # The position lies between the points i and i + 1 of the path.
         i = min(max(bisect_right(lengths, arc_m) - 1, 0), len(lengths) - 2)
         share = (arc_m - lengths[i]) / (lengths[i + 1] - lengths[i])
         x, y, dx, dy = [a + share * (b - a) for a, b in zip(rows[i], rows[i + 1], strict=True)]

@@ -138,7 +138,7 @@ def closest_ns(timestamps_ns: np.ndarray, wanted_ns: int, tolerance_ns: int) -> 
     """
     if len(timestamps_ns) == 0:
         return None
-    after = int(np.searchsorted(timestamps_ns, wanted_ns))
+    after = int(np.searchsorted(timestamps_ns, wanted_ns))  # first time at or after the wanted one
     neighbours = timestamps_ns[max(after - 1, 0) : after + 1]  # the times before and after
     index = np.abs(neighbours - wanted_ns).argmin()
     closest = int(neighbours[index])

@@ -95,6 +95,7 @@ class Argoverse2Map:
         self._painted = GeometryLayer(painted_lines)
         crossing_polygons = []
         for crossing in static_map.get_scenario_ped_crossings():
+            # Both edges run in one direction, so the ring returns along the second one.
             ring = np.vstack([crossing.edge1.xyz, crossing.edge2.xyz[::-1]])
             crossing_polygons.append(shapely.Polygon(ring))
         self._crossings = GeometryLayer(crossing_polygons)

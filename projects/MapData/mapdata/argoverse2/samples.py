@@ -79,7 +79,8 @@ class Argoverse2Options(FileOptions):
             raise InputError(f"rate_hz must be > 0, got {self.rate_hz}.")
         if self.thin_over not in THIN_OVER:
             raise InputError(f"thin_over must be one of {THIN_OVER}, got {self.thin_over!r}.")
-        if self.thin_over == "split" and (self.rate_hz is None or self.pose_stride is not None):
+        has_rate_of_sensors = self.rate_hz is not None and self.pose_stride is None
+        if self.thin_over == "split" and not has_rate_of_sensors:
             raise InputError(
                 "thin_over='split' keeps every N-th sample of all logs: give a rate, and times of "
                 "sensors (--at)."
@@ -382,7 +383,7 @@ def _lidar(
     if sweep_ns is None or sweep_ns not in log.poses:
         return None
     folder = log.log_dir.relative_to(options.root).as_posix()
-    last = int(np.searchsorted(times_ns, sweep_ns))
+    last = int(np.searchsorted(times_ns, sweep_ns))  # index of this sweep
     first = max(last - options.max_sweeps, 0)
     sweeps = []
     for time in reversed(times_ns[first : last + 1].tolist()):

@@ -201,6 +201,7 @@ class PoseTrack:
         matrices = np.array(list(poses), dtype=np.float64)
         if not len(times) or not np.isfinite(matrices).all():
             raise InputError("poses must be finite, at least one.")
+        # Distinct times, ascending, and the index of the first pose at each of them.
         self.times_ns, first = np.unique(times, return_index=True)
         self.poses = matrices[first]
         self.gap_ns = gap_ns

@@ -239,7 +239,8 @@ class NuScenesTables:
             self._check_link("sample_data", record, name="calibrated_sensor_token")
             channel = self._channel_of(record)
             is_sweep = channel == self.lidar and self._max_sweeps > 0
-            if is_sweep or (record["is_key_frame"] and channel in key_frame_channels):
+            is_key_frame = record["is_key_frame"] and channel in key_frame_channels
+            if is_sweep or is_key_frame:
                 yield {name: record[name] for name in names}
 
     def chain(

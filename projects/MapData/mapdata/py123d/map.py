@@ -76,7 +76,7 @@ class Map:
             self.left_out += 1
             return
         if line.shape[1] == 2:
-            line = np.pad(line, ((0, 0), (0, 1)))
+            line = np.pad(line, ((0, 0), (0, 1)))  # height 0
         if len(line) < 2:
             self.left_out += 1
             return
