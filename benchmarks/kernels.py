@@ -303,7 +303,7 @@ def random_locations(shape: tuple[int, ...], size: tuple[int, int]) -> Tensor:
 
 
 def kernel_sampling_cases(reduced: bool) -> Iterator[Case]:
-    """GKT as in the encoder of MapTR, and with points between pixels as in the one of MapQR."""
+    """GKT as in the encoder of MapTR, and with points between pixels as in the encoder of MapQR."""
     shape = (15, 25)
     rows, columns = (6, 4) if reduced else (200, 100)
     y, x = torch.meshgrid(

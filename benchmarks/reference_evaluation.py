@@ -110,7 +110,7 @@ def chamfer_map(
             preds.append([_resample(pred.polylines[i]) for i in ranked])
             gts.append([_resample(gt.polylines[k]) for k in truths])
             confidences.append(pred.confidence[ranked])
-        # Hits are listed by frame; `order` sorts those of all frames by score.
+        # Hits are listed frame by frame; `order` sorts the hits of all frames by score.
         order = np.argsort(-np.concatenate(confidences), kind="stable")
         num_gts = sum(map(len, gts))
         for threshold in thresholds:

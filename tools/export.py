@@ -5,7 +5,7 @@ Examples:
     python tools/export.py CONFIG CHECKPOINT --out model.onnx --check 5
     python tools/export.py CONFIG CHECKPOINT --out model_int8.onnx --int8 --calibration train.arrow
 
-The config sets the cameras. The image size is that of its test samples, or ``--size``.
+The config sets the cameras. The image size is the size of its test samples, or ``--size``.
 """
 
 import gsmap  # noqa: F401 - first: it handles Ctrl-C and guards against settings files
@@ -87,7 +87,7 @@ def open_samples(
     Args:
         inferencer: The model with its config.
         args: The options of the command.
-        source: The annotation file; None for the one of the config.
+        source: The annotation file; None takes the file of the config.
         split: ``train`` or ``test``, for the file of the config.
 
     Raises:

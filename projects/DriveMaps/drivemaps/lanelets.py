@@ -192,7 +192,7 @@ def _directions(line: FloatArray) -> FloatArray:
     """Unit direction of a line at each vertex. (n, 2)"""
     steps = np.diff(line, axis=0)
     steps = steps / np.linalg.norm(steps, axis=1, keepdims=True)
-    # A vertex has the mean direction of its two segments, and an end has that of its only segment.
+    # A vertex has the mean direction of its two segments, and an end the direction of its segment.
     sums = np.concatenate([steps[:1], steps[:-1] + steps[1:], steps[-1:]])
     return sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-9)
 

@@ -322,7 +322,7 @@ def join_lines(parts: Sequence[DenseLines]) -> DenseLines:
     """Join lines of different frames.
 
     Args:
-        parts: Lines; the frames of each part are numbered after those of the previous one.
+        parts: Lines. The frames of a part are numbered on from the frames of the previous part.
     """
     points = [np.zeros((0, 2))]
     frames = [np.zeros(0, np.int64)]

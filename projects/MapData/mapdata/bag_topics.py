@@ -155,7 +155,7 @@ def _words(topic: str) -> list[str]:
 def _candidate_infos(topic: str, infos: Sequence[str]) -> list[str]:
     """Topics of camera info that may belong to images.
 
-    They are in the nearest namespace above the images. If several camera infos are there, the ones
+    They are in the nearest namespace above the images. If several camera infos are there, topics
     with the words of the images are preferred.
     """
     nearest = None

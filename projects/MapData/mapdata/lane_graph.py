@@ -15,8 +15,8 @@ MAX_PATHS = 20_000
 # Edge of the graph, without its start: ids of the points on the way, and id of the point at which
 # it ends.
 Edge = tuple[tuple[int, ...], int]
-# For each lane of a map, the list of its links. A link has the positions of two lanes in the list
-# of lanes, of which the second follows the first, and the lane is one of the two.
+# For each lane of a map, the list of its links. A link is a pair of positions in the list of lanes:
+# the second lane follows the first one, and the lane is one of the two.
 LaneLinks = Sequence[Sequence[tuple[int, int]]]
 
 

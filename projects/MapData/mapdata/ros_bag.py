@@ -59,7 +59,8 @@ class RosTypes:
 
         Args:
             msgtype: Type of the messages, such as ``sensor_msgs/msg/Image``.
-            definition: Definition of the type in the bag; empty takes the one of ROS 2 Humble.
+            definition: Definition of the type in the bag. If it is empty, the type of ROS 2 Humble
+                is taken.
             is_idl: Whether the definition is in IDL.
             is_ros1: Whether the messages are serialized as in ROS 1.
 

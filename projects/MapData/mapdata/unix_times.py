@@ -17,7 +17,7 @@ def unix_time_ns(number: float, unit_ns: int | None = None) -> int | None:
     Args:
         number: Time since 1970.
         unit_ns: Unit of the time in nanoseconds. None detects seconds, milliseconds, microseconds
-            or nanoseconds, of which at most one is valid.
+            or nanoseconds; with at most one of these units, the time lies in the valid years.
 
     Returns:
         The time in nanoseconds; None if it is not in the years 2000 to 2099.

@@ -51,7 +51,7 @@ LOGGER = logging.getLogger(__name__)
 def plan_scenes(config: MiniCityConfig) -> list[SceneTask]:
     """Name the scenes after the official split and distribute them among the towns.
 
-    The scenes of one pass, which drives along every street once, come before those of the next.
+    A pass drives along every street once. Its scenes come before the scenes of the next pass.
     """
     from nuscenes.utils import splits
 

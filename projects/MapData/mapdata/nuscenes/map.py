@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 LINE_LAYERS = ("road_divider", "lane_divider")
 SURFACE_LAYERS = ("road_segment", "lane")
-# The further areas are those of nuScenes but ped_crossing, the first one.
+# All areas of nuScenes belong to it; the first of them, ped_crossing, is already listed.
 MAP_CLASSES = ("divider", "ped_crossing", "boundary", *AREA_CLASSES[1:4], "centerline")
 CROSSING = "ped_crossing"
 OUTLINE_MARGIN_M = 0.2  # distance from the edge of the patch at which outlines are cut
