@@ -68,7 +68,12 @@ def read_bag(path: Path, options: InputOptions) -> Source:
 
 
 def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
-    """Read the samples of an open bag."""
+    """Read the samples of an open bag.
+
+    The cameras are built first, from their camera info or from a calibration file. Then the images
+    are grouped to frames at the times of one camera, and the frames with a pose become samples. At
+    last, their images are written.
+    """
     kinds = {connection.topic: connection.msgtype for connection in bag.connections}
     listing = _listing(bag)
     calibration = options.calibration
@@ -97,12 +102,15 @@ def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
             _require_messages(name, pair, content=content)
         has_frames = bool(content.tree.frames)
         vehicle = _choose_vehicle(content, wanted=options.vehicle_frame) if has_frames else ""
-        rig = {topics[camera.name][0]: camera for camera, _ in calibrated_cameras}
+        rig = {}  # cameras by the topic of their images
+        for camera, _ in calibrated_cameras:
+            topic, _ = topics[camera.name]
+            rig[topic] = camera
         content.digest.update(calibration.read_bytes())
     rectification_key = set_rectification_targets(list(rig.values()), options.trained)
     content.digest.update(rectification_key)
 
-    times_ns = {}
+    times_ns = {}  # distinct times of the images, ascending, by camera
     for topic, camera in rig.items():
         times_ns[camera.name] = np.unique(content.images[topic].times_ns)
     first = _sampling_camera(list(times_ns))
@@ -130,6 +138,7 @@ def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
         camera=first,
     )
     notes += _absence_notes(frames, times_ns, first=first)
+    # The folder of the images depends on the content of the bag and on the rectification.
     digest = content.digest.hexdigest()[:16]
     root = options.frames_dir / f"{file_name(path.stem)}-{digest}"
     sample_times_ns = {sample.timestamp_ns for sample in samples}
