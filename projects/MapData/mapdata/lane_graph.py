@@ -84,7 +84,8 @@ class LanePaths:
             for before, after in lane_links:
                 end = lanes[before][-1]
                 start = lanes[after][0]
-                link_edges.append((before, after, (end, ((), start))))
+                edge: Edge = ((), start)  # without points on the way
+                link_edges.append((before, after, (end, edge)))
             self._links.append(link_edges)
         self._last_key: tuple[int, ...] = ()
         self._last_lines = np.empty(0, dtype=object)

@@ -47,7 +47,7 @@ def _time_ns(whole: str, fraction: str | None) -> int | None:
     """Time in nanoseconds from the digits before and after the point; None if it is no time."""
     if fraction is not None and len(whole) > 10:
         return None  # only seconds have a fraction
-    # 10 digits are seconds, and each further digit is a tenth of the unit.
+    # 10 digits are in seconds. With each further digit, the unit is ten times smaller.
     time_ns = unix_time_ns(int(whole), unit_ns=10 ** (19 - len(whole)))
     if time_ns is None:
         return None
