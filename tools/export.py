@@ -180,6 +180,7 @@ def check(inferencer: MapInferencer, exported: OnnxInferencer, args: argparse.Na
         predictions.append((token, elements))
     if args.results:
         exported.write(args.results, predictions)
+    # Differences are infinite if the numbers of elements of a class differ.
     equal_classes = [pair for pair in differences if np.isfinite(pair).all()]
     score, distance_m = np.max(equal_classes or [(0, 0)], axis=0)
     return (

@@ -93,7 +93,7 @@ def main() -> str:
     # Read before `parse_args`, which declares the page as an output that must not be read.
     is_foreign = _PAGE.exists() and not is_own_page(_PAGE)
     args = parse_args()
-    if args.out is _PAGE and is_foreign:
+    if args.out is _PAGE and is_foreign:  # without --out
         raise FileExistsError(f"{_PAGE} is there, and no page of this command: give --out PAGE.")
     paths = [args.results]
     if args.compare:

@@ -108,6 +108,7 @@ def _bounded_stream(open_stream: Callable[[BytesIO], Any]) -> Callable[..., byte
     def decompress(data: bytes, *_: object) -> bytes:
         limit = _count_packed(len(data))
         with open_stream(BytesIO(data)) as file:
+            # One byte beyond the limit shows that there are too many.
             return _count_unpacked(file.read(limit + 1), limit=limit)
 
     return decompress

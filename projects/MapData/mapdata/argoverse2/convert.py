@@ -82,7 +82,7 @@ def convert_argoverse2(options: Argoverse2Options) -> ConversionSummary:
                 writer.write(sample)
                 summary.add_sample(options.split, sample)
                 if sample.lidar is not None:
-                    sweep_ns = int(Path(sample.lidar.path).stem)
+                    sweep_ns = int(Path(sample.lidar.path).stem)  # a file is named by its time
                     offsets_ns.append(abs(sweep_ns - sample.timestamp_ns))
             _add_problems(summary, log_dir.name, result=result)
         if not len(writer) and not options.shard.count:

@@ -54,7 +54,7 @@ _OFFICIAL_SPLITS = {
     "v1.0-trainval": ("train", "val"), "v1.0-mini": ("mini_train", "mini_val"),
     "v1.0-test": ("test",),
 }  # fmt: skip
-_FRAMES_PER_WORKER = 500  # converted in about the time that a process takes to start
+_FRAMES_PER_WORKER = 500  # converting them takes about as long as starting a process
 _Scene = tuple[dict[str, Any], NuScenesTables]  # record of a scene, and the tables of its version
 
 
@@ -228,8 +228,11 @@ class _Conversion:
         Args:
             writers: Writer of each split.
         """
-        scenes = [scene for scene in self.scenes if scene[0]["name"] in self.split_of]
-        scenes = self.options.shard.part(sorted(scenes, key=_map_names))
+        selected = []
+        for scene, tables in self.scenes:
+            if scene["name"] in self.split_of:
+                selected.append((scene, tables))
+        scenes = self.options.shard.part(sorted(selected, key=_map_names))
         progress = Progress(
             desc=f"{self.options.dataset} {'+'.join(self.options.versions)}",
             unit="samples",

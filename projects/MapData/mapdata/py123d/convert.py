@@ -118,6 +118,7 @@ def _find_logs(options: Py123dOptions) -> list[Path]:
         if not options.logs or path.parent.name.startswith(tuple(options.logs)):
             folders.append(path.parent)
     if not folders:
+        # The table of a log is at logs/SPLIT/LOG/sync.arrow.
         splits = sorted({path.parts[-3] for path in options.root.glob(f"logs/*/*/{SYNC}")})
         known = f"; there are {', '.join(splits)}" if splits else ""
         raise FileNotFoundError(f"no log of py123d as asked for in {parent}{known}.")

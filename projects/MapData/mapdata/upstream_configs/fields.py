@@ -30,7 +30,7 @@ class Fields:
         value: Any = self._values
         for key in name.split("."):
             if isinstance(value, (list, tuple)):
-                value = dict(enumerate(value)).get(int(key))
+                value = dict(enumerate(value)).get(int(key))  # None beyond the end of the list
             elif isinstance(value, dict):
                 value = value.get(key)
             else:
