@@ -361,7 +361,7 @@ def test_bad_settings_are_refused(tmp_path):
     for rules in ({"dim": 3}, {"resample_predictions": False}, {"resample_ground_truth": False}):
         given_so = MetricSettings(CLASSES, grid=NUSCENES_GRID, **rules)
         for name in ("vectormapnet", "vectormapnet_shrunk"):
-            with pytest.raises(ValueError, match="is AP_chamfer of lines of 100 points"):
+            with pytest.raises(ValueError, match="is AP_chamfer of lines in the plane"):
                 MapEvaluator.from_names([name], given_so)
     with pytest.raises(ValueError, match=r"there is no metric .*'image'.*'chamfer', .*'hdmapnet'"):
         MapEvaluator.from_names(["image"], MetricSettings(CLASSES))
