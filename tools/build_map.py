@@ -283,7 +283,7 @@ def write_map(
             write_geojson(path, elements, classes, origin=None)
         elif suffix == "osm":
             lanes = lane_graph_of(drive, elements)
-            print(f"{format_count(len(lanes.lanelets), 'lanelet')} of centre lines: {path}")
+            print(f"{format_count(len(lanes.lanelets), 'lanelet')} {lanes.source}: {path}")
             write_lanelet2(
                 path,
                 elements,

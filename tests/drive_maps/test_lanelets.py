@@ -1,11 +1,15 @@
-"""Lanelets of centre lines, loaded by the ``lanelet2`` package with their routing graph."""
+"""Lanelets of centre lines and of driven lanes, as the ``lanelet2`` package routes on them."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import shapely
 from drive_cases import drive_of
 
+from drivemaps.directed_lines import resample
 from drivemaps.drive import Drive, DriveFrame, read_drive
+from drivemaps.driven_lanes import driven_lanes
 from drivemaps.geodetic import MapOrigin
 from drivemaps.lanelet2 import write_lanelet2
 from drivemaps.lanelets import lane_graph, lane_graph_of
@@ -57,6 +61,7 @@ def routing(path, lanes) -> tuple[list, dict[int, set[int]]]:
     assert all(traffic.isOneWay(lanelet) for lanelet in lanelets)
     limits = [traffic.speedLimit(lanelet).speedLimit for lanelet in lanelets]
     assert limits == pytest.approx([30.0] * len(lanelets))  # km/h
+    assert not any(graph.left(lanelet) or graph.right(lanelet) for lanelet in lanelets)
     position = {lanelet.id: number for number, lanelet in enumerate(lanelets)}
     following = {
         number: {position[other.id] for other in graph.following(lanelet)}
@@ -111,8 +116,6 @@ def test_the_direction_is_that_of_the_frames() -> None:
     merged = MapElements.from_polylines([np.array([[60.0, 0.0], [0.0, 0.0]])], [2])
     lanes = lane_graph_of(drive, merged)
     np.testing.assert_allclose(lanes.left, [[0, 1.75], [60, 1.75]])
-    without = Drive("scene", CLASSES[:2], (-30.0, 30.0), (-15.0, 15.0), frames)
-    assert not lane_graph_of(without, merged).lanelets
 
 
 def test_short_parts_between_forks_stay_in_the_true_map() -> None:
@@ -194,3 +197,164 @@ def test_every_annotated_path_of_minicity_can_be_driven(minicity_drive, make_map
             end = lanelets_at(centres, path[-1], last / np.linalg.norm(last))
             assert reached(start, following) & end, path
     assert paths > 5
+
+
+def borders_of_a_road(*gaps: tuple[float, float]) -> list[np.ndarray]:
+    """Two lanes of 3.5 m and their kerbs along y = 0, open in the gaps of x.
+
+    .. code-block:: text
+
+        0 ==========      ========== 200    y =  5.25  kerb
+        0 ----------      ---------- 200    y =  1.75  divider
+        0 ==========      ========== 200    y = -1.75  kerb
+    """
+    edges = [0.0, *(x for gap in gaps for x in gap), 200.0]
+    lines = []
+    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+        for y in (5.25, 1.75, -1.75):
+            lines.append(np.array([[start, y], [stop, y]]))
+    return lines
+
+
+def track(*points: tuple[float, float]) -> np.ndarray:
+    """Positions at most 8 m apart along a line through points. (n, 2)"""
+    line = shapely.LineString(points)
+    return shapely.get_coordinates(line.segmentize(8.0))
+
+
+def test_driven_lanes_lie_in_the_middle_of_two_borders(tmp_path) -> None:
+    """The vehicle drives 0.6 m left of the middle, over a junction of 20 m without lines."""
+    positions = track((0.0, 0.6), (200.0, 0.6))
+    borders = borders_of_a_road((90.0, 110.0))
+    found = driven_lanes(positions, borders)
+    assert found.outside_m == pytest.approx(0.0)
+    for line in found.centerlines:
+        np.testing.assert_allclose(line[:, 1], 0.0, atol=1e-9)
+    lanelets, following = routing(tmp_path / "road.osm", lane_graph(found.centerlines, borders))
+    last = len(lanelets) - 1
+    assert following == {number: {number + 1} - {last + 1} for number in range(last + 1)}
+    for lanelet in lanelets:  # the junction is as wide as the lanes, 3.5 m
+        assert [point.y for point in lanelet.leftBound] == pytest.approx(
+            [1.75] * len(lanelet.leftBound), abs=0.01
+        )
+        assert [point.y for point in lanelet.rightBound] == pytest.approx(
+            [-1.75] * len(lanelet.rightBound), abs=0.01
+        )
+        assert lanelet.leftBound[0].x < lanelet.leftBound[-1].x
+
+
+def test_a_lane_change_joins_no_lanes(tmp_path) -> None:
+    """West on the lane at y = 3.5, then across the divider; the lanes are not connected."""
+    positions = track((200.0, 3.5), (120.0, 3.5), (90.0, 0.0), (0.0, 0.0))
+    borders = borders_of_a_road()
+    found = driven_lanes(positions, borders)
+    assert {np.median(line[:, 1]).round(1) for line in found.centerlines} == {3.5, 0.0}
+    lanelets, following = routing(tmp_path / "change.osm", lane_graph(found.centerlines, borders))
+    ahead = reached({0}, following)
+    assert ahead != set(following)
+    for number in ahead:  # the lane at y = 3.5 runs west
+        assert lanelets[number].leftBound[0].y < 3.5 < lanelets[number].rightBound[0].y
+
+
+@pytest.mark.parametrize(
+    ("borders", "outside_m"),
+    [
+        ([], 200.0),
+        (borders_of_a_road()[:3:2], 0.0),  # no divider: 7 m wide
+        (borders_of_a_road((60.0, 140.0)), 80.0),  # too long for a junction
+        (borders_of_a_road((0.0, 40.0)), 40.0),  # no lane before it
+        (borders_of_a_road()[::3], 200.0),  # no right border
+    ],
+)
+def test_tracks_without_borders_are_in_no_lane(borders, outside_m) -> None:
+    found = driven_lanes(track((0.0, 0.0), (200.0, 0.0)), borders)
+    assert found.driven_m == pytest.approx(200.0)
+    assert found.outside_m == pytest.approx(outside_m, abs=4.0)  # two samples
+
+
+def test_a_standing_vehicle_and_gaps_of_the_track_are_no_lanes() -> None:
+    """The vehicle stands still at 50 m, and no frame lies between 80 and 140 m."""
+    start = track((0.0, 0.0), (50.0, 0.0))
+    standing = np.array([50.0, 0.0]) + 0.05 * np.array([[0, 0], [1, 1], [-1, 0], [0, -1]])
+    rest = track((50.0, 0.0), (80.0, 0.0))
+    later = track((140.0, 0.0), (200.0, 0.0))
+    found = driven_lanes(np.concatenate([start, standing, rest, later]), borders_of_a_road())
+    united = shapely.line_merge(shapely.MultiLineString(found.centerlines))
+    np.testing.assert_allclose([line.bounds[::2] for line in united.geoms], [[0, 80], [140, 200]])
+    assert not driven_lanes(standing, borders_of_a_road()).centerlines
+
+
+SIDE_STREET = ((60.0, -80.0), (60.0, -22.0), (62.0, -15.0), (66.0, -11.0))
+
+
+@pytest.mark.parametrize("lead", [(), SIDE_STREET])
+def test_a_block_driven_twice_has_one_ring_of_lanelets(lead, tmp_path) -> None:
+    """Round a block two and a half times; with a lead, from a side street into the ring."""
+    corners = [(0.0, 0.0), (100.0, 0.0), (100.0, 60.0), (0.0, 60.0), (0.0, 0.0)]
+    ring = shapely.Polygon(corners).buffer(10.0).exterior
+    borders = []
+    for aside_m in (-1.75, 1.75):
+        border = shapely.Polygon(ring).buffer(aside_m).exterior
+        borders.append(shapely.get_coordinates(border))
+    once = shapely.get_coordinates(ring.segmentize(5.0))
+    if lead:
+        start = np.linalg.norm(once - [72.0, -10.0], axis=1).argmin()
+        once = np.concatenate([once[start:-1], once[: start + 1]])
+        if once[1, 0] < once[0, 0]:
+            once = once[::-1]
+        for x in (58.25, 61.75):
+            borders.append(np.array([[x, -80.0], [x, -20.0]]))
+    laps = [once[1:], once[1:], once[1:14]]
+    positions = [track(*lead, tuple(once[0])), *laps] if lead else [once[:1], *laps]
+    found = driven_lanes(np.concatenate(positions), borders)
+    assert found.driven_m > 2.1 * ring.length
+    lanes = lane_graph(found.centerlines, borders)
+    _, following = routing(tmp_path / "block.osm", lanes)
+    assert all(len(others) == 1 for others in following.values())
+    assert reached({0}, following) == set(following)
+    length_m = sum(shapely.LineString(lane.left).length for lane in lanes.lanelets)
+    assert length_m < 1.2 * ring.length + 80.0
+
+
+def test_borders_beside_a_wide_lane_are_too_far_for_its_bounds() -> None:
+    """Between kerbs 7 m apart the vehicle keeps to the right, 1.75 m from its kerb."""
+    borders = borders_of_a_road()[:3:2]
+    lanes = lane_graph(driven_lanes(track((0.0, 0.0), (200.0, 0.0)), borders).centerlines, borders)
+    np.testing.assert_allclose(lanes.left[:, 1], 1.75)
+    np.testing.assert_allclose(lanes.right[:, 1], -1.75)
+
+
+def test_driven_lanes_of_minicity_are_its_annotated_lanes(minicity_drive) -> None:
+    """A vehicle on the annotated paths finds their lanes from dividers and boundaries alone."""
+    elements = true_map(minicity_drive)
+    borders = elements.select(elements.labels < 2).polylines
+    driven_m = 0.0
+    outside_m = 0.0
+    for frame in minicity_drive.frames:
+        for path in frame.elements.select(frame.elements.labels == 2).polylines:
+            found = driven_lanes(resample(path), borders)
+            driven_m += found.driven_m
+            outside_m += found.outside_m
+            for centerline in found.centerlines:
+                distances_m = shapely.distance(shapely.LineString(path), shapely.points(centerline))
+                assert distances_m.max() < 0.5
+    assert outside_m < 0.7 * driven_m  # paths that end in a junction are cut at it
+
+
+def test_a_drive_without_centre_lines_has_driven_lanes(minicity_drive) -> None:
+    """The drive of a model that predicts dividers and boundaries; the vehicle moves 80 m."""
+    sample = minicity_drive.frames[0].sample
+    frames = []
+    for position in track((0.0, 0.0), (80.0, 0.0)):
+        pose = np.eye(4)
+        pose[:2, 3] = position
+        moved = replace(sample, global_from_frame=pose)
+        frames.append(DriveFrame(moved, MapElements.from_polylines()))
+    drive = replace(minicity_drive, classes=CLASSES[:2], frames=frames)
+    merged = MapElements.from_polylines(borders_of_a_road(), [1, 0, 1])
+    lanes = lane_graph_of(drive, merged)
+    assert lanes.source == "of driven lanes (0 of 80 m are in no lane)"
+    assert len(lanes.lanelets) == 2
+    nothing = lane_graph_of(drive, MapElements.from_polylines())
+    assert nothing.source == "of driven lanes (80 of 80 m are in no lane)"
+    assert not nothing.lanelets

@@ -9,9 +9,10 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.annotations.file import AnnotationFile, merge_annotations
 from gsmap.structures.rigid import invert_rigid, rigid
 from gsmap.utils.errors import WorkError
+from gsmap.utils.shards import Shard, find_shards
 from mapdata.folders.rig import rotation_of
 from mapdata.py123d.convert import Py123dOptions, convert_py123d
 from mapdata.py123d.packed import unpack
@@ -142,7 +143,6 @@ def test_what_cannot_be_used_is_left_out_by_name(tmp_path):
     ("table", "column", "values", "message"),
     [
         ("camera.pcam_f0", "data", pa.array(["../a.jpg"] * 5), "the path must lie below"),
-        ("camera.pcam_f0", "data", pa.array(range(5), pa.int32()), "its images are in a film"),
         ("sync", "camera.pcam_f0", pa.array([9, -1, 9, 9, 9]), "has 5 images, not row 9"),
         (
             "ego_state_se3",
@@ -158,6 +158,86 @@ def test_foreign_values_are_refused(table, column, values, message, tmp_path):
     replace_column(folder / f"{table}.arrow", name, values)
     with pytest.raises(WorkError, match=f"no sample is left of test_val:(.|\n)*{message}"):
         convert(tmp_path)
+
+
+def add_camera(folder: Path, name: str, **changes) -> None:
+    """Add a camera to the log, with the images and rows of ``pcam_f0`` and changed metadata."""
+    table = pa.ipc.open_file(str(folder / "camera.pcam_f0.arrow")).read_all()
+    key = f"camera.{name}"
+    columns = {}
+    for column in table.column_names:
+        columns[column.replace("camera.pcam_f0", key)] = table[column]
+    metadata = {**cases.camera_metadata(name, number=9, distorted=False), **changes}
+    cases.write_table(folder / f"{key}.arrow", columns, metadata)
+    sync = pa.ipc.open_file(str(folder / "sync.arrow")).read_all()
+    replace_column(folder / "sync.arrow", key, sync["camera.pcam_f0"])
+
+
+def test_cameras_of_other_models_are_left_out_by_name(tmp_path):
+    folder = cases.write_log(tmp_path)
+    add_camera(folder, "fmcam_l", camera_model="fisheye_mei", mirror_parameter=2.2)
+    add_camera(folder, "ftcam_f0", camera_model="ftheta", intrinsics=[1.0] * 14)
+    add_camera(folder, "pcam_l0", intrinsics=None)
+    add_camera(folder, "pcam_r0")
+    sync = pa.ipc.open_file(str(folder / "sync.arrow")).read_all().drop_columns("camera.pcam_r0")
+    columns = dict(zip(sync.column_names, sync, strict=True))
+    cases.write_table(folder / "sync.arrow", columns, cases.log_metadata())
+    text, file = convert(tmp_path)
+    check_first_sample(tmp_path, file)
+    for line in (
+        "left out: its model is 'fisheye_mei', not 'pinhole', for example fmcam_l of log1",
+        "left out: its model is 'ftheta', not 'pinhole', for example ftcam_f0 of log1",
+        "left out: it has no intrinsics, for example pcam_l0 of log1",
+        "left out: sync.arrow has no column of it, for example pcam_r0 of log1",
+    ):
+        assert f"1 x camera {line}" in text
+
+
+def test_cameras_in_films_are_left_out_by_name(tmp_path):
+    folder = cases.write_log(tmp_path)
+    numbers = pa.array(range(5), pa.int32())  # of the frames in camera.pcam_b0.mp4
+    replace_column(folder / "camera.pcam_b0.arrow", "camera.pcam_b0.data", numbers)
+    text, file = convert(tmp_path)
+    assert [camera.name for camera in file[0].cameras] == ["pcam_f0"]
+    reason = "camera left out: its images are in a film; py123d must store them as JPEG or PNG"
+    assert f"1 x {reason}, for example pcam_b0 of log1" in text
+    replace_column(folder / "camera.pcam_f0.arrow", "camera.pcam_f0.data", numbers)
+    with pytest.raises(WorkError, match="no camera that can be used") as caught:
+        convert(tmp_path)
+    assert f"2 x {reason}" in str(caught.value)
+
+
+def test_other_tables_are_named(tmp_path):
+    folder = cases.write_log(tmp_path)
+    assert "not read" not in convert(tmp_path)[0]
+    for key in ("lidar.lidar_merged", "camera_semantic.pcam_f0", "box_detections_se3"):
+        columns = {f"{key}.timestamp_us": pa.array(cases.TIMES_US, pa.int64())}
+        cases.write_table(folder / f"{key}.arrow", columns, {})
+    text, file = convert(tmp_path)
+    tables = "box_detections_se3, camera_semantic.pcam_f0, lidar.lidar_merged"
+    assert f"not read (cameras, poses and maps are): {tables}" in text
+    check_first_sample(tmp_path, file)
+
+
+def test_joined_shards_are_the_whole_file(tmp_path):
+    """Three logs in four shards, of which one is empty."""
+    folder = cases.write_log(tmp_path)
+    for number in (2, 3):
+        shutil.copytree(folder, folder.with_name(f"log{number}"))
+    _, whole = convert(tmp_path)
+    path = tmp_path / "gsmap_py123d_test_val.arrow"
+    content = path.read_bytes()
+    path.unlink()
+    scenes = []
+    for index in range(4):
+        options = Py123dOptions(
+            tmp_path, split="test_val", rate_hz=None, classes=CLASSES, shard=Shard(index, 4)
+        )
+        convert_py123d(options)
+        scenes += [sample.scene for sample in AnnotationFile(options.shard.path_of(path))]
+    assert scenes == [sample.scene for sample in whole]
+    merge_annotations(path, find_shards(path))
+    assert path.read_bytes() == content
 
 
 def test_vehicles_of_other_heights_are_not_mixed(tmp_path):

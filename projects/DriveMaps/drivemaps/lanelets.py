@@ -1,7 +1,7 @@
-"""Lanelets: lanes with a left and a right bound, constructed from centre lines."""
+"""Lanelets: lanes with a left and a right bound, from centre lines or the track of a drive."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -9,7 +9,16 @@ import shapely
 import shapely.ops
 from scipy.spatial import cKDTree
 
+from drivemaps.directed_lines import (
+    border_distances,
+    border_tree,
+    drop_repeats,
+    line_directions,
+    resample,
+    rotate_to_left,
+)
 from drivemaps.drive import Drive
+from drivemaps.driven_lanes import driven_lanes
 from drivemaps.truth import components
 from gsmap.structures.elements import FloatArray, MapElements
 
@@ -23,7 +32,6 @@ _MOST_HALF_WIDTH_M = 3.0  # a border farther away belongs to another lane
 _MIN_HALF_WIDTH_M = 0.5
 _JOIN_M = 1.0  # ends within this distance are one node of the lane graph
 _SHORTEST_M = 2.0  # a lane is split only at points farther apart, and farther from its ends
-_STEP_M = 2.0  # lanes are sampled at most this far apart, to measure directions and widths
 _MIN_SUCCESSOR_COSINE = 0.5  # smallest cosine between the directions of successive lanes
 _MIN_PARALLEL_COSINE = 0.7  # smallest |cosine| between a line and a piece that runs along it
 
@@ -53,39 +61,50 @@ class LaneGraph:
         lanelets: Lanelets, the edges of the graph.
         left: End of the left bounds at each node, in metres. (nodes, 2)
         right: End of the right bounds at each node, in metres. (nodes, 2)
+        source: Description of the lines that the lanelets are made from.
     """
 
     lanelets: Sequence[Lanelet]
     left: FloatArray
     right: FloatArray
+    source: str = "of centre lines"
 
 
 def lane_graph_of(drive: Drive, elements: MapElements) -> LaneGraph:
-    """Construct lanelets from the centre lines in the map of a drive.
+    """Construct lanelets from the map of a drive.
 
     The lines of a merged map have no direction of travel. A centre line of the map gets the
-    direction of most of the centre lines in the frames that run along it.
+    direction of most of the centre lines in the frames that run along it. In a map without centre
+    lines, lanelets are the lanes that the vehicle has driven (`driven_lanes`).
 
     Args:
-        drive: Frames with centre lines in the direction of travel.
+        drive: Frames with poses, and with centre lines in the direction of travel if there are any.
         elements: Map of the drive in the global frame.
 
     Returns:
-        Lanelets and nodes, none if the drive has no class ``centerline``.
+        Lanelets and nodes.
     """
-    if CENTERLINE not in drive.classes:
-        return lane_graph([], [])
-    label = drive.classes.index(CENTERLINE)
-    pieces: list[FloatArray] = []
-    for frame in drive.frames:
-        pieces += frame.elements.select(frame.elements.labels == label).polylines
-    lines = elements.select(elements.labels == label).polylines
     borders: list[FloatArray] = []
     for name in BORDERS:
-        if name in drive.classes:
-            border_label = drive.classes.index(name)
-            borders += elements.select(elements.labels == border_label).polylines
+        borders += _lines_of_class(drive, elements, name)
+    lines = _lines_of_class(drive, elements, CENTERLINE)
+    if not lines:
+        positions = np.array([frame.origin for frame in drive.frames])
+        lanes = driven_lanes(positions, borders)
+        source = f"of driven lanes ({lanes.outside_m:.0f} of {lanes.driven_m:.0f} m are in no lane)"
+        return replace(lane_graph(lanes.centerlines, borders), source=source)
+    pieces: list[FloatArray] = []
+    for frame in drive.frames:
+        pieces += _lines_of_class(drive, frame.elements, CENTERLINE)
     return lane_graph(_orient_lines(lines, pieces), borders)
+
+
+def _lines_of_class(drive: Drive, elements: MapElements, name: str) -> list[FloatArray]:
+    """Lines of a class; empty if the drive does not have the class. each (n, 2)"""
+    if name not in drive.classes:
+        return []
+    label = drive.classes.index(name)
+    return elements.select(elements.labels == label).polylines
 
 
 def lane_graph(centerlines: Iterable[FloatArray], borders: Sequence[FloatArray]) -> LaneGraph:
@@ -104,25 +123,25 @@ def lane_graph(centerlines: Iterable[FloatArray], borders: Sequence[FloatArray])
     """
     nonempty = []
     for centerline in centerlines:
-        vertices = _drop_repeats(np.asarray(centerline)[:, :2])
+        vertices = drop_repeats(np.asarray(centerline)[:, :2])
         if len(vertices) > 1:
             nonempty.append(vertices)
     lines = _split(nonempty)
     if not lines:
         return LaneGraph([], left=np.empty((0, 2)), right=np.empty((0, 2)))
-    tree = shapely.STRtree([shapely.LineString(border) for border in borders if len(border) > 1])
+    tree = border_tree(list(borders))
     directions = []
     half_widths = []
     ends = []
     end_directions = []
     for line in lines:
-        line_directions = _directions(line)
+        directions_of_line = line_directions(line)
         left_m = _half_width(line, side=1, borders=tree)
         right_m = _half_width(line, side=-1, borders=tree)
-        directions.append(line_directions)
+        directions.append(directions_of_line)
         half_widths.append((left_m, right_m))
         ends += [line[0], line[-1]]
-        end_directions += [line_directions[0], line_directions[-1]]
+        end_directions += [directions_of_line[0], directions_of_line[-1]]
     nodes = _Nodes(
         ends=np.array(ends),
         directions=np.array(end_directions),
@@ -139,7 +158,7 @@ def lane_graph(centerlines: Iterable[FloatArray], borders: Sequence[FloatArray])
             continue
         known_lanes.append(lane)
         inner = line[1:-1]
-        to_left = _to_left(directions[index])[1:-1]
+        to_left = rotate_to_left(directions[index])[1:-1]
         left_m, right_m = half_widths[index]
         left = inner + left_m * to_left
         right = inner - right_m * to_left
@@ -171,38 +190,10 @@ class _Nodes:
             self.node_of_end[members] = node
             middle = ends[members].mean(axis=0)
             direction = directions[members].mean(axis=0)
-            to_left = _to_left(direction / np.linalg.norm(direction))
+            to_left = rotate_to_left(direction / np.linalg.norm(direction))
             left_m, right_m = half_widths_m[members].mean(axis=0)
             self.left[node] = middle + left_m * to_left
             self.right[node] = middle - right_m * to_left
-
-
-def _to_left(directions: FloatArray) -> FloatArray:
-    """Rotate vectors to the left by a right angle. (..., 2)"""
-    return np.stack([-directions[..., 1], directions[..., 0]], axis=-1)
-
-
-def _drop_repeats(line: FloatArray) -> FloatArray:
-    """Drop vertices that equal their predecessor, where a line has no direction. (n, 2)"""
-    differs = (np.diff(line, axis=0) != 0).any(axis=1)
-    return line[np.append(True, differs)]
-
-
-def _directions(line: FloatArray) -> FloatArray:
-    """Unit direction of a line at each vertex. (n, 2)"""
-    steps = np.diff(line, axis=0)
-    steps = steps / np.linalg.norm(steps, axis=1, keepdims=True)
-    # A vertex has the mean direction of its two segments, and an end the direction of its segment.
-    sums = np.concatenate([steps[:1], steps[:-1] + steps[1:], steps[-1:]])
-    return sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-9)
-
-
-def _resample(line: FloatArray) -> FloatArray:
-    """Sample a line at equal steps of at most ``_STEP_M``, with both ends. -> (n >= 2, 2)"""
-    shape = shapely.LineString(line)
-    count = max(int(np.ceil(shape.length / _STEP_M)), 1) + 1
-    distances = np.linspace(0.0, shape.length, count)
-    return shapely.get_coordinates(shapely.line_interpolate_point(shape, distances))
 
 
 def _orient_lines(lines: Sequence[FloatArray], pieces: Sequence[FloatArray]) -> list[FloatArray]:
@@ -211,21 +202,21 @@ def _orient_lines(lines: Sequence[FloatArray], pieces: Sequence[FloatArray]) -> 
     piece_directions = []
     for piece in pieces:
         if len(piece) > 1:
-            points = _resample(piece[:, :2])
+            points = resample(piece[:, :2])
             piece_points.append(points)
-            piece_directions.append(_directions(points))
+            piece_directions.append(line_directions(points))
     if not piece_points:
         return list(lines)
     tree = cKDTree(np.concatenate(piece_points))
     directions = np.concatenate(piece_directions)
     oriented = []
     for line in lines:
-        samples = _resample(line[:, :2])
+        samples = resample(line[:, :2])
         _, neighbours = tree.query(samples, k=8, distance_upper_bound=_JOIN_M)
         # A missing neighbour has the index `len(directions)`.
         rows, columns = np.nonzero(neighbours < len(directions))
         neighbour_directions = directions[neighbours[rows, columns]]
-        cosines = (_directions(samples)[rows] * neighbour_directions).sum(axis=1)
+        cosines = (line_directions(samples)[rows] * neighbour_directions).sum(axis=1)
         is_parallel = np.abs(cosines) > _MIN_PARALLEL_COSINE
         votes = np.sign(cosines[is_parallel]).sum()  # each near point votes +1 or -1
         is_opposite = votes < 0
@@ -240,7 +231,7 @@ def _split(lines: Sequence[FloatArray]) -> list[FloatArray]:
         lines: Lines in metres; lines of 2 m and less are dropped. each (n, 2)
 
     Returns:
-        Parts of the lines, sampled at most ``_STEP_M`` apart. each (n, 2)
+        Parts of the lines, sampled at most ``STEP_M`` apart. each (n, 2)
     """
     long_lines = []
     ends = []
@@ -248,7 +239,7 @@ def _split(lines: Sequence[FloatArray]) -> list[FloatArray]:
     for line in lines:
         if shapely.LineString(line).length <= _SHORTEST_M:
             continue
-        directions = _directions(line)
+        directions = line_directions(line)
         long_lines.append(line)
         ends += [line[0], line[-1]]
         end_directions += [directions[0], directions[-1]]
@@ -271,7 +262,7 @@ def _split(lines: Sequence[FloatArray]) -> list[FloatArray]:
         cuts.sort()
         for start, stop in pairwise(cuts):
             part = shapely.ops.substring(shape, start, stop)
-            parts.append(_resample(shapely.get_coordinates(part)))
+            parts.append(resample(shapely.get_coordinates(part)))
     return parts
 
 
@@ -286,15 +277,7 @@ def _half_width(line: FloatArray, side: int, borders: shapely.STRtree) -> float:
     Returns:
         Distance in metres, ``HALF_WIDTH_M`` if most vertices have no border beside them.
     """
-    # A ray from each vertex across the line, as long as the widest half of a lane.
-    across = side * _MOST_HALF_WIDTH_M * _to_left(_directions(line))
-    rays = shapely.linestrings(np.stack([line, line + across], axis=1))
-    rows, border_indices = borders.query(rays, predicate="intersects")
-    starts = shapely.points(line[rows])
-    crossings = shapely.intersection(rays[rows], borders.geometries[border_indices])
-    nearest_m = np.full(len(line), np.inf)
-    np.minimum.at(nearest_m, rows, shapely.distance(starts, crossings))
-    # Infinite without a border beside the vertex.
+    nearest_m = border_distances(line, side, borders=borders, reach_m=_MOST_HALF_WIDTH_M)
     finite_m = nearest_m[np.isfinite(nearest_m)]
     if 2 * len(finite_m) < len(line):
         return HALF_WIDTH_M

@@ -115,14 +115,25 @@ def from_records(
         records = calibrated_records(
             list(records), Path(calibration), meta=meta, root=Path(data_root)
         )
-    samples = _samples(records, meta, root=Path(data_root), join=join)
+    samples = create_samples(records, meta, root=Path(data_root), join=join)
     return write_annotations(path, meta, samples, shard=shard, source=source)
 
 
-def _samples(
+def create_samples(
     records: Iterable[Mapping[str, Any]], meta: AnnotationMeta, root: Path, join: bool
 ) -> Iterator[MapSample]:
-    """Yield the samples of records, clipped to the range, and warn of implausible records."""
+    """Yield the samples of records, clipped to the range, and warn of implausible records.
+
+    Args:
+        records: Records as `from_records` takes them.
+        meta: Frame, classes and range of the data.
+        root: Folder that image and LiDAR paths are relative to.
+        join: Whether to join lines of a class whose ends meet.
+
+    Raises:
+        FileNotFoundError: If an image without a given size is missing.
+        ValueError: If a record is malformed.
+    """
     has_warned = False
     empty_tokens = []
     count = 0

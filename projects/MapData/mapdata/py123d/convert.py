@@ -1,6 +1,7 @@
 """Conversion of logs of py123d to an annotation file (pinhole cameras, frame ``ego``)."""
 
 import argparse
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
@@ -8,16 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import CLASSES, RANGES
 from gsmap.datasets.errors import explain_errors
 from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.errors import InputError, WorkError
 from gsmap.utils.files import file_name
 from gsmap.utils.progress import Progress
+from gsmap.utils.shards import add_shard_options
 from mapdata.argoverse2.samples import thin_out
 from mapdata.command_line import FileOptions, add_range_options, options_from, parse_rate
-from mapdata.custom import from_records
+from mapdata.custom import create_samples
 from mapdata.py123d.log import REMEDY, SYNC, Log
 from mapdata.py123d.map import Map
 from mapdata.summary import ConversionSummary
@@ -65,7 +67,7 @@ def convert_py123d(options: Py123dOptions) -> ConversionSummary:
 
     Raises:
         FileNotFoundError: If there is no such split or log.
-        RuntimeError: If no sample is left. Nothing is written then.
+        RuntimeError: If no sample is left (allowed for a shard). Nothing is written then.
         ValueError: If logs differ in the height of the road, or an image is damaged.
     """
     summary = ConversionSummary(options.classes)
@@ -81,6 +83,7 @@ def convert_py123d(options: Py123dOptions) -> ConversionSummary:
         raise WorkError(f"no log is left of {options.split}:\n{summary.text()}")
     data_root = options.data_root or options.root
     target = options.path_of("py123d", options.split)
+    own_logs = options.shard.part(logs)
     meta = options.meta(
         dataset=file_name(f"py123d_{logs[0].metadata.get('dataset')}"),
         frame="ego",
@@ -88,22 +91,22 @@ def convert_py123d(options: Py123dOptions) -> ConversionSummary:
         ground_z_m=_ground_z_m(logs, options.ground_z_m),
         options={"rate_hz": options.rate_hz},
     )
-    with Progress(logs, desc=f"py123d {options.split}", unit="logs") as progress:
+    with Progress(own_logs, desc=f"py123d {options.split}", unit="logs") as progress:
         records = _all_records(progress, options, summary=summary)
         first = next(records, None)
-        if first is None:
+        if first is None and not options.shard.count:
             raise WorkError(f"no sample is left of {options.split}:\n{summary.text()}")
-        from_records(target, _chained(first, records), meta, data_root, join=True)
-    for sample in AnnotationFile(target):
+        all_records = records if first is None else itertools.chain([first], records)
+        samples = create_samples(all_records, meta, root=data_root, join=True)
+        write_annotations(target, meta, samples, shard=options.shard)
+    path = options.shard.path_of(target)
+    for sample in AnnotationFile(path):
         summary.add_sample(options.split, sample)
-    summary.notes.append(f"written to {target}")
+    tables = sorted({table for log in own_logs for table in log.unused_tables})
+    if tables:
+        summary.notes.append(f"not read (cameras, poses and maps are): {', '.join(tables)}")
+    summary.notes.append(f"written to {path}")
     return summary
-
-
-def _chained(first: dict[str, Any], records: Iterator[dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    """Yield the first record and the remaining ones."""
-    yield first
-    yield from records
 
 
 def _find_logs(options: Py123dOptions) -> list[Path]:
@@ -160,8 +163,8 @@ def _all_records(
                 if maps[path].left_out:
                     reason = "map element without a valid geometry left out"
                     summary.add_problem(reason, path.name, count=maps[path].left_out)
-            for name in log.unused_cameras:
-                summary.add_problem("camera left out: it is no pinhole camera", name)
+            for name, reason in log.unused_cameras.items():
+                summary.add_problem(f"camera left out: {reason}", f"{name} of {log.name}")
             records = _records(log, maps.get(path) if path else None, options, summary=summary)
             yield from records
         except (FileNotFoundError, ValueError) as error:
@@ -175,7 +178,7 @@ def _records(
     frames = {}
     for time_ns, rows in log.frames():
         if not rows:
-            raise InputError("it has no pinhole camera")
+            raise InputError("it has no camera that can be used")
         known_rows = {name: row for name, row in rows.items() if row is not None}
         missing = sorted(rows.keys() - known_rows)
         if missing:
@@ -258,6 +261,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--out-dir", type=Path, help="folder of the annotation file (default: the data root)")
     add("--tag", default="", help="suffix of its name, such as _extended")
     add_range_options(parser, RANGES["ego"])
+    add_shard_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> str:

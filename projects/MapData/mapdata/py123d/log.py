@@ -19,6 +19,7 @@ from mapdata.paths import path_below
 from mapdata.py123d.packed import metadata_of
 
 SYNC = "sync.arrow"
+_MAP = Path("map.arrow")  # in the folder of a log
 _EGO = "ego_state_se3"
 REMEDY = "convert the log again with py123d"
 _CAMERA_PREFIX = "camera."
@@ -50,7 +51,7 @@ class Camera:
         image_rows: Number of images.
 
     Raises:
-        ValueError: If the table is damaged, or its images are in a film.
+        ValueError: If the table is damaged.
     """
 
     def __init__(self, path: Path) -> None:
@@ -61,8 +62,6 @@ class Camera:
             self._table = read_table(path, columns=list(columns), memory_map=True)
             self.metadata = metadata_of(self._table)
             self.image_rows = self._table.num_rows
-            if pa.types.is_integer(self._table.schema.field(self._column("data")).type):
-                raise InputError("its images are in a film; py123d must store them as JPEG or PNG")
 
     def _column(self, name: str) -> str:
         return f"{self.key}.{name}"
@@ -73,10 +72,16 @@ class Camera:
         return self._table[self._column(name)][row].as_py()
 
     @property
-    def is_pinhole(self) -> bool:
-        """Whether this is a pinhole camera, possibly with distortion."""
-        has_intrinsics = self.metadata.get("intrinsics") is not None
-        return self.metadata.get("camera_model") == "pinhole" and has_intrinsics
+    def fault(self) -> str:
+        """Reason why the camera cannot be used; empty for a pinhole camera with images."""
+        model = self.metadata.get("camera_model")
+        if model != "pinhole":
+            return f"its model is {model!r:.40}, not 'pinhole'"
+        if self.metadata.get("intrinsics") is None:
+            return "it has no intrinsics"
+        if pa.types.is_integer(self._table.schema.field(self._column("data")).type):
+            return "its images are in a film; py123d must store them as JPEG or PNG"
+        return ""
 
     def time_us(self, row: int) -> int:
         """Time of an image in microseconds."""
@@ -190,7 +195,7 @@ class Log:
         if not isinstance(metadata, dict):
             return None
         if metadata.get("map_is_per_log"):
-            return self.folder / "map.arrow"
+            return self.folder / _MAP
         dataset = str(metadata["dataset"])
         file = f"{dataset}/{dataset}_{metadata['location']}.arrow"
         return path_below(root / "maps", name=file, noun="the map's file")
@@ -224,17 +229,31 @@ class Log:
 
     @cached_property
     def cameras(self) -> list[Camera]:
-        """Pinhole cameras, by name."""
-        return [camera for camera in self._all_cameras if camera.is_pinhole]
+        """Usable cameras, by name."""
+        return [camera for camera in self._all_cameras if camera.name not in self.unused_cameras]
 
     @cached_property
     def _all_cameras(self) -> list[Camera]:
         return [Camera(path) for path in sorted(self.folder.glob(f"{_CAMERA_PREFIX}*.arrow"))]
 
+    @cached_property
+    def unused_cameras(self) -> dict[str, str]:
+        """Reasons why cameras cannot be used, by the names of the cameras."""
+        reasons = {}
+        for camera in self._all_cameras:
+            reason = camera.fault
+            if not reason and camera.key not in self._sync.column_names:
+                reason = f"{SYNC} has no column of it"
+            if reason:
+                reasons[camera.name] = reason
+        return reasons
+
     @property
-    def unused_cameras(self) -> list[str]:
-        """Names of the cameras that are no pinhole cameras."""
-        return [camera.name for camera in self._all_cameras if not camera.is_pinhole]
+    def unused_tables(self) -> list[str]:
+        """Names of the tables that are not read, such as those of LiDAR."""
+        names = {path.stem for path in self.folder.glob("*.arrow")}
+        cameras = {camera.key for camera in self._all_cameras}
+        return sorted(names - cameras - {Path(SYNC).stem, _MAP.stem, _EGO})
 
     def frames(self) -> Iterator[tuple[int, dict[str, int | None]]]:
         """Yield the time in nanoseconds, and the row of each camera's table, of each frame."""
