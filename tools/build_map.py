@@ -184,9 +184,7 @@ def check_options(args: argparse.Namespace, ann: AnnotationFile) -> None:
     origins = {name: find_origin(args, ann, name) for name in set(ann.column("map_name"))}
     if args.crs and args.origin:
         raise InputError("--crs and --origin both say where the poses lie: give one of them.")
-    if any(isinstance(origin, MapOrigin) for origin in origins.values()):
-        positions = np.array([sample.global_from_frame[:2, 3] for sample in ann])
-        require_near(positions, str(args.ann))
+    require_positions(ann, origins.values(), str(args.ann))
     unknown = []
     for name, origin in sorted(origins.items()):
         if origin is None:
@@ -206,6 +204,27 @@ def check_options(args: argparse.Namespace, ann: AnnotationFile) -> None:
         )
     if {"osm", "geojson"} & set(args.formats) and len(unknown) < len(origins):
         import_extra("pyproj", "maps")
+
+
+def require_positions(
+    ann: AnnotationFile, origins: Iterable[MapOrigin | MapGrid | None], where: str
+) -> None:
+    """Check that the positions of samples fit the places of their global frames.
+
+    Args:
+        ann: The samples.
+        origins: Places of the global frames; None is unknown.
+        where: Name of the annotation file, for the message.
+
+    Raises:
+        ValueError: If positions are far from an origin, or outside of a grid.
+    """
+    positions = np.array([sample.global_from_frame[:2, 3] for sample in ann])
+    for origin in set(origins):
+        if isinstance(origin, MapOrigin):
+            require_near(positions, where)
+        elif isinstance(origin, MapGrid):
+            origin.require_inside(positions, where)
 
 
 def require_own_files(args: argparse.Namespace, names: Iterable[str], scored: bool) -> None:

@@ -1,4 +1,5 @@
 import json
+import math
 import sys
 from dataclasses import replace
 
@@ -284,3 +285,28 @@ def test_poses_in_a_grid_lie_where_the_grid_says():
     require_near(np.array([[99_000.0, -5.0]]), "a")
     with pytest.raises(ValueError, match=r"a: positions lie up to 4429 km.*give --crs"):
         require_near(np.array([[500_000.0, 4_429_000.0]]), "a")
+
+
+@pytest.mark.parametrize(
+    ("crs", "position", "is_inside"),
+    [
+        ("EPSG:32650", (500_000.0, 4_429_000.0), True),
+        ("EPSG:32650", (100.0, 200.0), False),  # at the equator, west of the zone
+        ("EPSG:25832", (900_000.0, 5_800_000.0), True),  # maps of a country leave the zone
+        ("EPSG:2056", (2_600_000.0, 1_200_000.0), True),
+        ("EPSG:2056", (10.0, -10.0), False),
+        ("EPSG:3857", (10.0, 10.0), True),
+        ("EPSG:32650", (1e12, 0.0), False),
+        ("EPSG:32650", (math.nan, 0.0), False),
+    ],
+)
+def test_local_positions_are_no_coordinates_of_a_grid(crs, position, is_inside):
+    pytest.importorskip("pyproj", reason="pip install -e .[maps]")
+    positions = np.array([position])
+    if is_inside:
+        MapGrid(crs).require_inside(positions, "a")
+        return
+    with pytest.raises(
+        ValueError, match=rf"a: the position .* outside of .*{crs}.*give its --orig"
+    ):
+        MapGrid(crs).require_inside(positions, "a")

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from processes import run_python
 
-from gsmap.utils.cli import output_file, run_command
+from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.errors import InputError, InputTypeError, NotFiniteError, WorkError
 from gsmap.utils.files import atomic_write, read_json, read_text, write_text
 from gsmap.utils.parallel import ordered_map
@@ -225,7 +225,7 @@ cli.run_command(command)
 def test_kill_runs_the_clean_up_where_that_is_wanted(clean_up_on_kill, code, left, tmp_path):
     program = f"""
 import time
-from gsmap.utils.cli import output_file, run_command
+from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.errors import InputError, InputTypeError, NotFiniteError, WorkError
 from gsmap.utils.files import atomic_write
 def command():
@@ -326,3 +326,25 @@ run_command(command, clean_up_on_kill=False)
             os.killpg(process.pid, signal.SIGINT)
             assert process.wait() == 130
             assert process.stderr.read() == said
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["chekc"], "invalid choice: 'chekc' (choose from 'check'); did you mean 'check'?"),
+        (["check", "--data-rot", "x"], "--data-rot x; did you mean '--data-root'?"),
+        (["check", "-q", "--data-rot=5"], "-q --data-rot=5; did you mean '--data-root'?"),
+        (["--formats", "geojsn"], "; did you mean 'geojson'?"),
+        (["check", "--level", "3"], "invalid choice: 3 (choose from 1, 2)\n"),
+        (["check", "-q"], "unrecognized arguments: -q\n"),
+    ],
+)
+def test_similar_options_and_choices_are_named(words, message, capsys):
+    parser = CommandParser()
+    parser.add_argument("--formats", choices=("osm", "geojson"), nargs="+")
+    subparser = parser.add_subparsers(dest="command").add_parser("check")
+    subparser.add_argument("--data-root")
+    subparser.add_argument("--level", type=int, choices=(1, 2))
+    with pytest.raises(SystemExit, match="2"):
+        parser.parse_args(words)
+    assert message in capsys.readouterr().err

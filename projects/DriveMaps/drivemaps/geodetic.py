@@ -129,6 +129,39 @@ class MapGrid:
                 "such as EPSG:32650."
             )
 
+    def require_inside(self, positions: FloatArray, where: str) -> None:
+        """Check that positions are coordinates of the grid.
+
+        Positions near the origin of the grid and outside of its area are probably metres from
+        another origin.
+
+        Args:
+            positions: Positions of the vehicle in the global frame. (n, >= 2)
+            where: Name of their file, for the message.
+
+        Raises:
+            ValueError: If all coordinates are within 100 km and a position is outside of the area,
+                or if a position has no longitude and latitude.
+        """
+        points = np.asarray(positions)[:, :2]
+        system = import_extra("pyproj", "maps").CRS.from_user_input(self.crs)
+        lon_deg, lat_deg = self.lon_lat(points).T
+        is_wrong = ~(np.isfinite(lon_deg) & np.isfinite(lat_deg))
+        area = system.area_of_use
+        if area is not None and np.abs(points).max(initial=0.0) <= _FARTHEST_M:
+            with np.errstate(invalid="ignore"):  # infinite where there is no longitude
+                from_west_deg = (lon_deg - area.west) % 360.0
+            width_deg = (area.east - area.west) % 360.0 or 360.0  # of the whole Earth
+            is_wrong |= from_west_deg > width_deg
+            is_wrong |= (lat_deg < area.south) | (lat_deg > area.north)
+        if is_wrong.any():
+            x, y = points[is_wrong.argmax()]
+            raise InputError(
+                f"{where}: the position {x:.0f} {y:.0f} is outside of the area of {self.crs} "
+                f"({system.name}): if positions are metres from a place, give its --origin LAT LON "
+                "instead of --crs."
+            )
+
     @cached_property
     def _transformer(self) -> Any:
         """Transformation from the grid to longitude and latitude."""

@@ -19,7 +19,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
 
-from gsmap.utils.faults import user_message
+from gsmap.utils.faults import suggestion, user_message
 from gsmap.utils.handover import report_lost_batches
 from gsmap.utils.inputs import declare_files, protect_inputs
 from gsmap.utils.interrupt import INTERRUPTED_TEXT, is_first_rank
@@ -77,6 +77,31 @@ class CommandParser(argparse.ArgumentParser):
         overrides = getattr(namespace, "cfg_options", None)
         declare_overrides(overrides if isinstance(overrides, dict) else {})
         return namespace, rest
+
+    def error(self, message: str) -> NoReturn:
+        """Print the usage and a message, with the most similar option or choice, and exit."""
+        match = re.fullmatch(r"unrecognized arguments: .*?(--[\w-]+).*", string=message, flags=re.S)
+        if match:
+            message += suggestion(match[1], self._option_names())
+        super().error(message)
+
+    def _option_names(self) -> list[str]:
+        """Names of the options of the command and its subcommands."""
+        names = list(self._option_string_actions)
+        for action in self._actions:
+            if isinstance(action, argparse._SubParsersAction):
+                for subparser in action.choices.values():
+                    names += subparser._option_string_actions
+        return names
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        """Raise an error with the most similar choice if a value is none of the choices."""
+        try:
+            super()._check_value(action, value)
+        except argparse.ArgumentError as error:
+            choices = [str(choice) for choice in action.choices or ()]
+            error.message += suggestion(str(value), choices)
+            raise
 
 
 def _has_nan(value: Any) -> bool:
