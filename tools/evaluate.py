@@ -22,6 +22,7 @@ import sys
 import time
 from importlib import import_module
 from pathlib import Path
+from typing import NamedTuple
 
 from scoring.analyses import (
     change_report,
@@ -37,6 +38,7 @@ from scoring.options import parse_args
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import CLASSES, RANGES
+from gsmap.datasets.errors import explain_errors
 from gsmap.evaluation.core.chamfer_ap import HARD_CHAMFER_THRESHOLDS
 from gsmap.evaluation.core.evaluator import MapEvaluator
 from gsmap.evaluation.core.file_evaluation import (
@@ -47,6 +49,7 @@ from gsmap.evaluation.core.file_evaluation import (
 from gsmap.evaluation.core.match_files import require_own_matches, write_matches
 from gsmap.evaluation.core.metric import MetricSettings, metric_class, metric_files
 from gsmap.evaluation.core.report import MetricReport, format_table, write_figures
+from gsmap.evaluation.core.results_json import GROUND_TRUTH_KEY, read_leading_meta
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.cli import run_command
@@ -60,17 +63,52 @@ from gsmap.utils.words import format_count
 PRINTED = ("intervals", "by", "uncertainty", "changes")
 
 
+class TruthSettings(NamedTuple):
+    """Settings that a ground-truth file describes.
+
+    Attributes:
+        classes: Names of the classes, in label order.
+        x_range: Smallest and largest x in metres.
+        y_range: Smallest and largest y in metres.
+    """
+
+    classes: tuple[str, ...]
+    x_range: tuple[float, float]
+    y_range: tuple[float, float]
+
+
+def json_settings(path: Path) -> TruthSettings:
+    """Settings of ground truth in JSON: those of its ``meta``, or nuScenes' where it has none.
+
+    Args:
+        path: Ground truth, such as ``create_data.py export`` writes it.
+
+    Raises:
+        FileNotFoundError: If the file does not exist.
+        ValueError: If the file has no ground truth, or its classes or its range are malformed.
+    """
+    meta = read_leading_meta(path, GROUND_TRUTH_KEY)
+    x_range, y_range = RANGES["lidar"]
+    with explain_errors(f"meta of {path}", "correct it, or remove it"):
+        classes = meta.get("classes", CLASSES)
+        if not isinstance(classes, (list, tuple)) or not all(isinstance(c, str) for c in classes):
+            raise InputError(f"classes must be a list of names, got {classes!r:.80}")
+        low_x, high_x = meta.get("x_range", x_range)
+        low_y, high_y = meta.get("y_range", y_range)
+        grid = BEVGrid((low_x, high_x), (low_y, high_y))
+    return TruthSettings(tuple(classes), x_range=grid.x_range, y_range=grid.y_range)
+
+
 def metric_settings(args: argparse.Namespace) -> MetricSettings:
     """Rules of the metrics, from the options and the annotation file."""
     if args.ground_truth.suffix.lower() == ".json":
-        classes = CLASSES
-        x_range, y_range = RANGES["lidar"]
+        described = json_settings(args.ground_truth)
     else:
         meta = AnnotationFile(args.ground_truth).meta
-        classes = meta.classes
-        x_range = meta.x_range
-        y_range = meta.y_range
-    classes = tuple(args.classes or classes)
+        described = TruthSettings(meta.classes, x_range=meta.x_range, y_range=meta.y_range)
+    classes = tuple(args.classes or described.classes)
+    x_range = described.x_range
+    y_range = described.y_range
     for name in args.polygon_classes:
         if name not in classes and name not in AREA_CLASSES:
             hint = suggestion(name, classes)
@@ -173,7 +211,7 @@ def match_shard(args: argparse.Namespace, evaluator: MapEvaluator, settings: Met
         source = digest_of_common(read_shard(results_shard))
     pairs = open_pairs(args, results, classes=evaluator.classes)
     matches = list(match_samples(pairs, evaluator, args.workers))
-    notes = pairs.notes(evaluator.counts_heights)
+    notes = pairs.notes(evaluator.counts_heights, evaluator.canvas)
     source += digest(args.ground_truth)
     path = write_matches(
         args.out,

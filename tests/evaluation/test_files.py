@@ -14,6 +14,7 @@ from gsmap.datasets.annotations.record import AnnotationMeta, MapInstance, MapSa
 from gsmap.evaluation.core.file_evaluation import evaluate_files, read_ground_truth
 from gsmap.evaluation.core.results_json import read_samples, vectors_of, write_results
 from gsmap.structures.elements import MapElements
+from mapdata.vectors_json import write_vectors
 
 REPO = Path(__file__).resolve().parents[2]
 LABELS = {name: i for i, name in enumerate(CLASSES)}
@@ -345,3 +346,78 @@ def test_results_of_a_model_of_another_split_are_refused_unless_allowed(tmp_path
         write_results(results, results_of(4), {name: hostile})
         with pytest.raises(ValueError, match="split_list must be a name with a digest"):
             evaluate_files(results, truth, EVALUATOR)
+
+
+EGO_LINES = {
+    "divider": [[-28.0, 1.0], [28.0, 1.0]],
+    "ped_crossing": [[20.0, -4.0], [24.0, -4.0], [24.0, 4.0], [20.0, -4.0]],
+    "centerline": [[-30.0, -2.0], [30.0, -2.0]],
+}
+
+
+def write_ego_truth(folder: Path) -> tuple[Path, Path, Path]:
+    """Results equal to the ground truth, the annotation file, and its export, in frame `ego`."""
+    classes = tuple(EGO_LINES)
+    meta = AnnotationMeta(
+        dataset="own", frame="ego", split="val", classes=classes, x_range=(-30.0, 30.0),
+        y_range=(-15.0, 15.0), ground_z_m=0.0, command="",
+    )  # fmt: skip
+    instances = [
+        MapInstance(label=label, points=np.array(points))
+        for label, points in enumerate(EGO_LINES.values())
+    ]
+    write_annotations(folder / "val.arrow", meta, [MapSample("t0", instances=instances)])
+    write_vectors([folder / "val.arrow"], folder / "val.json")
+    vectors = [vector(points, name, 0.9) for name, points in EGO_LINES.items()]
+    write_results(folder / "results.json", [("t0", vectors)])
+    return folder / "results.json", folder / "val.arrow", folder / "val.json"
+
+
+def test_an_export_has_the_classes_and_the_range_of_its_file(tmp_path, capsys):
+    """A crossing 20 m ahead in frame `ego` is outside of nuScenes' canvas of 15 m."""
+    results, annotations, export = write_ego_truth(tmp_path)
+    figures = []
+    for truth in (annotations, export):
+        out = tmp_path / f"{truth.name}.figures"
+        command()([str(results), str(truth), "--out", str(out)])
+        figures.append(json.loads(out.read_text()))
+    assert figures[0] == figures[1]
+    assert figures[0]["raster/mAP"] == figures[0]["chamfer/mAP"] == 1.0
+    assert figures[0]["raster/centerline/AP"] == 1.0
+    assert "note:" not in capsys.readouterr().out
+
+
+def test_ground_truth_outside_of_the_canvas_is_noted(tmp_path, capsys):
+    results, _, export = write_ego_truth(tmp_path)
+    content = json.loads(export.read_text())
+    del content["meta"]  # as MapTR writes it
+    export.write_text(json.dumps(content))
+    note = (
+        "note: ground truth reaches x -30 to 30 and y -4 to 4 m, and the canvas of raster metrics "
+        "is x -15 to 15 and y -30 to 30 m: they do not count parts outside (--range)"
+    )
+    command()([str(results), str(export)])
+    assert note in capsys.readouterr().out
+    for words in (["--range", "-30", "-15", "30", "15"], ["--eval", "chamfer"]):
+        command()([str(results), str(export), *words])
+        assert "ground truth reaches" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ({"classes": "divider"}, "classes must be a list of names"),
+        ({"classes": [1]}, "classes must be a list of names"),
+        ({"x_range": [30, -30]}, "x_range must be"),
+        ({"x_range": [30]}, "meta of .*val.json"),
+        ({"y_range": ["a", "b"]}, "meta of .*val.json"),
+        ({"y_range": None}, "meta of .*val.json"),
+    ],
+)
+def test_a_malformed_description_of_ground_truth_is_refused(entry, message, tmp_path):
+    results, _, export = write_ego_truth(tmp_path)
+    content = json.loads(export.read_text())
+    content["meta"] |= entry
+    export.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=message):
+        command()([str(results), str(export)])

@@ -73,7 +73,7 @@ class Camera:
 
     @property
     def fault(self) -> str:
-        """Reason why the camera cannot be used; empty for a pinhole camera with images."""
+        """Fault of the camera; empty for a pinhole camera with images."""
         model = self.metadata.get("camera_model")
         if model != "pinhole":
             return f"its model is {model!r:.40}, not 'pinhole'"
@@ -238,7 +238,7 @@ class Log:
 
     @cached_property
     def unused_cameras(self) -> dict[str, str]:
-        """Reasons why cameras cannot be used, by the names of the cameras."""
+        """Faults of the cameras that are left out, by the names of the cameras."""
         reasons = {}
         for camera in self._all_cameras:
             reason = camera.fault
@@ -250,7 +250,7 @@ class Log:
 
     @property
     def unused_tables(self) -> list[str]:
-        """Names of the tables that are not read, such as those of LiDAR."""
+        """Names of the tables that are not read, such as LiDAR."""
         names = {path.stem for path in self.folder.glob("*.arrow")}
         cameras = {camera.key for camera in self._all_cameras}
         return sorted(names - cameras - {Path(SYNC).stem, _MAP.stem, _EGO})

@@ -18,6 +18,7 @@ from gsmap.evaluation.core.metric import (
 )
 from gsmap.evaluation.core.report import MetricReport, flat_metrics
 from gsmap.structures.elements import MapElements
+from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import resample_all
 from gsmap.utils.errors import InputError
 
@@ -115,6 +116,15 @@ class MapEvaluator:
     def reset(self) -> None:
         """Remove all samples."""
         self._matches.clear()
+
+    @property
+    def canvas(self) -> BEVGrid | None:
+        """Canvas of the first metric that draws elements; None if there is no such metric."""
+        for metric in self.metrics:
+            grid = getattr(metric, "grid", None)
+            if isinstance(grid, BEVGrid):
+                return grid
+        return None
 
     @property
     def classes(self) -> tuple[str, ...]:

@@ -17,6 +17,7 @@ from gsmap.evaluation.core.metric import Sample
 from gsmap.evaluation.core.report import MetricReport
 from gsmap.evaluation.core.results_json import GROUND_TRUTH_KEY, RESULTS_KEY, THREE_D, SampleFile
 from gsmap.structures.elements import MapElements
+from gsmap.structures.grid import BEVGrid
 from gsmap.utils.errors import InputError
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
@@ -24,6 +25,7 @@ from gsmap.utils.shards import WHOLE, Shard
 from gsmap.utils.split_lists import require_results_of
 from gsmap.utils.words import format_count
 
+_CANVAS_TOLERANCE_M = 0.5  # by which ground truth may leave a canvas without a note
 CHUNK = 64  # samples per task: few tasks to hand over, and evenly distributed
 Evaluation = tuple[list[MetricReport], list[str]]
 """Reports of all metrics, and notes on ignored elements, heights and samples."""
@@ -211,6 +213,8 @@ class SamplePairs:
             self._other_shards = set(tokens).difference(shard.part(tokens))
         self._mismatches: list[str] = []
         self._degenerate = 0
+        self._low = np.full(2, np.inf)  # bounds of the ground truth
+        self._high = np.full(2, -np.inf)
 
     def __iter__(self) -> Iterator[Sample]:
         """Yield token, predictions and ground truth of each sample.
@@ -268,15 +272,20 @@ class SamplePairs:
         return self._results.about
 
     def _pair(self, token: str, predictions: MapElements, truth: MapElements) -> Sample:
-        """Create a sample, and count its ground truths of fewer than two points."""
+        """Create a sample; counts ground truths of fewer than two points, and tracks bounds."""
         self._degenerate += int((truth.num_points < 2).sum())
+        if len(truth.points):
+            points = np.asarray(truth.points)[:, :2]
+            self._low = np.minimum(self._low, points.min(axis=0))
+            self._high = np.maximum(self._high, points.max(axis=0))
         return Sample(token, predictions, truth)
 
-    def notes(self, counts_heights: bool) -> list[str]:
-        """Return notes on ignored elements, heights and samples, after iterating.
+    def notes(self, counts_heights: bool, canvas: BEVGrid | None = None) -> list[str]:
+        """Return notes on ignored elements, heights, range and samples, after iterating.
 
         Args:
             counts_heights: Whether a metric uses heights.
+            canvas: Canvas of a metric that draws elements.
         """
         notes = list(self._mismatches)
         ignored_predictions = Counter(self._results.ignored)
@@ -291,11 +300,32 @@ class SamplePairs:
                 f"{self._degenerate} ground truths have fewer than two points: they count, but no "
                 "prediction can match them"
             )
+        if canvas is not None:
+            notes += self._canvas_notes(canvas)
         for name, number in sorted(ignored_predictions.items()):
             notes.append(f"{number} predictions of class {name!r} are not scored")
         for name, number in sorted(ignored_truth.items()):
             notes.append(f"{number} ground truths of class {name!r} are not scored")
         return notes
+
+    def _canvas_notes(self, canvas: BEVGrid) -> list[str]:
+        """Return a note if the ground truth leaves a canvas."""
+        low = np.array([canvas.x_range[0], canvas.y_range[0]])
+        high = np.array([canvas.x_range[1], canvas.y_range[1]])
+        is_outside = (self._low < low - _CANVAS_TOLERANCE_M).any()
+        is_outside |= (self._high > high + _CANVAS_TOLERANCE_M).any()
+        if not is_outside:
+            return []
+        truth_range = _range_text(self._low, self._high)
+        return [
+            f"ground truth reaches {truth_range}, and the canvas of raster metrics is "
+            f"{_range_text(low, high)}: they do not count parts outside (--range)"
+        ]
+
+
+def _range_text(low: np.ndarray, high: np.ndarray) -> str:
+    """Text of a rectangle in metres."""
+    return f"x {low[0]:.0f} to {high[0]:.0f} and y {low[1]:.0f} to {high[1]:.0f} m"
 
 
 def _load(side: Any, token: str, pending: Any) -> MapElements:
@@ -339,7 +369,7 @@ def evaluate_files(
     )
     matches = match_samples(pairs, evaluator, num_workers=num_workers)
     reports = evaluator.reports(matches)
-    return reports, pairs.notes(evaluator.counts_heights)
+    return reports, pairs.notes(evaluator.counts_heights, evaluator.canvas)
 
 
 def match_samples(

@@ -9,7 +9,7 @@ import heapq
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -264,6 +264,28 @@ def _points_of(vector: Mapping[str, Any]) -> Any:
     if not isinstance(curve["degree"], int):
         raise TypeError(f"the degree {curve['degree']!r:.20} is no whole number")
     return curve_points(curve["pts"], degree=curve["degree"]).tolist()
+
+
+def read_leading_meta(path: Path, key: str) -> dict[str, Any]:
+    """Read the metadata before the samples of a file. It is not validated.
+
+    Args:
+        path: Path of the file.
+        key: Key of the samples: ``results`` or ``GTs``.
+
+    Returns:
+        Metadata, empty if there is none before the samples.
+
+    Raises:
+        FileNotFoundError: If the file does not exist.
+        ValueError: If the file has no list under the key.
+    """
+    other_entries: dict[str, Any] = {"meta": None}  # `items_of` fills it
+    advice = f'it must be {{"{key}": [...]}}'
+    with closing(items_of(path, key, advice, other_entries)) as items:
+        next(items, None)
+    meta = other_entries["meta"]
+    return meta if isinstance(meta, dict) else {}
 
 
 def read_samples(
