@@ -1,6 +1,7 @@
 """Where a model's frame lay in the vehicle of its training: at inference it lies there, too."""
 
 import logging
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +17,9 @@ from scipy.spatial.transform import Rotation
 
 import gsmap.registered  # noqa: F401
 from gsmap.apis.export import ExportedDetector, graph_metadata
+from gsmap.apis.loading import load_model
 from gsmap.apis.map_inferencer import MapInferencer
+from gsmap.checkpoints.named_models import checkpoint_for
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta
 from gsmap.datasets.source import Mount, change_frame, ground_from_frame
@@ -256,6 +259,19 @@ def test_models_of_generated_streets_say_so_once_on_other_recordings(tmp_path, c
         inferencer.dataset(tmp_path / "mine.arrow")
         inferencer.dataset(open_input(tmp_path / "mine.arrow"))
     assert caplog.text.count("the model has seen generated streets alone (MiniCity)") == 1
+
+
+@pytest.mark.parametrize("copied", [False, True])
+def test_the_file_of_a_model_that_ships_is_of_generated_streets(copied, tmp_path):
+    """Commands give the weights by their path."""
+    path = checkpoint_for("gsmap_r18_minicity", None)
+    if copied:
+        path = Path(shutil.copy(path, tmp_path))
+    model = load_model("gsmap_r18_minicity", path)
+    assert model.training_dataset == "minicity"
+    renamed = path if not copied else path.rename(tmp_path / "mine.pth")
+    known = load_model("gsmap_r18_minicity", renamed).training_dataset
+    assert known == ("" if copied else "minicity")
 
 
 def test_models_of_generated_streets_say_so_once_of_images_in_memory(caplog):

@@ -112,11 +112,12 @@ def _training_dataset(contents: Checkpoint | None, name: object) -> str:
 
     Args:
         contents: Contents of the checkpoint; None for initial weights.
-        name: Path of the checkpoint, or name of a model. Models that ship are trained on MiniCity.
+        name: Path of the checkpoint, or name of a model. Models that ship are trained on MiniCity;
+            a file with the name of one is a copy of it.
     """
     if contents is None:
         return ""
-    model = named_models().get(str(name))
+    model = named_models().get(Path(str(name)).name.removesuffix(".pth"))
     default = "minicity" if model is not None and not model.address else ""
     return str(contents.dataset_meta.get("dataset", default))
 
