@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from gsmap.datasets.annotations.file import check_samples
-from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord, MapSample
+from gsmap.datasets.annotations.record import RANGES, AnnotationMeta, CameraRecord, MapSample
 from gsmap.datasets.source import Mount, Source, sample_in_vehicle
 from gsmap.utils.errors import InputError, InputTypeError
 
@@ -52,6 +52,9 @@ def source_in_memory(
         ValueError: If an array has another shape, a matrix is not a valid calibration, or the
             arguments have different cameras.
     """
+    frames = (VEHICLE, *RANGES)
+    if frame not in frames:
+        raise InputError(f"frame must be one of {frames}, got {frame!r}.")
     intrinsics = _by_name(intrinsics)
     cam_from_frame = _by_name(cam_from_frame)
     _require_cameras("intrinsics", values=intrinsics, names=list(images))
