@@ -16,6 +16,8 @@ TARGETS = (
     {"pieces": [2, 2, 2], "degrees": [1, 2, 3], "pixel_m": 0.46875},
 )
 
+TRANSFORM_CASES = {"FormatBezierTargets": {"adds": {"gt_instances_3d"}, "needs_truth": True}}
+
 ANY_NUMBER = True  # lines have no equal numbers of points
 
 

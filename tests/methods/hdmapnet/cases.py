@@ -7,6 +7,10 @@ TARGETS = (
 
 LOSSES = ("pts", ("loss_pull",))  # embeddings of an element that are alike already
 
+TRANSFORM_CASES = {
+    "MakeLineMaps": {"adds": {"gt_lines", "gt_directions"}, "needs_truth": True},
+}
+
 ANY_NUMBER = True  # lines have no equal numbers of points
 
 

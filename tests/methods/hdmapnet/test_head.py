@@ -207,7 +207,6 @@ def test_the_border_of_a_map_counts_as_outside():
         (lambda: MakeLineMaps(step_m=0), "step_m must be more than 0"),
         (lambda: MakeLineMaps(num_directions=7), "num_directions must divide 360"),
         (lambda: sample([MapInstance(2, LINES[0].points)]), "label 2 of an element"),
-        (lambda: sample(None), "'token-0' has no ground truth"),
         (lambda: encoder().transform_views(torch.zeros(1, 3, 1, 2, 4)), "built for 2 cameras"),
         (lambda: head().target(Det3DDataSample(), "gt_lines"), "put MakeLineMaps into"),
         (lambda: head(pixel_m=0.6).target(sample([]), "gt_lines"), "the head's maps are"),

@@ -20,6 +20,8 @@ LOSSES = ("num_pts", ())  # field of the ground truth; losses that may be zero
 
 PROFILES = ("pivotnet/pivotnet_r18_minicity", ("192", "320"))  # the size of its positions
 
+TRANSFORM_CASES = {"FormatPivotTargets": {"adds": {"gt_instances_3d"}, "needs_truth": True}}
+
 ANY_NUMBER = True  # lines have no equal numbers of points
 
 

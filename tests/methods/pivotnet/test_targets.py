@@ -53,8 +53,7 @@ def test_lines_across_start_at_the_right():
     assert orient_line(across, 1.0).tolist() == across[::-1].tolist()
 
 
-def test_no_element_and_elements_that_cannot_be():
-    assert len(targets().labels_3d) == 0
+def test_elements_and_settings_that_cannot_be():
     with pytest.raises(ValueError, match="label 3 of an element"):
         targets(MapInstance(3, np.array([[0.0, 0], [0, 9]])))
     with pytest.raises(ValueError, match="num_points must be >= 2"):
@@ -64,8 +63,6 @@ def test_no_element_and_elements_that_cannot_be():
     for name in ("pixel_m", "step_m", "thickness_px"):
         with pytest.raises(ValueError, match=f"{name} must be more than 0, got 0"):
             FormatPivotTargets(**{name: 0})
-    with pytest.raises(ValueError, match="leave FormatPivotTargets out"):
-        FormatPivotTargets().transform({"map_instances": None, "token": "a"})
 
 
 def test_the_matching_by_hand_and_too_few_points():

@@ -91,6 +91,11 @@ EXPORT_CLASS_FACTOR = 0.003  # shaken states that no norm ends make every score 
 
 TARGETS = ({"canvas": {"margin_m": 3.0}}, {"margin_m": 3.0})
 
+TRANSFORM_CASES = {
+    "FormatPolylineTargets": {"changes": {"gt_instances_3d"}, "needs_truth": True},
+    "StretchToPadding": {"changes": {"lidar2img", "img_aug_matrix"}},
+}
+
 ANY_NUMBER = True  # lines have no equal numbers of points
 
 

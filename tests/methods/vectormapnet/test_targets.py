@@ -62,13 +62,6 @@ def test_corners_stay_off_the_border():
     assert (found.keypoint_tokens >= 0).all()
 
 
-def test_no_element_gives_empty_targets():
-    found = transformed()
-    assert found.keypoints.shape == found.keypoint_tokens.shape == (0, 4)
-    assert len(found.tokens) == len(found.token_weights) == len(found.pts) == 0
-    assert found.tokens.dtype == torch.int64
-
-
 def test_behind_maptrs_targets_both_are_there():
     results = {
         "map_instances": [], "token": "a", "x_range": GRID.x_range, "y_range": GRID.y_range,
@@ -81,8 +74,6 @@ def test_behind_maptrs_targets_both_are_there():
 
 
 def test_what_does_not_fit_is_refused():
-    with pytest.raises(ValueError, match="leave FormatPolylineTargets out"):
-        FormatPolylineTargets().transform({"map_instances": None, "token": "b"})
     with pytest.raises(ValueError, match="must not be negative"):
         FormatPolylineTargets(tolerance_m=-1.0)
     with pytest.raises(ValueError, match="margin_m must be >= 0"):

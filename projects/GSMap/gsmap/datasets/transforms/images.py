@@ -172,10 +172,12 @@ class ScaleImages(BaseTransform):
             results["img"] = step.on_host(cropped_images)
         else:
             take_step(results, step)
-        for view, (height, width) in enumerate(raw_shapes):
-            matrix = np.diag([size[0] / width, size[1] / height, 1.0, 1.0])
-            for key in ("lidar2img", "img_aug_matrix"):
-                results[key][view] = matrix @ results[key][view]
+        scalings = []
+        for height, width in raw_shapes:
+            scalings.append(np.diag([size[0] / width, size[1] / height, 1.0, 1.0]))
+        for key in ("lidar2img", "img_aug_matrix"):
+            pairs = zip(scalings, results[key], strict=True)
+            results[key] = [scaling @ projection for scaling, projection in pairs]
         results["raw_shapes"] = [size[::-1]] * len(results["img"])
         results["img_shape"] = results["pad_shape"] = size[::-1]
         return results

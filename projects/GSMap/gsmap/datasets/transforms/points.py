@@ -151,11 +151,12 @@ class PointsToFrame(BaseTransform):
         """Apply ``lidar2frame`` to ``points``."""
         matrix = results["lidar2frame"]
         if not np.array_equal(matrix, np.eye(4)):
-            points = results["points"].tensor
-            frame_from_lidar = torch.as_tensor(matrix, dtype=points.dtype)
+            points = results["points"].clone()
+            frame_from_lidar = torch.as_tensor(matrix, dtype=points.tensor.dtype)
             rotation = frame_from_lidar[:3, :3]
             shift = frame_from_lidar[:3, 3]
-            points[:, :3] = points[:, :3] @ rotation.T + shift
+            points.tensor[:, :3] = points.tensor[:, :3] @ rotation.T + shift
+            results["points"] = points
         return results
 
 
