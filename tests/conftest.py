@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import HealthCheck, settings
+from parsed_configs import keep_parsed_configs
 
 import gsmap  # noqa: F401 - before mmcv.ops, which may need its stand-in
 
@@ -25,6 +26,7 @@ settings.register_profile(
     "steady", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.load_profile("steady")
+keep_parsed_configs()
 
 TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None)
 STATM = Path("/proc/self/statm")

@@ -2,11 +2,12 @@
 
 from pathlib import Path
 
+from method_cases import cases_of_methods
 from mmengine.config import Config
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 MINICITY = "_base_/datasets/minicity"
-DEPTH_AND_MASKS = "maptrv2/maptrv2_r50_24e"
+DEPTH_AND_MASKS = next(iter(cases_of_methods("DEPTH_AND_MASKS").values()), "")
 SWEEPS = "maptr/maptr_r50_pointpillars_24e"
 
 

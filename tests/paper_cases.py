@@ -8,6 +8,7 @@ from mmdet3d.registry import MODELS
 from mmengine.config import Config
 from mmengine.registry import init_default_scope
 from torch import nn
+from unset_weights import unset_weights
 
 import gsmap.registered  # noqa: F401
 from gsmap.engine.launch import check_config, read_config
@@ -28,7 +29,8 @@ def head_of(name: str) -> nn.Module:
     init_default_scope("mmdet3d")
     cfg = load(name)
     shared = {"grid": BEVGrid(**cfg.grid), "classes": cfg.classes}
-    return MODELS.build({**shared, **cfg.model.map_head})
+    with unset_weights():
+        return MODELS.build({**shared, **cfg.model.map_head})
 
 
 def require_target(config: str, transform: str, kind: str) -> None:

@@ -25,7 +25,7 @@ MOST = 8
 MORE = {
     # the rules of ground truth on Argoverse 2 (``--compat``), a form of info files and upstream
     # configs have its name
-    "maptrv2": 29,
+    "maptrv2": 15,
     # AP_raster and upstream configs are its own; the paper of GSMap compares with it
     "mapvr": 11,
 }

@@ -3,25 +3,20 @@
 from dataclasses import asdict, replace
 
 import pytest
-import torch
 from mmdet3d.registry import MODELS
 from mmengine.optim import build_optim_wrapper
 from released_settings import REPO, released, settings_of
 from test_configs import load
+from unset_weights import unset_weights
 
 from gsmap.models.encoders.gkt import GeometryKernelAttention
 from gsmap.structures.grid import BEVGrid
 
-NEEDS_VALUES = ("mmdet.SwinTransformer", "mmdet.EfficientNet", "GSMapHead")  # when it is built
-
 
 @pytest.mark.parametrize("name", released(), ids=lambda name: name.rpartition("/")[2])
 def test_settings_are_those_of_the_release(name):
-    """Without the values of weights: models are built on the device that has none."""
     cfg = load(REPO / name)
-    kinds = {cfg.model.img_backbone.type, cfg.model.map_head.type}
-    device = "cpu" if kinds & set(NEEDS_VALUES) else "meta"
-    with torch.device(device):
+    with unset_weights():
         model = MODELS.build(cfg.model).train()
     groups = build_optim_wrapper(model, cfg.optim_wrapper).optimizer.param_groups
     found, wanted = asdict(settings_of(cfg, model, groups)), asdict(released()[name])
@@ -35,7 +30,7 @@ def test_the_table_notices_a_change():
     name = "configs/maptr/maptr_r50_24e.py"
     cfg = load(REPO / name)
     cfg.optim_wrapper.paramwise_cfg.custom_keys.pop("img_backbone")
-    with torch.device("meta"):
+    with unset_weights():
         model = MODELS.build(cfg.model).train()
     groups = build_optim_wrapper(model, cfg.optim_wrapper).optimizer.param_groups
     found = settings_of(cfg, model, groups)

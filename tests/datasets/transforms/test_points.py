@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 import torch
 from argoverse2_road import SPEED_M_S, START_NS, SWEEP_EVERY_NS, write_log
+from method_cases import cases_of_methods
 from mmdet3d.registry import DATASETS
 from mmdet3d.structures import LiDARPoints
 from mmengine.config import Config
@@ -27,7 +28,8 @@ from mapdata.argoverse2.convert import convert_argoverse2
 from mapdata.argoverse2.log import RING_CAMERAS
 from mapdata.argoverse2.samples import Argoverse2Options
 
-CONFIG = Path(__file__).resolve().parents[3] / "configs/maptrv2/maptrv2_r50_av2_depth_6e.py"
+REPO = Path(__file__).resolve().parents[3]
+CONFIG = next(iter(cases_of_methods("ARGOVERSE2_DEPTH").values()), "")
 GROUND_Z_M = -0.25  # exact in float16
 LOAD = {"coord_type": "LIDAR", "load_dim": 5, "use_dim": 5}
 
@@ -64,10 +66,10 @@ def write_files(log: Path) -> None:
 
 
 def depth_data(root: Path, **options) -> torch.utils.data.Dataset:
-    """Convert a root and open it with the data set of MapTRv2 with depth."""
+    """Convert a root and open it with the data set of a model with depth."""
     init_default_scope("mmdet3d")
     convert_argoverse2(Argoverse2Options(root, rate_hz=None, **options))
-    config = Config.fromfile(CONFIG).train_dataloader.dataset
+    config = Config.fromfile(REPO / CONFIG).train_dataloader.dataset
     config.update(data_root=str(root), ann_file="gsmap_av2_val.arrow", split="val", rate_hz=None)
     return DATASETS.build(config)
 

@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Iterator
+from functools import cache
 from typing import Any
 
 from mmdet3d.registry import MODELS, TRANSFORMS
@@ -85,8 +86,12 @@ def _class_names(cls: type) -> set[str]:
     return {base.__name__ for base in cls.__mro__}
 
 
+@cache
 def _defaults(cls: type | None) -> dict[str, Any]:
-    """Return the default values of a class's constructor arguments, including its base classes."""
+    """Return the default values of a class's constructor arguments, including its base classes.
+
+    The result is shared by all calls and must not be changed.
+    """
     defaults: dict[str, Any] = {}
     if cls is None:
         return defaults
