@@ -50,7 +50,7 @@ def measure_extraction(root: Path, split: str = "val", stride: int = 10) -> dict
     result = {}
     for name, classes in _SETS.items():
         # `c=classes` binds the classes of this iteration.
-        result[f"maptrv2_{name}_ms"] = ms_per_frame(lambda m, pose, c=classes: m.extract(pose, c))
+        result[f"default_{name}_ms"] = ms_per_frame(lambda m, pose, c=classes: m.extract(pose, c))
     result["maptr_three_classes_ms"] = ms_per_frame(lambda m, pose: m.extract(pose, compat="maptr"))
     result["preparation_ms_per_log"] = 1e3 * preparation_s / len(maps)
     result["frames"] = len(frames)

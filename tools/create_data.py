@@ -24,7 +24,7 @@ COMMANDS = {
         "render camera images for real Argoverse 2 logs",
     ),
     "py123d": ("mapdata.py123d.convert", "convert logs of py123d"),
-    "infos": ("mapdata.infos.convert", "convert an info file of MapTR or MapTRv2"),
+    "infos": ("mapdata.infos.convert", "convert an info file of MapTR or its successors"),
     "split": ("mapdata.splitter", "split scenes by place, at a distance from each other"),
     "overlap": ("mapdata.overlap", "list the validation samples that lie near training"),
     "occlusion": ("mapdata.nuscenes.occlusion", "group samples by how much boxes hide of the map"),

@@ -36,7 +36,7 @@ def info_v2(sample: MapSample) -> dict[str, Any]:
 
 
 def info_of_maptr(sample: MapSample) -> dict[str, Any]:
-    """Return MapTRv2's info file of a sample."""
+    """Return an info file with the ground truth of a sample."""
 
     def sensor(path: str, frame_from_sensor: np.ndarray) -> dict[str, Any]:
         return {
@@ -65,7 +65,7 @@ def info_of_maptr(sample: MapSample) -> dict[str, Any]:
 
 
 def info_of_argoverse2(sample: MapSample) -> dict[str, Any]:
-    """Return MapTRv2's info file of a sample of Argoverse 2."""
+    """Return an info file of a sample of Argoverse 2."""
     turn = {"e2g_translation": [5.0, 6.0, 0.0], "e2g_rotation": [1.0, 0.0, 0.0, 0.0]}
     lines: dict[str, list[Any]] = {name: [] for name in CLASSES}
     for instance in sample.instances:  # along x, as the range is

@@ -31,6 +31,7 @@ from mapdata.argoverse2.log import (
     Argoverse2Log,
     closest_ns,
 )
+from mapdata.argoverse2.map import DEFAULT_RULES
 from mapdata.argoverse2.samples import Argoverse2Options, sample_times, thin_out
 from mapdata.command_line import parse_rate
 from mapdata.vectors_json import write_vectors
@@ -291,7 +292,7 @@ def test_the_tool_converts_and_names_its_command(tmp_path):
     meta = AnnotationFile(tmp_path / "gsmap_av2_val.arrow").meta
     assert "av2 --root" in meta.command
     assert meta.options == {
-        "at": "auto", "rate_hz": 2.0, "compat": "maptrv2", "num_sweeps": 0,
+        "at": "auto", "rate_hz": 2.0, "compat": DEFAULT_RULES, "num_sweeps": 0,
         "split_list": "official",
     }  # fmt: skip
 

@@ -8,7 +8,7 @@ import shapely
 from argoverse2_road import bow_tie, crossing, pose, road_map, write_map
 from av2.geometry.geometry import quat_to_mat
 
-from mapdata.argoverse2.map import Argoverse2Map
+from mapdata.argoverse2.map import COMPAT_MODES, DEFAULT_RULES, Argoverse2Map
 from mapdata.argoverse2.rules import drop_duplicates, merge_until_stable
 from mapdata.crossings import cut_rings, merge_parallel
 from mapdata.local_map import LocalPatch, rings_of
@@ -25,7 +25,7 @@ def xy_sets(lines: list[np.ndarray]) -> set[frozenset]:
     return {frozenset(map(tuple, np.round(line[:, :2], 2).tolist())) for line in lines}
 
 
-def test_straight_road_by_the_rules_of_maptrv2(road):
+def test_straight_road_by_the_default_rules(road):
     elements = road.extract(pose())
     # The line between the neighbouring lanes, once, through both pieces; not the outer paint.
     assert xy_sets(elements["divider"]) == {frozenset({(-30.0, 0.0), (30.0, 0.0)})}
@@ -98,7 +98,7 @@ def test_invalid_polygons_take_no_part_and_are_counted(tmp_path):
 
 def test_off_the_map_there_is_nothing(road):
     far = pose(x=500.0)
-    for compat in ("maptrv2", "maptr"):
+    for compat in COMPAT_MODES:
         elements = road.extract(far, ("divider", "ped_crossing", "boundary", "centerline"), compat)
         assert elements == {"divider": [], "ped_crossing": [], "boundary": [], "centerline": []}
 
@@ -215,8 +215,8 @@ def assert_same_elements(found: list[np.ndarray], expected: list[list], dim: int
 @pytest.mark.parametrize(
     ("file", "compat", "classes", "dim"),
     [
-        ("E5_A.json", "maptrv2", ("divider", "ped_crossing", "boundary"), 3),
-        ("E5_A_centerline.json", "maptrv2", ("centerline",), 3),
+        ("E5_A.json", DEFAULT_RULES, ("divider", "ped_crossing", "boundary"), 3),
+        ("E5_A_centerline.json", DEFAULT_RULES, ("centerline",), 3),
         ("E5b_A.json", "maptr", ("divider", "ped_crossing", "boundary"), 2),
     ],
 )

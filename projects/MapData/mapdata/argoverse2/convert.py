@@ -17,7 +17,7 @@ from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
 from gsmap.utils.split_lists import SPLIT_LIST
 from mapdata.argoverse2.log import BROKEN_LOGS, MAP_CHANGE_LOGS, find_all_logs, find_logs
-from mapdata.argoverse2.map import COMPAT_MODES
+from mapdata.argoverse2.map import COMPAT_MODES, DEFAULT_RULES
 from mapdata.argoverse2.samples import (
     THIN_OVER,
     Argoverse2Options,
@@ -251,11 +251,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--thin-over", default="log", choices=THIN_OVER,
         help="what --rate thins out: each log alone, or the samples of all logs sorted by time, "
-        "as MapTR and MapTRv2 validate (default: %(default)s)",
+        "as the published systems validate (default: %(default)s)",
     )  # fmt: skip
     add("--dim", type=int, default=2, choices=(2, 3), help="coordinates per point")
     add(
-        "--compat", default="maptrv2", choices=COMPAT_MODES,
+        "--compat", default=DEFAULT_RULES, choices=COMPAT_MODES,
         help="rules of the ground truth (default: %(default)s)",
     )  # fmt: skip
     add("--centerline", action="store_true", help="add the class centerline")

@@ -27,6 +27,7 @@ from mapdata.lane_graph import ROUND_DECIMALS, LaneLinks, LanePaths, link_lanes
 from mapdata.local_map import GeometryLayer, LocalPatch, rings_of, vertices_of
 
 COMPAT_MODES = ("maptrv2", "maptr")
+DEFAULT_RULES = COMPAT_MODES[0]
 MAP_CLASSES = ("divider", "ped_crossing", "boundary", "centerline")
 NO_LANE = -2  # a lane without a neighbour on one side
 OUTSIDE = -1  # a neighbour that is not in the map
@@ -150,7 +151,7 @@ class Argoverse2Map:
         self,
         city_from_ego: np.ndarray,
         classes: Collection[str] = MAP_CLASSES[:3],
-        compat: str = "maptrv2",
+        compat: str = DEFAULT_RULES,
         x_range: tuple[float, float] = RANGES["ego"][0],
         y_range: tuple[float, float] = RANGES["ego"][1],
     ) -> dict[str, list[np.ndarray]]:
@@ -159,7 +160,7 @@ class Argoverse2Map:
         Args:
             city_from_ego: Transform from the vehicle to the city in metres. (4, 4)
             classes: Classes to extract, out of ``MAP_CLASSES``.
-            compat: Rules of the ground truth, ``maptrv2`` or ``maptr``.
+            compat: Rules of the ground truth, out of ``COMPAT_MODES``.
             x_range: Smallest and largest x (forward) in metres, ego frame.
             y_range: Smallest and largest y (left) in metres, ego frame.
 

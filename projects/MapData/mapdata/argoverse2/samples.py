@@ -26,7 +26,7 @@ from mapdata.argoverse2.log import (
     Argoverse2Log,
     closest_ns,
 )
-from mapdata.argoverse2.map import Argoverse2Map, check_rules, find_map
+from mapdata.argoverse2.map import DEFAULT_RULES, Argoverse2Map, check_rules, find_map
 from mapdata.command_line import FileOptions
 
 THIN_OVER = ("log", "split")  # values of the option ``thin_over``
@@ -47,7 +47,7 @@ class Argoverse2Options(FileOptions):
             for ``train`` and 2.5 Hz (every fourth sweep) for the other splits.
         thin_over: Samples that are thinned out together: the samples of one ``log``, or of the
             whole ``split`` sorted by time (`thin_out_split`).
-        compat: Rules of the ground truth, ``maptrv2`` or ``maptr``.
+        compat: Rules of the ground truth, out of ``COMPAT_MODES``.
         dim: Coordinates per point, 2 or 3.
         logs: Ids, or first characters of ids, of the logs to convert; empty converts all.
         keep_map_changes: Whether to keep the logs whose map was changed on purpose.
@@ -63,7 +63,7 @@ class Argoverse2Options(FileOptions):
     at: str = "auto"
     rate_hz: float | None = "published"  # type: ignore[assignment]  # a number after initialisation
     thin_over: str = "log"
-    compat: str = "maptrv2"
+    compat: str = DEFAULT_RULES
     dim: int = 2
     logs: Sequence[str] = ()
     keep_map_changes: bool = False
@@ -180,7 +180,7 @@ def usable_times(log_dir: Path, options: Argoverse2Options) -> list[int]:
 
 
 def thin_out_split(times_ns: Mapping[str, Sequence[int]], rate_hz: float) -> dict[str, set[int]]:
-    """Thin out the samples of all logs together, as MapTR and MapTRv2 validate.
+    """Thin out the samples of all logs together, as the published systems validate.
 
     The samples of all logs are sorted by time, and every N-th of them is kept. N is the median
     sampling rate divided by ``rate_hz``, rounded, at least 1.
