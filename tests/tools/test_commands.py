@@ -58,14 +58,42 @@ SLOW = {"torch", "mmdet3d", "mmcv"}
 SLOWER = {"mmdet3d.structures", "mmdet3d.models", "mmcv.ops"}
 
 
-@pytest.mark.parametrize("tool", sorted(path.name for path in (REPO / "tools").glob("*.py")))
-def test_help_comes_without_what_is_slow_to_import(tool):
-    code = "import runpy, sys; sys.argv = sys.argv[1:]; sys.path.insert(0, 'tools')"
-    code += "\ntry: runpy.run_path(sys.argv[0], None, "
-    code += "'__main__')\nexcept SystemExit: pass\nprint('modules:', *sys.modules)"
-    done = run_python("-c", code, f"tools/{tool}", "--help")
-    text, modules = done.stdout.split("modules: ")
-    assert "usage" in text.lower(), done.stderr
+TOOLS = sorted(path.name for path in (REPO / "tools").glob("*.py"))
+# Forks of one process, which imports the modules that many tools need and that take a second
+HELP = """
+import os, runpy, sys
+import gsmap.datasets.annotations.file, gsmap.evaluation.core.chamfer_ap, mmengine.config
+tools = sys.argv[1:]
+sys.path.insert(0, "tools")
+for tool in tools:
+    sys.stdout.flush()
+    pid = os.fork()
+    if pid == 0:
+        print("tool:", tool)
+        sys.argv = [f"tools/{tool}", "--help"]
+        try:
+            runpy.run_path(sys.argv[0], None, "__main__")
+        except SystemExit:
+            pass
+        print("modules:", *sys.modules, flush=True)
+        os._exit(0)
+    os.waitpid(pid, 0)
+"""
+
+
+@pytest.fixture(scope="module")
+def help_of_tools() -> dict[str, str]:
+    """The help of each tool, followed by the modules that are imported then."""
+    done = run_python("-c", HELP, *TOOLS)
+    parts = done.stdout.split("tool: ")[1:]
+    assert len(parts) == len(TOOLS), done.stderr
+    return {part.partition("\n")[0]: part for part in parts}
+
+
+@pytest.mark.parametrize("tool", TOOLS)
+def test_help_comes_without_what_is_slow_to_import(tool, help_of_tools):
+    text, modules = help_of_tools[tool].split("modules: ")
+    assert "usage" in text.lower()
     needs_torch = tool in ("compare.py", "export.py")
     assert not (SLOWER if needs_torch else SLOW) & set(modules.split())
 
