@@ -5,6 +5,7 @@ from types import ModuleType
 import pytest
 import torch
 from method_cases import cases_of_methods
+from test_configs import load, small
 
 from benchmarks import export, fps, live, profile, step
 from benchmarks.model import advance_samples, image_shape, model_and_batch
@@ -48,9 +49,9 @@ LOSSES = cases_of_methods("LOSSES")
 @pytest.mark.parametrize("method", LOSSES)
 def test_heads_with_targets_of_their_own_have_losses(method):
     field, may_be_zero = LOSSES[method]
-    args = argparse.Namespace(threads=torch.get_num_threads(), device="cpu", size=None)
-    path = str(REPO / f"configs/{method}/{method}_r18_minicity.py")
-    model, inputs, (sample,) = model_and_batch(path, args)
+    args = argparse.Namespace(threads=torch.get_num_threads(), device="cpu", size=(64, 96))
+    cfg = small(load(REPO / f"configs/{method}/{method}_r18_minicity.py"))
+    model, inputs, (sample,) = model_and_batch(cfg, args)
     assert len(sample.gt_instances_3d[field]) >= 15
     losses = model.loss(inputs, [sample])
     assert all(torch.isfinite(loss) for loss in losses.values())
