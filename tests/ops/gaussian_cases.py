@@ -36,7 +36,7 @@ CASES = {
     "twenty": (random_gaussians(2, 20, 0.5, 3), ODD_GRID),
     "sixty-four": (random_gaussians(2, 64, 0.5, 3), ODD_GRID),
     "tiny": (random_gaussians(2, 20, 0.01, 0.3), ODD_GRID),
-    "huge": (random_gaussians(2, 20, 20, 50), ODD_GRID),
+    "huge": (random_gaussians(2, 5, 20, 50), ODD_GRID),
     "thin": (random_gaussians(2, 5, 0.05, 20), ODD_GRID),
     "far off": (random_gaussians(2, 8, 0.3, 2, spread=5), ODD_GRID),
     "on pixel centres": (on_pixel_centres(2, 8), ODD_GRID),

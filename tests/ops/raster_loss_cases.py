@@ -22,7 +22,7 @@ MASKS = {
     "smaller than the window": (sparse_masks((7, 4), 0.3), sparse_masks((7, 4), 0.3, seed=1)),
     "one pixel": (sparse_masks((1, 1), 1.0), sparse_masks((1, 1), 1.0, seed=1)),
     "faint": (1e-3 * sparse_masks((21, 33), 0.3), 1e-2 * sparse_masks((21, 33), 0.3, seed=1)),
-    "empty prediction": (torch.zeros(2, 21, 33), sparse_masks((21, 33), 0.3)),
-    "empty target": (sparse_masks((21, 33), 0.3), torch.zeros(2, 21, 33)),
-    "both empty": (torch.zeros(2, 21, 33), torch.zeros(2, 21, 33)),
+    "empty prediction": (torch.zeros(2, 7, 9), sparse_masks((7, 9), 0.3)),
+    "empty target": (sparse_masks((7, 9), 0.3), torch.zeros(2, 7, 9)),
+    "both empty": (torch.zeros(2, 7, 9), torch.zeros(2, 7, 9)),
 }
