@@ -18,6 +18,7 @@ from mmengine.config import Config
 from mmengine.model import BaseModel
 from mmengine.registry import init_default_scope
 from torch import Tensor
+from unset_weights import unset_weights
 
 from gsmap import registered  # noqa: F401
 from gsmap.checkpoints.key_map import key_maps
@@ -141,7 +142,8 @@ class Golden:
         if config not in self._models:
             init_default_scope("mmdet3d")
             cfg = Config.fromfile(self.configs / config, import_custom_modules=False)
-            model = MODELS.build(cfg.model)
+            with unset_weights():
+                model = MODELS.build(cfg.model)
             model.load_state_dict(self.upstream_state(state_list))
             self._models[config] = model.eval()
         return self._models[config]
