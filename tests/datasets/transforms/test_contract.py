@@ -79,7 +79,7 @@ CASES: dict[str, dict[str, Case]] = {
         for kind in KINDS
     },
     "DelayCameras": {"": Case({"ann_file": "FOLDER/a.arrow", "severity": 1}, changes={"images"})},
-    "DropCameras": {"": Case({"prob": 1.0}, changes={"img", "lidar2cam", "lidar2img"})},
+    "DropCameras": {"": Case({"prob": 0.5}, changes={"img", "lidar2cam", "lidar2img"})},
     "FormatMapTargets": {"": Case(adds={"gt_instances_3d"}, needs_truth=True)},
     "MakeBEVMask": {"": Case(adds={"gt_seg"}, needs_truth=True)},
     "MakeInstanceMasks": {"": Case(changes={"gt_instances_3d"}, needs_truth=True)},
