@@ -2,7 +2,7 @@
 
 The place is compared with later drives, which are called passes. A point is in view of a pass if
 at least five frames of the drive have it in range. A pass sees an element of the old map if the map
-of its drive has an element of this class there. A change is reported if more than half of the
+of its drive has an element of this class there. A change is reported if three quarters of the
 passes that have it in view agree on it.
 """
 
@@ -34,6 +34,7 @@ from gsmap.structures.elements import MAX_TOTAL_LENGTH_M, MapElements
 from gsmap.structures.polylines import arc_lengths
 from gsmap.utils.errors import InputError
 
+_MIN_SHARE = 0.75  # share of the passes in view that must agree on a change
 # Elements of the old map this far outside of the range of the frames still show which ground the
 # old map covers.
 _MARGIN_M = 60.0
@@ -46,14 +47,18 @@ def find_changes(
 
     A change concerns a whole area, or a part of a line that is at least 8 m long or the whole line.
 
-    * Removed: an area or a part of a line of the old map that most passes in view do not see.
+    * Removed: an area or a part of a line of the old map that three quarters
+      of the passes in view do not see.
     * Added: an area or a part of a line in the map of a pass that the old map does not have. The
       old map has no line of the class within 1.5 m of it, or no area of the class that shares 30
       percent with it. An element of any class of the old map must lie within 30 m, for elsewhere
       the old map may not cover the ground.
-    * Moved: a part of a line of the old map whose predictions lie at least 0.5 m beside it, all on
-      one side, or an area of the old map whose centre moved by at least 0.75 m. The shift must also
-      be at least three standard errors.
+    * Moved: a part of a line of the old map beside which the maps of the passes have a line, on one
+      side and at a mean distance of at least 0.5 m, or an area of the old map whose centre moved by
+      at least 0.75 m. The shift must also be at least three standard errors.
+
+    Lines of the old map with a score below 0.35 are neither removed nor moved, and lines of a pass
+    with a score below 0.4 are not added. They still show that a line is not new, or not gone.
 
     The confidence of a removed or moved element is multiplied by its score in the old map, as an
     element that never was there cannot be removed.
@@ -77,7 +82,9 @@ def find_changes(
     changes: list[Change] = []
     for label, name in enumerate(classes):
         find_in_class = area_changes if name in AREA_CLASSES else line_changes
-        changes += find_in_class(old, passes, label, config)
+        for change in find_in_class(old, passes, label, config):
+            if change.num_passes >= _MIN_SHARE * change.passes_in_view:
+                changes.append(change)
     changes.sort(key=lambda change: (change.label, KINDS.index(change.kind), -change.confidence))
     num_on_new_ground: Counter[str] = Counter()
     for one_pass in passes:

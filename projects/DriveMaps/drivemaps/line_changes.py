@@ -1,6 +1,7 @@
 """Changes of the lines of one class."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -32,9 +33,11 @@ from drivemaps.line_matching import (
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 from gsmap.structures.polylines import arc_lengths
 
+_MIN_OLD_CONFIDENCE = 0.35  # smallest confidence of an old line that is removed or moved
+_MIN_NEW_CONFIDENCE = 0.4  # smallest confidence of a line that is added
 _MIN_LENGTH_M = 8.0  # shorter changed parts are ignored, unless they are whole lines
 _MIN_MOVE_M = 0.5  # a vertex has moved if it is shifted by at least this
-_MIN_FRAMES = 3  # smallest number of matched frames that can show that a vertex has moved
+_MIN_FRAMES = 3  # smallest number of matched frames that can show that a part has moved
 _WINDOW = 5  # number of vertices of the running median along a line
 
 
@@ -104,6 +107,9 @@ def line_changes(
 ) -> list[Change]:
     """Find the changes of the lines of one class.
 
+    Lines of low confidence are no changes themselves, but they show that a line is not new or not
+    gone.
+
     Args:
         old: Old map in the global frame.
         passes: Drives past the place.
@@ -113,7 +119,7 @@ def line_changes(
     Returns:
         Removed, moved and added parts of lines.
     """
-    lines = dense_elements(old, label)
+    lines = dense_elements(old.select(old.confidence >= _MIN_OLD_CONFIDENCE), label)
     if not len(lines.points):
         return _added(old, passes, label)
     predictions = [dense_predictions(one_pass.drive, label, config) for one_pass in passes]
@@ -143,50 +149,107 @@ def line_changes(
             num_passes=num_passes,
         )
         changes.append(change)
-    changes += _moved(joined, normals[:num_old], matches=matches, evidence=evidence, label=label)
+    maps = join_lines([lines, *(dense_elements(one.elements, label) for one in passes)])
+    moves = _Moves(
+        maps=maps,
+        map_matches=match_vertices(maps, normals_of(maps), queries=np.arange(num_old)),
+        frames=joined,
+        frame_matches=matches,
+    )
+    changes += _moved(lines, normals[:num_old], moves=moves, evidence=evidence, label=label)
     return changes + _added(old, passes, label)
 
 
+@dataclass(frozen=True, eq=False)
+class _Moves:
+    """Distances of new lines from the vertices of old ones.
+
+    The map of a pass is more accurate than its frames, so it gives the positions. The frames give
+    the error.
+
+    Args:
+        maps: Old lines as the first ones, and the lines of the maps of the passes.
+        map_matches: Matches of the old vertices with the maps, at most one per vertex and pass.
+        frames: Old lines as the first ones, and the predicted lines of all frames.
+        frame_matches: Matches of the old vertices with the predictions.
+    """
+
+    maps: DenseLines
+    map_matches: Matches
+    frames: DenseLines
+    frame_matches: Matches
+
+    def shifts(self, num_vertices: int) -> FloatArray:
+        """Mean distance of each old vertex over the passes; 0 without a match. (M,)"""
+        matches = self.map_matches
+        totals = np.bincount(matches.vertices, matches.distances, minlength=num_vertices)
+        counts = np.bincount(matches.vertices, minlength=num_vertices)
+        return totals / np.maximum(counts, 1)
+
+    def shift_of(self, part: slice) -> Shift | None:
+        """Mean distance of a part of an old line, and its error; None without enough frames."""
+        by_pass = _by_frame(self.maps, _within(self.map_matches, part))
+        by_frame = _by_frame(self.frames, _within(self.frame_matches, part))
+        if len(by_frame.distances) < _MIN_FRAMES:
+            return None
+        error_m = Shift.of_frames(*by_frame).std_m
+        return Shift(float(by_pass.distances.mean()), std_m=error_m)
+
+
+class _FrameDistances(NamedTuple):
+    """Distances of a part of a line in F frames.
+
+    Attributes:
+        distances: Mean distance in each frame, in metres. (F,)
+        variances: Mean variance of the predicted vertices, in square metres. (F,)
+        weights: Weight of each frame. (F,)
+    """
+
+    distances: FloatArray
+    variances: FloatArray
+    weights: FloatArray
+
+
+def _within(matches: Matches, part: slice) -> Matches:
+    """Select the matches of the vertices of a part."""
+    return matches.select((matches.vertices >= part.start) & (matches.vertices < part.stop))
+
+
 def _moved(
-    joined: DenseLines, normals: FloatArray, matches: Matches, evidence: _Evidence, label: int
+    lines: DenseLines, normals: FloatArray, moves: _Moves, evidence: _Evidence, label: int
 ) -> list[Change]:
     """Find parts of the old lines that moved across their direction.
 
     Args:
-        joined: The old lines, followed by the lines of all frames.
+        lines: Old lines. M vertices
         normals: Unit vector to the left of each vertex of the old lines. (M, 2)
-        matches: Matches of the vertices of the old lines.
+        moves: Distances of the new lines.
         evidence: Views of the vertices of the old lines.
         label: Index of the class.
     """
     num_old = len(normals)
-    # Shift of each vertex: weighted mean distance of its matches, smoothed along its line.
-    weights = joined.weights[matches.segments]
-    total = np.bincount(matches.vertices, weights, minlength=num_old)
-    moments = np.bincount(matches.vertices, weights * matches.distances, minlength=num_old)
-    num_frames = np.bincount(matches.vertices, minlength=num_old)
-    has_frames = num_frames >= _MIN_FRAMES
-    shifts = np.where(has_frames, moments / np.where(total > 0, total, 1.0), 0.0)
-    old_lines = _first_lines(joined, num_old)
-    for start, end in zip(old_lines.offsets[:-1], old_lines.offsets[1:], strict=True):
+    # Shift of each vertex: mean distance over the passes, smoothed along its line.
+    shifts = moves.shifts(num_old)
+    for start, end in zip(lines.offsets[:-1], lines.offsets[1:], strict=True):
         shifts[start:end] = median_filter(shifts[start:end], _WINDOW, mode="nearest")
-    support = np.bincount(matches.vertices, joined.scores[matches.segments], minlength=num_old)
+    matches = moves.frame_matches
+    scores = moves.frames.scores[matches.segments]
+    support = np.bincount(matches.vertices, scores, minlength=num_old)
     views = evidence.views.sum(axis=0)
     changes = []
     for side in (1.0, -1.0):  # left and right
-        has_moved = has_frames & evidence.is_present & (side * shifts >= _MIN_MOVE_M)
-        for part in _parts(old_lines, has_moved):
-            in_part = (matches.vertices >= part.start) & (matches.vertices < part.stop)
-            shift = _shift_of(joined, matches.select(in_part))
+        has_moved = evidence.is_present & (side * shifts >= _MIN_MOVE_M)
+        for part in _parts(lines, has_moved):
+            shift = moves.shift_of(part)
             in_view, num_passes = evidence.count_passes(part, seen=True)
-            if not num_passes or not shift.exceeds(_MIN_MOVE_M):
+            if shift is None or not num_passes or not shift.exceeds(_MIN_MOVE_M):
                 continue
             share = smooth_share(float(support[part].mean()), float(views[part].mean()))
-            share *= float(old_lines.scores[part].mean())
+            share *= float(lines.scores[part].mean())
             change = Change(
                 MOVED,
                 label,
-                line=old_lines.points[part] + shifts[part, None] * normals[part],
+                line=lines.points[part] + shifts[part, None] * normals[part],
                 confidence=share * shift.probability(_MIN_MOVE_M),
                 passes_in_view=in_view,
                 num_passes=num_passes,
@@ -197,20 +260,8 @@ def _moved(
     return changes
 
 
-def _first_lines(lines: DenseLines, num_vertices: int) -> DenseLines:
-    """The first lines, which have ``num_vertices`` vertices in all."""
-    last = int(np.searchsorted(lines.offsets, num_vertices))  # number of these lines
-    return DenseLines(
-        points=lines.points[:num_vertices],
-        offsets=lines.offsets[: last + 1],
-        frames=lines.frames[:num_vertices],
-        scores=lines.scores[:num_vertices],
-        weights=lines.weights[:num_vertices],
-    )
-
-
-def _shift_of(joined: DenseLines, matches: Matches) -> Shift:
-    """Mean distance of the matches of one part, from the mean of each frame."""
+def _by_frame(joined: DenseLines, matches: Matches) -> _FrameDistances:
+    """Mean distance in each frame; a frame counts once, however many vertices match."""
     # `rows` numbers the frames with matches, and `counts` are their numbers of matches.
     _, rows = np.unique(joined.frames[matches.segments], return_inverse=True)
     counts = np.bincount(rows)
@@ -218,7 +269,7 @@ def _shift_of(joined: DenseLines, matches: Matches) -> Shift:
     variances = scores / joined.weights[matches.segments]  # as a weight is score over variance
     mean_variances = np.bincount(rows, variances) / counts
     mean_scores = np.bincount(rows, scores) / counts
-    return Shift.of_frames(
+    return _FrameDistances(
         np.bincount(rows, matches.distances) / counts,
         variances=mean_variances,
         weights=counts * mean_scores / mean_variances,
@@ -230,7 +281,9 @@ def _added(old: MapElements, passes: list[Pass], label: int) -> list[Change]:
     known_lines = old.select(old.labels == label).polylines
     changes = []
     for one_pass in passes:
-        lines = dense_elements(one_pass.elements, label)
+        elements = one_pass.elements
+        is_sure = elements.confidence >= _MIN_NEW_CONFIDENCE
+        lines = dense_elements(elements.select(is_sure), label)
         if not len(lines.points):
             continue
         evidence = _Evidence.of_points(lines.points, passes, label)

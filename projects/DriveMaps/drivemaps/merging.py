@@ -8,11 +8,13 @@ import shapely
 from drivemaps.area_merging import merge_areas
 from drivemaps.config import MergeConfig
 from drivemaps.drive import Drive, drive_map
+from drivemaps.lanelets import CENTERLINE
 from drivemaps.line_merging import merge_lines
 from gsmap.structures.classes import AREA_CLASSES
-from gsmap.structures.elements import FloatArray, MapElements
+from gsmap.structures.elements import IntArray, MapElements
 
 _RADIUS_M = 1.0  # a polyline within this distance of another one runs along it
+_MOST_VERTICES = 1000  # of a line that is compared with others of its frame
 _MOST_SHARE = 0.5  # share of a polyline's length that may run along another one
 
 
@@ -36,6 +38,9 @@ def confident(drive: Drive, min_score: float) -> Drive:
 def merge(drive: Drive, config: MergeConfig | None = None) -> MapElements:
     """Merge the predictions of all frames into one map, deterministically.
 
+    Lines of a frame that run along a line of their class with a higher score are left out before
+    (`suppress`): a model may predict an object several times.
+
     Args:
         drive: Frames with their predictions.
         config: Parameters of merging; ``MergeConfig()`` by default.
@@ -47,6 +52,7 @@ def merge(drive: Drive, config: MergeConfig | None = None) -> MapElements:
         InputError: If the lines are too long or too close together to be merged in bounded time.
     """
     config = config or MergeConfig()
+    drive = _without_duplicates(drive)
     rows = []
     for label, name in enumerate(drive.classes):
         merge_class = merge_areas if name in AREA_CLASSES else merge_lines
@@ -67,33 +73,63 @@ def suppress(drive: Drive) -> MapElements:
     Returns:
         Selected predictions in the global frame, with their scores.
     """
-    rows = []
+    lines = []
+    labels = []
+    scores = []
     for frame in drive.frames:
         for points, label, score in frame.elements.rows:
-            if len(points) > 1:
-                rows.append((points, label, score))
-    rows.sort(key=_falling_score)
-    lines = np.array([shapely.LineString(points) for points, _, _ in rows], dtype=object)
-    strips = shapely.buffer(lines, _RADIUS_M)
+            lines.append(points)
+            labels.append(label)
+            scores.append(score)
+    elements = MapElements.from_polylines(lines, labels=labels, scores=scores)
+    rows = []
+    for points, label, score in elements.select(_select_distinct(elements)).rows:
+        rows.append((label, points, score))
+    return drive_map(rows)
+
+
+def _without_duplicates(drive: Drive) -> Drive:
+    """Leave out the lines of each frame that run along a line with a higher score.
+
+    Areas are kept, centre lines, whose paths share parts, and lines with so many vertices that a
+    comparison would take long.
+    """
+    may_overlap = np.array([name in (*AREA_CLASSES, CENTERLINE) for name in drive.classes])
+    frames = []
+    for frame in drive.frames:
+        elements = frame.elements
+        kept = may_overlap[elements.labels] | (elements.num_points > _MOST_VERTICES)
+        compared = np.flatnonzero(~kept)
+        kept[compared[_select_distinct(elements.select(compared))]] = True
+        frames.append(replace(frame, elements=elements.select(kept)))
+    return replace(drive, frames=frames)
+
+
+def _select_distinct(elements: MapElements) -> IntArray:
+    """Select polylines by non-maximum suppression within each class.
+
+    Args:
+        elements: Polylines in metres.
+
+    Returns:
+        Indices of the selected polylines, which have a length, by falling score.
+    """
+    lines = []
+    for points in elements.polylines:
+        lines.append(shapely.LineString(points[:, :2] if len(points) > 1 else None))
+    shapes = np.array(lines, dtype=object)
+    strips = shapely.buffer(shapes, _RADIUS_M)
     tree = shapely.STRtree(strips)
-    is_selected = np.zeros(len(rows), dtype=bool)
+    order = np.argsort(-elements.confidence, kind="stable")
+    is_selected = np.zeros(len(elements), dtype=bool)
     selected = []
-    for index, (points, label, score) in enumerate(rows):
-        line = lines[index]
-        rivals = []  # selected polylines of the class
-        for near_index in tree.query(line):
-            _, near_label, _ = rows[near_index]
-            if is_selected[near_index] and near_label == label:
-                rivals.append(near_index)
+    for index in order.tolist():
+        line = shapes[index]
+        near = tree.query(line)
+        rivals = near[is_selected[near] & (elements.labels[near] == elements.labels[index])]
         lengths_along = shapely.length(shapely.intersection(line, strips[rivals]))
         is_duplicate = (lengths_along > _MOST_SHARE * line.length).any()
         if line.length > 0.0 and not is_duplicate:
             is_selected[index] = True
-            selected.append((label, points, score))
-    return drive_map(selected)
-
-
-def _falling_score(row: tuple[FloatArray, int, float]) -> float:
-    """Key that sorts vertices, labels and scores by falling score."""
-    _, _, score = row
-    return -score
+            selected.append(index)
+    return np.array(selected, dtype=np.int64)

@@ -73,6 +73,8 @@ class RasterPrior(BaseModule, AddsWeights):
         test_rule: Rule of writing in tests.
         test_memory: Frames of a test that share a map: those of a place (``"kept"``), of a scene
             (``"scene"``), or none (``"none"``).
+        train_drop: Probability that a sample of a training reads an empty map, so that the model also
+            works without one; 0 as published.
         neutral_start: Start parts that have no effect, so that the prior can be trained from the
             checkpoint of a model without one. False starts random parts, as published.
 
@@ -96,6 +98,7 @@ class RasterPrior(BaseModule, AddsWeights):
         train_rule: Mapping[str, Any] | None = None,
         test_rule: Mapping[str, Any] | None = None,
         test_memory: str = "kept",
+        train_drop: float = 0.0,
         neutral_start: bool = False,
         init_cfg: dict | None = None,
     ) -> None:
@@ -111,6 +114,9 @@ class RasterPrior(BaseModule, AddsWeights):
             )
         if bev is None and queries is None:
             raise InputError("prior needs bev, queries or both, such as bev=dict().")
+        if not 0 <= train_drop < 1:
+            raise InputError(f"prior.train_drop must be in [0, 1), got {train_drop}.")
+        self.train_drop = train_drop
         self.window = head.grid.rasterized(cell_m)
         self.scale = self.window.height // cells.height
         size = (self.scale * cells.height, self.scale * cells.width)
@@ -243,7 +249,10 @@ class RasterPrior(BaseModule, AddsWeights):
             The outputs with fused ``bev_feats``, and the cells of the map for `hook`.
         """
         self.flush()
-        windows = [self.maps.read(Place.of(meta)) for meta in metas]
+        windows = []
+        for meta in metas:
+            is_dropped = self.training and bool(torch.rand(()) < self.train_drop)
+            windows.append(self.maps.read(None if is_dropped else Place.of(meta)))
         cells = F.pixel_unshuffle(torch.stack(windows), self.scale)  # (B, M, H, W) on the host
         device = outputs["bev_feats"].device
         calibration = stack_calibration(metas, self.calibration, device)
