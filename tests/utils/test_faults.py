@@ -199,7 +199,7 @@ def test_a_bus_error_of_a_worker_is_no_want_of_memory():
     [
         ("pid 7) is killed by signal: Bus error.", "bus error of a data loader's worker: a data"),
         ("pid 7) is killed by signal: Killed.", "out of memory (DataLoader worker (pid(s) 7) exi"),
-        ("", "DataLoader worker (pid(s) 7) exited unexpectedly, by a signal unknown: out of"),
+        ("", "DataLoader worker (pid(s) 7) exited unexpectedly, and its signal is unknown:"),
     ],
 )
 def test_the_signal_of_a_worker_says_what_was_missing(cause, text):

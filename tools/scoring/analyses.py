@@ -103,8 +103,10 @@ def change_report(args: argparse.Namespace) -> MetricReport:
         for key in ("precision", "recall"):
             value = figures[f"{name}/{key}"]
             row.append("-" if value == UNDEFINED else f"{100 * value:.1f}")
-        for key in ("num_found", "num_true"):  # changes of any kind have the numbers of all
-            row.append(f"{figures.get(f'{name}/{key}', figures[f'all/{key}']):.0f}")
+        # "any_kind" counts all changes, and `figures` has these numbers only for "all".
+        counted = "all" if name == "any_kind" else name
+        for key in ("num_found", "num_true"):
+            row.append(f"{figures[f'{counted}/{key}']:.0f}")
         rows.append(row)
     print(markdown_table(["changes", "precision", "recall", "found", "true in view"], rows) + "\n")
     return MetricReport.of_figures("changes", figures)
@@ -151,9 +153,9 @@ def interval_report(
     """Print the interval of every AP, and of its difference from another result file.
 
     Args:
-        evaluation: Reports and notes of the result file. The notes of ``others`` are added to its
-            notes.
-        others: Reports and notes of the file of ``--against``, if it is given.
+        evaluation: Reports of the metrics with an AP, and notes, of the result file. The notes of
+            ``others`` are added to these notes.
+        others: Reports of all metrics, and notes, of the file of ``--against``, if it is given.
         resamples: The resamples of the scenes.
         args: The options of the command.
 
@@ -177,6 +179,7 @@ def interval_report(
                 figures[f"{key}/{part}"] = value
     if others is not None:
         other_reports, other_notes = others
+        # Like `reports`, only the metrics with an AP.
         ranked = [report for report in other_reports if report.detections]
         notes.extend(f"{args.against}: {note}" for note in other_notes)
         differences = ap_differences(reports, ranked, resamples)

@@ -38,8 +38,8 @@ def confident(drive: Drive, min_score: float) -> Drive:
 def merge(drive: Drive, config: MergeConfig | None = None) -> MapElements:
     """Merge the predictions of all frames into one map, deterministically.
 
-    Lines of a frame that run along a line of their class with a higher score are left out before
-    (`suppress`): a model may predict an object several times.
+    A model may predict an object of a frame several times. Therefore lines that run along a line of
+    their frame and class with a higher score are not merged. The rule is the one of `suppress`.
 
     Args:
         drive: Frames with their predictions.
@@ -91,8 +91,8 @@ def suppress(drive: Drive) -> MapElements:
 def _without_duplicates(drive: Drive) -> Drive:
     """Leave out the lines of each frame that run along a line with a higher score.
 
-    Areas are kept, centre lines, whose paths share parts, and lines with so many vertices that a
-    comparison would take long.
+    Three kinds of elements are always kept: areas, centre lines (their paths share parts), and
+    lines with so many vertices that a comparison would take long.
     """
     may_overlap = np.array([name in (*AREA_CLASSES, CENTERLINE) for name in drive.classes])
     frames = []
@@ -112,11 +112,13 @@ def _select_distinct(elements: MapElements) -> IntArray:
         elements: Polylines in metres.
 
     Returns:
-        Indices of the selected polylines, which have a length, by falling score.
+        Indices of the selected polylines, by falling score. Polylines of length 0 are not selected.
     """
     lines = []
     for points in elements.polylines:
-        lines.append(shapely.LineString(points[:, :2] if len(points) > 1 else None))
+        # A line of shapely needs two points. A single point becomes an empty line, of length 0.
+        coordinates = points[:, :2] if len(points) > 1 else None
+        lines.append(shapely.LineString(coordinates))
     shapes = np.array(lines, dtype=object)
     strips = shapely.buffer(shapes, _RADIUS_M)
     tree = shapely.STRtree(strips)

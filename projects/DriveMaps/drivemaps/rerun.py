@@ -32,7 +32,8 @@ def write_rerun(path: str | Path, replay: Replay) -> None:
 
     Raises:
         FileNotFoundError: If an image is missing.
-        BrokenSampleError: If an image is damaged or not an image; none of its content is written.
+        BrokenSampleError: If an image file is damaged or is not an image. The recording is not
+            written in this case.
         RuntimeError: If ``rerun-sdk`` is missing.
     """
     rr = import_extra("rerun", "viz")
@@ -105,11 +106,13 @@ def _log_predictions(recording: Any, rr: Any, moment: Moment, colours: Sequence[
     if moment.ellipses is not None:
         centres, half_axes, quaternions = moment.ellipses
         thickness = np.full(len(centres), 0.01)
+        # Each vertex of an element has one Gaussian, with the colour of the element.
+        gaussian_rgb = np.repeat(rgb, elements.num_points, axis=0)
         ellipsoids = rr.Ellipsoids3D(
             centers=centres,
             half_sizes=np.column_stack([half_axes, thickness]),
             quaternions=quaternions,
-            colors=np.repeat(rgb, elements.num_points, axis=0),
+            colors=gaussian_rgb,
         )
         recording.log(f"{entity}/gaussians", ellipsoids)
 

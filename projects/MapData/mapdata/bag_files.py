@@ -114,7 +114,8 @@ def _read_metadata(file: Path) -> str:
     """
     if file.stat().st_size > _MOST_BYTES:
         raise InputError(
-            f"{file.name} has more than {_MOST_BYTES} bytes: `ros2 bag convert` writes fewer parts"
+            f"{file.name} has more than {_MOST_BYTES} bytes, such as for a recording of thousands "
+            "of parts: `ros2 bag convert` can write the recording in fewer parts"
         )
     text = file.read_text(encoding="utf-8", errors="replace")
     if "<<" in text or _ALIAS.search(text):
@@ -124,6 +125,8 @@ def _read_metadata(file: Path) -> str:
 
 def _check_parts(parts: Sequence[Path]) -> None:
     """Raise a ``ValueError`` unless files are one file, or the numbered parts of one recording."""
+    # Files are parts of one recording if their names differ only in digits, and if the numbers at
+    # the ends of their names all differ.
     patterns = set()
     numbers = set()
     for part in parts:
@@ -144,8 +147,8 @@ def _notes_on(parts: Sequence[Path]) -> list[str]:
         log = part.with_name(f"{part.name}-wal")
         if log.is_file() and log.stat().st_size:
             notes.append(
-                f"{log.name} holds messages that {log.stem}.db3 lacks, and they are not read: "
-                f"`sqlite3 {log.stem}.db3 'PRAGMA wal_checkpoint'` adds them"
+                f"{log.name} holds messages that {part.name} lacks, and they are not read: "
+                f"`sqlite3 {part.name} 'PRAGMA wal_checkpoint'` adds them"
             )
     return notes
 
@@ -161,8 +164,8 @@ def damage_in(path: Path) -> str | None:
     missing = [name for name in names if not (path / name).is_file()]
     if missing:
         return (
-            f"{_METADATA} names {', '.join(missing)}, not there: copy all files of the recording, "
-            f"or `ros2 bag reindex {path.name}` to go on with the others"
+            f"{_METADATA} names {', '.join(missing)}, which {path.name} does not contain: copy all "
+            f"files of the recording, or run `ros2 bag reindex {path.name}` to use only the others"
         )
     for part in parts_in(path):
         damage = _damage_of(part)
@@ -177,7 +180,7 @@ def _listed_names(file: Path) -> list[str] | None:
         content = yaml.safe_load(_read_metadata(file))
         paths = content["rosbag2_bagfile_information"]["relative_file_paths"]
         return [Path(str(path)).name for path in paths]
-    except (yaml.YAMLError, UnicodeDecodeError, TypeError, KeyError):
+    except (yaml.YAMLError, TypeError, KeyError):
         return None
 
 

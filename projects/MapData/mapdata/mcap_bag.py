@@ -160,7 +160,10 @@ def _connection_of(channel: Any, schema: Any) -> McapConnection:
 
 
 def _listed_type(connection: McapConnection) -> str:
-    """Type of a connection for a listing, followed by an encoding that is not of ROS."""
+    """Type of a connection for a listing.
+
+    The encoding is added unless it is one of ROS, or the type is one of Foxglove's (``ROS_TYPES``).
+    """
     name = connection.schema.name if connection.schema else "no type"
     is_known = connection.encoding in ("cdr", "ros1") or name in ROS_TYPES
     return name if is_known else f"{name} in {connection.encoding}"

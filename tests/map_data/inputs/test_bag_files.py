@@ -131,7 +131,8 @@ def test_a_part_that_the_metadata_do_not_name_is_named(tmp_path):
 def test_a_missing_part_is_named(tmp_path):
     folder = bag_of(tmp_path, "mcap")
     (folder / "drive.mcap").rename(tmp_path / "away.mcap")
-    with pytest.raises(ValueError, match=r"metadata\.yaml names drive\.mcap, not there: copy all"):
+    expected = r"metadata\.yaml names drive\.mcap, which drive does not contain: copy all"
+    with pytest.raises(ValueError, match=expected):
         open_input(folder, options(tmp_path))
 
 

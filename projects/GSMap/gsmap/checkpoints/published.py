@@ -70,7 +70,7 @@ def load_published(
     """
     path = find_weights(address)
     try:
-        with refusing(address):
+        with refusing(address):  # raises ValueError for a damaged file
             checkpoint = load_tensors(path, map_location=map_location)
     except ValueError as error:
         if path != cache_file(address):
@@ -156,10 +156,14 @@ def find_weights(address: str) -> Path:
 
 
 def cache_file(address: str) -> Path:
-    """Path of a downloaded file. Its name contains a digest of the address, which is unique."""
-    name, dot, suffix = _published_name(address).rpartition(".")
+    """Path of a downloaded file.
+
+    The file name contains a digest of the address, so that each address has a different file.
+    """
+    name = _published_name(address)
+    stem, dot, suffix = name.rpartition(".")
     mark = hashlib.sha256(address.encode()).hexdigest()[:16]
-    marked_name = f"{name}={mark}.{suffix}" if dot else f"{suffix}={mark}"
+    marked_name = f"{stem}={mark}.{suffix}" if dot else f"{name}={mark}"
     return Path(torch.hub.get_dir(), "checkpoints", file_name(marked_name))
 
 
@@ -237,8 +241,8 @@ def _download_error(address: str, reason: str) -> OSError:
     name = _published_name(address)
     place = os.environ.get(WEIGHTS) or f"a folder and set {WEIGHTS} to it"
     return OSError(
-        f"{address} cannot be fetched ({reason}): put {name} into {place}, or set the setting with "
-        "this address (init_cfg.checkpoint or load_from) to a path; with init_cfg=None, the part "
+        f"{address} cannot be fetched ({reason}): put {name} into {place}, or replace the address "
+        "in the config (init_cfg.checkpoint or load_from) by a path; with init_cfg=None, the part "
         "is trained from scratch."
     )
 
@@ -253,7 +257,8 @@ def in_our_names(checkpoint: Any) -> Any:
         checkpoint: Contents of the published file.
 
     Returns:
-        The weights by their new keys. Contents in another format are returned unchanged.
+        The weights by their new keys. Contents in another format keep their keys; of a mapping with
+        ``model`` and without ``state_dict``, the value of ``model`` is returned.
     """
     if not isinstance(checkpoint, Mapping):
         return checkpoint
@@ -261,6 +266,7 @@ def in_our_names(checkpoint: Any) -> Any:
     if isinstance(checkpoint.get("state_dict"), Mapping):
         state = checkpoint["state_dict"]
     elif isinstance(checkpoint.get("model"), Mapping):
+        # mmengine reads the weights from ``state_dict``, but not from ``model``.
         checkpoint = checkpoint["model"]
         state = checkpoint
     if "_conv_stem.weight" in state:

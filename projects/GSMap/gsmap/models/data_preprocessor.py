@@ -57,7 +57,8 @@ class MapDataPreprocessor(Det3DDataPreprocessor):
             samples: The samples, with the steps in their metainfo.
 
         Returns:
-            Images as packed by the published pipelines. (B, V, 3, H', W')
+            Images after all steps, as the pipelines of the published systems pack them. These
+            pipelines run the steps on the CPU. (B, V, 3, H', W')
         """
         steps = [sample.metainfo.get("image_steps") or () for sample in samples]
         return run_image_steps(images, steps)
@@ -65,7 +66,7 @@ class MapDataPreprocessor(Det3DDataPreprocessor):
     def normalise(self, images: Tensor) -> Tensor:
         """Convert images to float32, normalise and pad them. (..., 3, H, W) -> (..., 3, H', W')
 
-        With ``bgr_to_rgb`` or ``rgb_to_bgr``, the order of the channels is reversed before.
+        With ``bgr_to_rgb`` or ``rgb_to_bgr``, the order of the channels is reversed first.
         """
         if self._channel_conversion:
             images = images.flip(dims=(-3,))
@@ -110,16 +111,16 @@ def _join_steps(steps: Sequence[Sequence[Any]]) -> list[Any] | None:
     """Join the steps of all samples to steps of the batch.
 
     Returns:
-        A step of the batch for each number, or None if samples differ in the number or in the kinds
-        of their steps.
+        Steps of the batch, one for each position in the lists of the samples. None if the samples
+        differ in the number of steps, or in the kind of the step at a position.
     """
     num_steps = len(steps[0])
     for sample_steps in steps:
         if len(sample_steps) != num_steps:
             return None
     batch_steps = []
-    for number in range(num_steps):
-        first, *others = [sample_steps[number] for sample_steps in steps]
+    for position in range(num_steps):
+        first, *others = [sample_steps[position] for sample_steps in steps]
         step = first.join(others)
         if step is None:
             return None

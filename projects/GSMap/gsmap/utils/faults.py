@@ -70,11 +70,15 @@ def user_message(error: BaseException) -> str | None:
 
 
 def is_machine_error(error: BaseException) -> bool:
-    """Whether an error comes from a limit of the system, independent of the content of a file."""
+    """Whether an error comes from the machine, not from the content of a file.
+
+    Examples are a lack of memory, a missing file and missing permissions.
+    """
     if isinstance(error, MemoryError):  # also raised by Arrow
         return True
     if isinstance(error, OSError) and error.errno:
-        return error.errno != errno.EINVAL  # raised for negative positions in damaged files
+        # Damaged files cause EINVAL, since it is raised for negative positions in a file.
+        return error.errno != errno.EINVAL
     return isinstance(error, RuntimeError | OSError) and bool(_NO_MEMORY.search(str(error)))
 
 
@@ -110,13 +114,16 @@ def _describe_machine_error(error: BaseException, text: str) -> str | None:
     if text.strip():
         first_line = text.strip().splitlines()[0]
         reason = first_line.rstrip(".")
-    signals = f"{text} {error.__cause__}"
-    if is_runtime_error and "signal: Bus error" in signals:
+    # When a worker has died, the message of torch's DataLoader is either "DataLoader worker (pid 7)
+    # is killed by signal: Bus error." or "DataLoader worker (pid(s) 7) exited unexpectedly". The
+    # cause of an error with the second message may have the first one, which names the signal.
+    text_and_cause = f"{text} {error.__cause__}"
+    if is_runtime_error and "signal: Bus error" in text_and_cause:
         return f"bus error of a data loader's worker: {_BUS_ERROR_ADVICE}."
-    if is_runtime_error and "exited unexpectedly" in text and "signal:" not in signals:
+    if is_runtime_error and "exited unexpectedly" in text and "signal:" not in text_and_cause:
         return (
-            f"{reason}, by a signal unknown: out of memory ({_REDUCE_MEMORY}), or "
-            f"{_BUS_ERROR_ADVICE}."
+            f"{reason}, and its signal is unknown: either the memory was full ({_REDUCE_MEMORY}), "
+            f"or {_BUS_ERROR_ADVICE}."
         )
     if is_runtime_error and _NO_HANDLES.match(text):
         return f"too many open files: raise their limit (ulimit -n), or {_FEWER_PROCESSES}."

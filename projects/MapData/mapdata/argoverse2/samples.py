@@ -31,7 +31,7 @@ from mapdata.command_line import FileOptions
 
 THIN_OVER = ("log", "split")  # values of the option ``thin_over``
 # Hint on missing sensor data.
-_NEEDS_NONE = "`create_data.py av2 --at poses:10` needs none"
+_ALTERNATIVE = "`create_data.py av2 --at poses:10` needs neither calibration nor sensor data"
 
 
 @dataclass(frozen=True)
@@ -79,11 +79,11 @@ class Argoverse2Options(FileOptions):
             raise InputError(f"rate_hz must be > 0, got {self.rate_hz}.")
         if self.thin_over not in THIN_OVER:
             raise InputError(f"thin_over must be one of {THIN_OVER}, got {self.thin_over!r}.")
-        has_rate_of_sensors = self.rate_hz is not None and self.pose_stride is None
-        if self.thin_over == "split" and not has_rate_of_sensors:
+        can_thin_out = self.rate_hz is not None and self.pose_stride is None
+        if self.thin_over == "split" and not can_thin_out:
             raise InputError(
-                "thin_over='split' keeps every N-th sample of all logs: give a rate, and times of "
-                "sensors (--at)."
+                "thin_over='split' keeps every N-th sample of all logs: give a rate, and a value "
+                "of --at other than poses:N."
             )
         if self.dim not in (2, 3):
             raise InputError(f"dim must be 2 or 3, got {self.dim}.")
@@ -140,7 +140,7 @@ def read_log(
     log_map = None
     if with_map:
         log_map = Argoverse2Map.from_log(log_dir)
-        result.elements = log_map.left_out
+        result.elements = log_map.left_out  # ids of the unusable elements of the map
         for kind, count in log_map.invalid_counts.items():
             if count > 0:
                 result.invalid[kind] = count
@@ -180,10 +180,11 @@ def usable_times(log_dir: Path, options: Argoverse2Options) -> list[int]:
 
 
 def thin_out_split(times_ns: Mapping[str, Sequence[int]], rate_hz: float) -> dict[str, set[int]]:
-    """Thin out the samples of all logs together, as the published systems validate.
+    """Thin out the samples of all logs together.
 
     The samples of all logs are sorted by time, and every N-th of them is kept. N is the median
-    sampling rate divided by ``rate_hz``, rounded, at least 1.
+    sampling rate divided by ``rate_hz``, rounded, at least 1. The published systems select their
+    validation samples by this rule.
 
     Args:
         times_ns: Ascending times of the samples in nanoseconds, by name of the log.
@@ -261,14 +262,14 @@ def sample_times(log: Argoverse2Log, options: Argoverse2Options) -> np.ndarray:
     uncalibrated = [name for name in RING_CAMERAS if name not in log.calibration]
     if uncalibrated:
         cameras = ", ".join(uncalibrated) if log.calibration else "the ring cameras"
-        raise InputError(f"no calibration of {cameras} ({_NEEDS_NONE})")
+        raise InputError(f"no calibration of {cameras} ({_ALTERNATIVE})")
     times_ns = log.lidar_timestamps_ns
     kind = "LiDAR sweeps"
     if options.at == "cameras" or (options.at == "auto" and len(times_ns) == 0):
         times_ns = log.image_timestamps_ns[RING_CAMERAS[0]]
         kind = f"images of {RING_CAMERAS[0]}"
     if len(times_ns) == 0:
-        raise InputError(f"no {kind} ({_NEEDS_NONE})")
+        raise InputError(f"no {kind} ({_ALTERNATIVE})")
     if options.thin_over == "split":
         return times_ns
     return thin_out(times_ns, options.rate_hz)

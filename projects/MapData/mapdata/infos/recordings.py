@@ -43,9 +43,9 @@ def read_info_file(
     content = load_plain_pickle(path)
     if not isinstance(content, Mapping) or not isinstance(content.get("data_list"), list):
         raise InputError(
-            f"{path} is not an info file of mmdet3d's format v2 (no data_list); those of "
-            "published systems convert with tools/create_data.py infos, older ones of mmdet3d with "
-            "its tools/dataset_converters/update_infos_to_v2.py."
+            f"{path} is not an info file of mmdet3d's format v2 (no data_list): convert an info "
+            "file of a published system with tools/create_data.py infos, and an older info file of "
+            "mmdet3d with mmdet3d's tools/dataset_converters/update_infos_to_v2.py."
         )
     samples = []
     meta = AnnotationMeta("mmdet3d", "lidar", split="test")

@@ -114,14 +114,17 @@ def _map_points(sample: MapSample) -> Array:
         raise InputError(
             f"sample {sample.token!r} has no ground truth: give a file with map elements."
         )
+    # The ground is at z = 0 of the vehicle's frame. Without `ego_from_frame`, the annotation frame
+    # is taken to be the vehicle's frame.
     frame_height_m = 0.0 if sample.ego_from_frame is None else sample.ego_from_frame[2, 3]
     elements = [np.empty((0, 3))]
     for instance in sample.instances:
         length_m = arc_lengths(instance.points)[-1]
         num_steps = max(math.ceil(length_m / _STEP_M), 1)
         points = resample(instance.points, num_steps + 1)
-        ground = np.full(len(points), -frame_height_m)
-        elements.append(np.column_stack([points, ground])[:, :3])  # points with heights keep them
+        ground_z_m = np.full(len(points), -frame_height_m)
+        # Points with heights have three columns, and the fourth column, the ground, is dropped.
+        elements.append(np.column_stack([points, ground_z_m])[:, :3])
     return np.concatenate(elements)
 
 
@@ -142,8 +145,9 @@ def _in_image(points: Array, camera: CameraRecord) -> NDArray[np.bool_]:
 def hidden_share(sample: MapSample, boxes: Boxes) -> float:
     """Compute the share of a sample's map that boxes hide.
 
-    The share is taken of the map points inside at least one image. A point is hidden if boxes
-    intersect the line of sight from each camera with the point in its image.
+    The share is taken of the map points inside at least one image. A point is hidden if, for each
+    camera whose image contains the point, a box intersects the line of sight from the camera to the
+    point.
 
     Args:
         sample: Sample with cameras and ground truth. Elements without heights are placed on the

@@ -14,9 +14,11 @@ from gsmap.structures.polylines import is_closed
 
 SHORTEST_M = 1.0  # pieces of lines below this, and pieces of areas below 1 m^2, are left out
 _SEPARATOR = " at "
+# The limits of the bands begin with 0, the vehicle, and end with infinity. The others are circles.
+_RADII_M = DISTANCES_M[1:-1]
 _BANDS = [
-    *(f"{inner_m:g}-{outer_m:g} m" for inner_m, outer_m in pairwise(DISTANCES_M[:-1])),
-    f"beyond {DISTANCES_M[-2]:g} m",
+    *(f"{inner_m:g}-{outer_m:g} m" for inner_m, outer_m in pairwise((0.0, *_RADII_M))),
+    f"beyond {_RADII_M[-1]:g} m",
 ]
 
 
@@ -79,7 +81,7 @@ def cut_line(points: FloatArray) -> Iterator[tuple[int, FloatArray]]:
     vertices = _interpolate(points, positions)
     middle_x, middle_y = _interpolate(points, middles).T
     distances = np.hypot(middle_x, middle_y)
-    bands = np.searchsorted(DISTANCES_M[1:-1], distances, side="right")  # band of each part
+    bands = np.searchsorted(_RADII_M, distances, side="right")  # band of each part
     changes = np.flatnonzero(np.diff(bands)) + 1
     pieces = []
     for start, end in pairwise([0, *changes.tolist(), len(bands)]):
@@ -108,7 +110,7 @@ def _cut_positions(points: FloatArray) -> FloatArray:
     """
     start = points[:-1]
     step = np.diff(points, axis=0)
-    radii = np.array(DISTANCES_M[1:-1])[:, None]
+    radii = np.array(_RADII_M)[:, None]
     # A point start + share * step is on a circle if
     # a * share**2 + 2 * b * share + |start|**2 - radius**2 is zero.
     a = (step**2).sum(axis=1)
@@ -158,8 +160,8 @@ def _band_areas() -> list[shapely.Geometry]:
     centre = shapely.Point(0, 0)
     areas = []
     inner: shapely.Geometry = centre
-    for radius_m in DISTANCES_M[1:]:
-        outer = centre.buffer(min(radius_m, far_m), quad_segs=64)
+    for radius_m in (*_RADII_M, far_m):
+        outer = centre.buffer(radius_m, quad_segs=64)
         areas.append(outer.difference(inner))
         inner = outer
     return areas

@@ -78,8 +78,9 @@ def euclidean_shape_loss(pred: Tensor, target: Tensor) -> Tensor:
 def euclidean_relation_loss(pred: Tensor, target: Tensor, counts: Sequence[int]) -> Tensor:
     """L1 distance between the relation features of the elements of each sample.
 
-    A sample with n matches adds the sum over its pairs of different elements, each taken once,
-    divided by the number (n * P)^2 of pairs of points, which includes pairs within an element.
+    The distances of a sample are summed over all pairs of different elements, and over the P * P
+    pairs of points of two elements. Each pair of elements is taken once. With n matches, the sum is
+    divided by (n * P)^2, the number of all pairs of points. The results of all samples are added.
 
     Args:
         pred: Normalised points of M predictions, sample after sample. (..., M, P, 2)
@@ -139,9 +140,11 @@ class EuclideanLoss(MapLoss):
 
     def by_layer(self, pairs: MatchedPairs) -> Tensor:
         """Weighted loss of each decoder layer. Heights are ignored."""
-        pred = pairs.by_layer(pairs.pred_pts[..., :2])
+        # The M pairs lie layer after layer, and the L layers have equally many pairs.
+        pred = pairs.by_layer(pairs.pred_pts[..., :2])  # (L, M / L, P, 2)
         target = pairs.by_layer(pairs.gt_pts[..., :2])
         shape = euclidean_shape_loss(pred, target)
+        # `pairs.counts` repeats the counts of the samples for every layer. One layer is enough.
         num_samples = len(pairs.counts) // pairs.num_layers
         counts = pairs.counts[:num_samples]
         relation = euclidean_relation_loss(pred, target, counts)

@@ -213,6 +213,7 @@ class PointLineDecoder(BaseModule):
         masks = []
         for (_, p), class_lines in zip(self.queries, lines, strict=True):
             blocked = class_lines.masks.detach().flatten(2) < 0  # (B, n, S)
-            blocked &= ~blocked.all(-1, keepdim=True)  # no cell of a line with an empty mask
+            is_empty = blocked.all(-1, keepdim=True)
+            blocked &= ~is_empty  # for a line with an empty mask, no cell is blocked
             masks.append(blocked.repeat_interleave(p, 1))
         return torch.cat(masks, dim=1)

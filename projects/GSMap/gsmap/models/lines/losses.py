@@ -17,8 +17,10 @@ class Case(NamedTuple):
     """Lines of one class in one sample.
 
     Attributes:
-        lines: Predicted lines, tensors (n, ...).
-        truth: Annotated lines, tensors (K, ...), with ``masks``.
+        lines: Object whose attributes are tensors (n, ...) of n predicted lines, such as ``logits``
+            (n, 2).
+        truth: Object whose attributes are tensors (K, ...) of K annotated lines, such as ``masks``
+            (K, H, W).
         mask_distances: Distances between the masks. (n, K)
         token: Token of the sample.
     """
@@ -81,7 +83,7 @@ class LineLosses:
         of all cases are copied to the device at once, too.
 
         Args:
-            cases: Lines of one class in one sample each.
+            cases: Cases of all decoder layers, classes and samples.
 
         Returns:
             The result of `pairs` for each case, on the device.
@@ -125,11 +127,11 @@ class LineLosses:
         raise NotImplementedError
 
     def __call__(self, cases: Sequence[Case], matches: Sequence[Any]) -> dict[str, Tensor]:
-        """Weighted losses of a layer and class, by name.
+        """Weighted losses of the lines that one decoder layer predicts for one class, by name.
 
         Args:
-            cases: Lines of the class in each sample.
-            matches: Result of `match`.
+            cases: Cases of this layer and class, one for each sample.
+            matches: Results of `match` for these cases.
         """
         raise NotImplementedError
 

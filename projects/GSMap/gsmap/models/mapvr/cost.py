@@ -42,7 +42,8 @@ class RenderedDiceCost(MapCost):
 
         Args:
             pred_instances: Predictions with normalised ``pts`` (N, P, 2).
-            gt_instances: Ground truths with ``first_pts`` (K, P, 2) and ``labels`` (K,).
+            gt_instances: Ground truths with ``first_pts`` (K, P, 2), the normalised points in the
+                annotated order, and ``labels`` (K,).
             img_meta: Not used.
 
         Returns:

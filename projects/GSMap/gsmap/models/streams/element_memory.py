@@ -46,10 +46,12 @@ class ElementMemory:
         noise_m: float = 0.05,
         noise_deg: float = 0.15,
     ) -> None:
+        # A head's reference decodes the predictions to the fields in its `outputs`. Only Gaussians
+        # have the field ``scales``.
         if not isinstance(head, MapHead) or "scales" not in head.reference.outputs:
             raise InputError(
                 f"temporal.elements needs a head with Gaussians, got {type(head).__name__}: take "
-                "GSMapHead, or leave it out."
+                "GSMapHead, or leave out temporal.elements."
             )
         has_valid_noise = noise_m >= 0 and noise_deg >= 0
         if not (gate_m > 0 and 0 <= min_score < 1 and has_valid_noise):

@@ -21,7 +21,8 @@ from gsmap.utils.errors import InputError
 class HeightPlanesEncoder(CameraEncoder):
     """BEV encoder that averages the image features of all cameras at points of horizontal planes.
 
-    The planes are concatenated along the channels and reduced by a neck of stride 4.
+    The features and the coordinates x, y, z of the points of all planes are concatenated along the
+    channels. A convolution and a neck of stride 4 reduce the result to BEV features.
 
     Args:
         grid: Extent of the map, in metres.
@@ -57,7 +58,7 @@ class HeightPlanesEncoder(CameraEncoder):
                 block = ConvModule(embed_dims, embed_dims, 3, padding=1, bias=True, norm_cfg=norm)
                 blocks.append(block)
             self.upsampling.append(blocks)
-        plane_channels = len(heights_m) * (embed_dims + 3)
+        plane_channels = len(heights_m) * (embed_dims + 3)  # features and x, y, z of the points
         self.reduction = nn.Conv2d(plane_channels, embed_dims, kernel_size=3, padding=1)
         stem, stages = resnet_stages(BasicBlock, embed_dims, widths=[neck_dims])
         pooling = nn.MaxPool2d(3, stride=2, padding=1)
@@ -144,7 +145,8 @@ class HeightPlanesEncoder(CameraEncoder):
         num_planes, height, width = self.planes.shape[1:]
         visible = projection.visible  # (B, V, Q)
         uv = 2 * projection.uv[..., 0, :] - 1  # [-1, 1] over the image, (B, V, Q, 2)
-        # Projections of invisible points may have any value, also NaN. -2 is beyond the image.
+        # Projections of invisible points may have any value, also NaN. Beyond the image, such as at
+        # -2, `grid_sample` returns 0.
         uv = uv.where(visible[..., None], -2.0)
         total = feats.new_zeros(())
         for view in range(feats.shape[1]):
@@ -152,8 +154,7 @@ class HeightPlanesEncoder(CameraEncoder):
             view_feats = F.grid_sample(
                 feats[:, view], grid, align_corners=False
             )  # (B, C, Z * H, W)
-            mask = visible[:, view].view(-1, 1, num_planes * height, width)
-            total = total + view_feats * mask
+            total = total + view_feats
         num_views = visible.sum(dim=1).clamp(min=1).view(-1, 1, num_planes, height, width)
         return total.unflatten(2, (num_planes, height)) / num_views
 

@@ -4,8 +4,9 @@ r"""Triton kernels: masks of 2D Gaussians, one program per tile of an instance.
 
 The raster of an instance is cut into tiles of TILE x TILE pixels. A program keeps the pixels of one
 tile in registers and loops over the P Gaussians of the instance. Outside of the bounding box of a
-Gaussian, its density is below ``CUT`` of the reference. If the box misses the tile, a scalar branch
-skips the Gaussian. A NaN Gaussian is never skipped, so the mask becomes NaN.
+Gaussian, its density is below 1e-8 (``CUT`` in ``reference.py``), at more than sqrt(SQUARED_REACH)
+standard deviations from the mean. If the box misses the tile, a scalar branch skips the Gaussian. A
+NaN Gaussian is never skipped, so the mask becomes NaN.
 
 A pixel at the offset (dx, dy) from the mean has the coordinates u = (c dx + s dy) / sigma_u and
 v = (c dy - s dx) / sigma_v along the axes of the Gaussian, with the cosine c and the sine s of its
@@ -337,9 +338,9 @@ def _prepare(gaussians):
     reach = math.sqrt(SQUARED_REACH)
     cos = rotations.cos()
     sin = rotations.sin()
-    u, v = scales.square().split(1, -1)
-    half_x = reach * (cos.square() * u + sin.square() * v).sqrt()
-    half_y = reach * (sin.square() * u + cos.square() * v).sqrt()
+    variance_u, variance_v = scales.square().split(1, -1)
+    half_x = reach * (cos.square() * variance_u + sin.square() * variance_v).sqrt()
+    half_y = reach * (sin.square() * variance_u + cos.square() * variance_v).sqrt()
     return torch.cat([means, cos, sin, scales.reciprocal(), half_x, half_y], dim=-1)
 
 
@@ -418,18 +419,25 @@ def render_gaussians_backward(grads, gaussians, frame, height, width):
 def _gradients(moments, gaussians, prepared):
     """Compute the gradient of Gaussians (N, P, 5) from moments (N, tiles, P, 5).
 
-    The equations are in the docstring of ``numba.py``. Its moments M_u, M_v, M_uu, M_uv and M_vv
-    are in metres: one factor sigma per index larger than the moments here.
+    The moments m_u, m_v, m_uu, m_uv and m_vv are sums over pixels whose coordinates u and v are
+    divided by sigma_u and sigma_v. With sigma as s, the gradients are
+
+        dL/dsigma = (m_uu / s_u, m_vv / s_v),  dL/dmu = R(theta) (m_u / s_u, m_v / s_v),
+        dL/dtheta = m_uv (s_u / s_v - s_v / s_u).
+
+    The equations in the docstring of ``numba.py`` are equal to these, with u and v in metres.
     """
     cos, sin, inv_u, inv_v = prepared[..., 2:6].unbind(-1)
     scale_u, scale_v = gaussians[..., 2:4].unbind(-1)
     m_u, m_v, m_uu, m_uv, m_vv = moments.sum(1).unbind(-1)
-    m_u = m_u * inv_u  # M_u / sigma_u^2 of the equations
-    m_v = m_v * inv_v
-    grad_x = cos * m_u - sin * m_v
-    grad_y = sin * m_u + cos * m_v
+    grad_u = m_u * inv_u  # gradient of the mean along the axes of the Gaussian
+    grad_v = m_v * inv_v
+    grad_x = cos * grad_u - sin * grad_v
+    grad_y = sin * grad_u + cos * grad_v
+    grad_scale_u = m_uu * inv_u
+    grad_scale_v = m_vv * inv_v
     grad_rotation = m_uv * (scale_u * inv_v - scale_v * inv_u)
-    return torch.stack([grad_x, grad_y, m_uu * inv_u, m_vv * inv_v, grad_rotation], dim=-1)
+    return torch.stack([grad_x, grad_y, grad_scale_u, grad_scale_v, grad_rotation], dim=-1)
 
 
 def _warp_parameters(prepared):
