@@ -14,6 +14,7 @@ REPO = Path(__file__).resolve().parents[1]
 NAMES = [
     *("gsmap.BEVGrid", "gsmap.MapElements", "gsmap.MapEvaluator", "gsmap.MapInferencer"),
     *("gsmap.RasterLoss", "gsmap.list_models", "gsmap.load_model", "gsmap.render_gaussians"),
+    *("gsmap.OnnxInferencer", "gsmap.export_onnx", "gsmap.from_records", "mapdata.from_records"),
     *("drivemaps.write_geojson", "gsmap.apis.MapInferencer", "gsmap.apis.load_model"),
     *("gsmap.datasets.VectorizedMapDataset", "gsmap.evaluation.ChamferConfig"),
     *("gsmap.evaluation.MapEvaluator", "gsmap.evaluation.RasterConfig", "drivemaps.MapOrigin"),

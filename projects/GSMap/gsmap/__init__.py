@@ -37,4 +37,5 @@ __getattr__, __dir__, __all__ = lazy_names(
         "load_model": "apis",
         "render_gaussians": "ops",
     },
+    others={"from_records": "mapdata"},
 )

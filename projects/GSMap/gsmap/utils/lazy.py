@@ -7,27 +7,30 @@ from typing import Any
 
 
 def lazy_names(
-    package: str, modules: Mapping[str, str]
+    package: str, modules: Mapping[str, str], others: Mapping[str, str] | None = None
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """Make ``__getattr__``, ``__dir__`` and ``__all__`` of a package with lazy names.
 
     Args:
         package: ``__name__`` of the package.
         modules: Module, relative to the package, that defines each name.
+        others: Package that defines each name that does not lie in the package.
 
     Returns:
         ``__getattr__``, ``__dir__`` and ``__all__``.
     """
+    places = {name: f"{package}.{module}" for name, module in modules.items()}
+    places.update(others or {})
 
     def load(name: str) -> Any:
-        if name not in modules:
+        if name not in places:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        module = import_module(f"{package}.{modules[name]}")
+        module = import_module(places[name])
         value = getattr(module, name)
         setattr(sys.modules[package], name, value)
         return value
 
     def list_names() -> list[str]:
-        return sorted({*vars(sys.modules[package]), *modules})
+        return sorted({*vars(sys.modules[package]), *places})
 
-    return load, list_names, sorted(modules)
+    return load, list_names, sorted(places)

@@ -73,8 +73,8 @@ class RasterPrior(BaseModule, AddsWeights):
         test_rule: Rule of writing in tests.
         test_memory: Frames of a test that share a map: those of a place (``"kept"``), of a scene
             (``"scene"``), or none (``"none"``).
-        train_drop: Probability that a sample of a training reads an empty map, so that the model also
-            works without one; 0 as published.
+        train_drop: Probability that a sample of a training reads an empty map, so that the model
+            also works without one; 0 as published.
         neutral_start: Start parts that have no effect, so that the prior can be trained from the
             checkpoint of a model without one. False starts random parts, as published.
 
