@@ -229,7 +229,7 @@ def test_meta_refuses_bad_values():
             AnnotationMeta("x", "ego", "val", x_range=x_range)
     with pytest.raises(ValueError, match="classes"):
         AnnotationMeta("x", "ego", "val", classes=("a", "a"))
-    with pytest.raises(ValueError, match="classes must be names"):
+    with pytest.raises(ValueError, match="classes must be different names"):
         AnnotationMeta("x", "ego", "val", classes="abc")
     with pytest.raises(ValueError, match="at most 1000 classes, not 1001"):
         AnnotationMeta("x", "ego", "val", classes=[f"class {i}" for i in range(1001)])
