@@ -238,6 +238,25 @@ def test_the_work_grows_with_the_frames_of_a_drive(monkeypatch):
     assert work[1] < 2.3 * work[0]
 
 
+def test_duplicates_within_a_frame_change_nothing():
+    drive = drive_of(0.1, scored=True)
+    frames = []
+    for frame in drive.frames:
+        elements = frame.elements
+        doubles = [line + [0.3, 0.4] for line in elements.polylines]  # 0.5 m away
+        polylines = [*elements.polylines, *doubles]
+        labels = [*elements.labels, *elements.labels]
+        scores = [*elements.confidence, *(elements.confidence / 2)]
+        both = MapElements.from_polylines(polylines, labels, scores)
+        is_area = both.labels == CLASSES.index("ped_crossing")
+        is_double = np.arange(len(both)) >= len(elements)
+        frames.append(replace(frame, elements=both.select(~(is_area & is_double))))
+    expected = merge(drive)
+    found = merge(replace(drive, frames=frames))
+    np.testing.assert_array_equal(found.points, expected.points)
+    np.testing.assert_array_equal(found.labels, expected.labels)
+
+
 def test_lines_that_no_drive_has_are_refused_before_they_are_merged():
     drive = drive_of()
     frame = drive.frames[0]

@@ -282,3 +282,22 @@ def test_a_neutral_prior_learns():
         assert prior.queries.attention.out_proj.weight.grad.any() == (step > 0)
         assert bool(prior.bev.conv[0].weight.grad.any()) == (step > 0)
         assert bool(prior.queries.label_encoder.weight.grad.any()) == (step > 1)
+
+
+def test_a_dropped_map_is_empty_in_training_only():
+    torch.manual_seed(0)
+    samples = frames(("town", "a", 0.0))
+    metas = [sample.metainfo for sample in samples]
+    outputs = {"bev_feats": torch.zeros(1, 32, 12, 6), "img_feats": None}
+    read = {}
+    for train_drop in (0.0, 0.999):
+        model = prior_model(train_drop=train_drop, bev=None).train()
+        train_step(model, samples)
+        read[train_drop] = model.prior.fuse(outputs, metas, img_shape=(64, 96))[CELLS].any()
+        model.eval()
+        predict(model, samples)
+        assert model.prior.fuse(outputs, metas, img_shape=(64, 96))[CELLS].any()
+    assert read[0.0]
+    assert not read[0.999]
+    with pytest.raises(ValueError, match=r"train_drop must be in \[0, 1\)"):
+        prior_model(train_drop=1.0)
