@@ -243,7 +243,8 @@ def test_duplicates_within_a_frame_change_nothing():
     frames = []
     for frame in drive.frames:
         elements = frame.elements
-        doubles = [line + [0.3, 0.4] for line in elements.polylines]  # 0.5 m away
+        beside = np.array([0.3, 0.4])  # 0.5 m away
+        doubles = [line + beside for line in elements.polylines]
         polylines = [*elements.polylines, *doubles]
         labels = [*elements.labels, *elements.labels]
         scores = [*elements.confidence, *(elements.confidence / 2)]
