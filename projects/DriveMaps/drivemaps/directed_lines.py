@@ -63,5 +63,6 @@ def border_distances(
     starts = shapely.points(line[rows])
     crossings = shapely.intersection(rays[rows], borders.geometries[border_indices])
     nearest_m = np.full(len(line), np.inf)
-    np.fmin.at(nearest_m, rows, shapely.distance(starts, crossings))  # NaN: rounded to no crossing
+    # Rounding may lead to an empty crossing. Its distance is NaN, which `fmin` ignores.
+    np.fmin.at(nearest_m, rows, shapely.distance(starts, crossings))
     return nearest_m

@@ -248,7 +248,8 @@ def _match_pairs(
     start_along = start[:, 1] * normal[:, 0] - start[:, 0] * normal[:, 1]
     end_along = end[:, 1] * normal[:, 0] - end[:, 0] * normal[:, 1]
     extent = end_along - start_along
-    # Position of the crossing on the segment, from 0 (start) to 1 (end).
+    # Position of the crossing on the segment, from 0 (start) to 1 (end). A segment that is parallel
+    # to the normal has extent 0, and its position is 0.
     fraction = -start_along / np.where(extent == 0.0, np.inf, extent)
     distances = (normal * (start + fraction[:, None] * (end - start))).sum(axis=1)
     lengths = np.linalg.norm(end - start, axis=1)

@@ -20,11 +20,11 @@ from gsmap.structures.elements import FloatArray, MapElements
 from gsmap.utils.errors import InputError
 
 CLASS_KEY = "class"
-"""Property of the class of an element in the files of `write_geojson` and `write_lanelet2`."""
+"""Property with the class of an element in the files of `write_geojson` and `write_lanelet2`."""
 FARTHEST_M = 1e7
 """Largest coordinate of a vertex in metres of the global frame."""
 _MOST_VERTICES = 5_000_000
-_SMALLEST_M2 = 0.01  # smaller areas are points or lines
+_SMALLEST_M2 = 0.01  # a ring with a smaller area is a point or a line and is not used
 _LONGEST_NAME = 60  # characters of a value in a message
 _LISTED_REASONS = 8  # largest number of reasons in a message
 
@@ -112,7 +112,7 @@ class ElementCollector:
             values: Untrusted properties of the element.
 
         Returns:
-            Name of the class. None, if the element has none; it is then counted as unused.
+            Name of the class. None if the rule finds no class; the element is counted as unused.
         """
         value = values.get(self._rule.key)
         if isinstance(value, (int, float)):
@@ -131,7 +131,8 @@ class ElementCollector:
 
         Args:
             name: Class of the element.
-            line: Finite vertices in degrees or metres; areas are closed. (n, 2)
+            line: Finite vertices in degrees or metres. The last vertex of an area must be equal to
+                its first vertex. (n, 2)
             score: Confidence in [0, 1].
 
         Raises:

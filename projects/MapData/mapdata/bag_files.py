@@ -96,7 +96,7 @@ def _needs_mcap_reader(parts: Sequence[Path]) -> bool:
 
 
 def _listed_parts(folder: Path) -> list[Path]:
-    """Files in a folder that its metadata name."""
+    """Files in a folder that are named in the metadata of the folder."""
     text = _read_metadata(folder / _METADATA)
     listed_parts = []
     for part in parts_in(folder):

@@ -327,8 +327,8 @@ def _absence_notes(
         note = f"camera {name!r} has no image within 50 ms at {count} of {len(frames)} samples"
         if count == len(frames):
             note += (
-                f": its images are from {_span_text(image_times)}, those of {first!r} from "
-                f"{_span_text(times_ns[first])}"
+                f": its images are from {_span_text(image_times)}, and the images of {first!r} "
+                f"are from {_span_text(times_ns[first])}"
             )
         notes.append(note)
     return notes

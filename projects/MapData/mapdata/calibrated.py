@@ -79,7 +79,7 @@ def calibrated_records(
 
 
 def _name_of(record: Any, number: int) -> Any:
-    """Token of a record; its number if it has no token."""
+    """Token of a record, or the number of the record if it has no token."""
     return record.get("token", number) if isinstance(record, Mapping) else number
 
 

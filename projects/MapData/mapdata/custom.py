@@ -97,9 +97,9 @@ def from_records(
         Number of samples.
 
     Raises:
-        FileNotFoundError: If an image without a given size is missing, or the calibration file.
-        ValueError: If a record or the calibration file is malformed; the message names the token or
-            that file. No annotation file is left then.
+        FileNotFoundError: If the calibration file is missing, or an image whose size is not given.
+        ValueError: If a record or the calibration file is malformed. The message names the token of
+            the record or the calibration file. In this case, no annotation file remains.
     """
     if meta.frame == "ego" and meta.ground_z_m is None:
         _LOGGER.warning(_UNKNOWN_ROAD, path)

@@ -135,7 +135,7 @@ class LanePaths:
         return self._last_lines
 
     def _subgraph(self, lanes: Sequence[int]) -> dict[int, list[Edge]]:
-        """Edges that leave each node in the graph of some lanes, in their order."""
+        """Edges that leave each node in the graph of some lanes, in the order of the lanes."""
         members = set(lanes)
         graph: dict[int, dict[Edge, None]] = {}  # inner dicts: ordered sets
         for lane in lanes:

@@ -166,7 +166,7 @@ def sample_overlap(train: Places, val: Places) -> tuple[np.ndarray, np.ndarray]:
 
     Returns:
         Distance of each validation sample in metres (m,), and the row of its nearest training
-        sample (m,); infinite and -1 on maps without training.
+        sample (m,). On maps without training samples, the distance is infinite and the row is -1.
     """
     distance = np.full(len(val.tokens), np.inf)
     nearest = np.full(len(val.tokens), -1)
@@ -181,7 +181,10 @@ def sample_overlap(train: Places, val: Places) -> tuple[np.ndarray, np.ndarray]:
 
 
 def draw_overlap(train: Places, val: Places, distance_m: np.ndarray) -> "Figure":
-    """Draw a panel per map: training grey, validation blue, or red within 5 m of training.
+    """Draw a panel per map with the positions of the samples.
+
+    Training samples are grey and validation samples are blue. Validation samples within 5 m of a
+    training sample are red.
 
     Args:
         train: Positions of the training samples.

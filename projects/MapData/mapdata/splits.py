@@ -54,9 +54,9 @@ class SplitList:
         known = f"{total - len(missing)} of the {total} scenes of the splits are in {where}"
         if self.complete and not allowed:
             raise InputError(
-                f"split {self.name!r}: only {known}, {min(missing)!r} is not: add the parts of the "
-                "data set that hold the others (docs/data.md), or take those that are there with "
-                "--allow-missing, for figures that compare with no others."
+                f"split {self.name!r}: only {known}, and {min(missing)!r} is not: add the parts of "
+                "the data set with the missing scenes (docs/data.md), or use the present scenes "
+                "with --allow-missing, for figures that are not compared with published ones."
             )
         return f"{known}, which has no more."
 

@@ -97,7 +97,8 @@ def scan(
     elevation = np.linspace(LOWEST_RAD, HIGHEST_RAD, num=BEAMS)
     level = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
     slope = np.tan(elevation)
-    # Horizontal distance at which each beam meets the ground, z = 0; inf for level and rising ones.
+    # Horizontal distance at which each beam meets the ground, z = 0. It is infinite for beams that
+    # are level or rise.
     ground = np.where(slope < -1e-3, -origin[2] / np.minimum(slope, -1e-3), np.inf)
     # Horizontal distance and box of the hit of each ray; -1 stands for the ground.
     reach = np.broadcast_to(ground[:, None], (BEAMS, COLUMNS)).copy()

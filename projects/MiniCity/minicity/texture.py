@@ -143,7 +143,7 @@ def paint_ground(
 
 
 def _halve_repeatedly(color: Image) -> list[Image]:
-    """Image (H, W, 3) at ``LEVELS`` resolutions, each half of the one before."""
+    """Image (H, W, 3) at ``LEVELS`` resolutions, each half of the previous one."""
     levels: list[Image] = [color]
     for _ in range(LEVELS - 1):
         rows, columns = levels[-1].shape[:2]

@@ -87,7 +87,8 @@ def follow_lanes(town: Town, first: Lane, length_m: float, rng: np.random.Genera
     Args:
         town: The town.
         first: First lane.
-        length_m: Least length of the path in metres, unless the lanes end before.
+        length_m: Least length of the path in metres. The path is shorter if its lanes have no
+            successor.
         rng: Source of the turns.
 
     Returns:

@@ -90,7 +90,7 @@ def test_frame_numbers_follow_rate_hz_in_their_order(tmp_path):
 def test_times_that_rate_hz_contradicts_are_refused(tmp_path):
     names = [f"{1_500_000_042 + i}.png" for i in range(3)]
     with pytest.raises(
-        ValueError, match=r"read as Unix times \(2017-.*every 1 s, and rate_hz says 10"
+        ValueError, match=r"read as Unix times \(2017-.*every 1 s, but rate_hz is 10"
     ):
         open_input(folder_of(tmp_path / "a", {"front": names}, rate_hz=10))
     for number, more in enumerate(({"rate_hz": 1}, {})):

@@ -17,7 +17,8 @@ from gsmap.utils.errors import InputError
 if TYPE_CHECKING:
     from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
 
-_LACK_OF_RESOURCES = {errno.EMFILE, errno.ENFILE, errno.ENOMEM}  # open files and memory
+# Too many open files of the process or of the system, and too little memory.
+_LACK_OF_RESOURCES = {errno.EMFILE, errno.ENFILE, errno.ENOMEM}
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ class FrameDataset(Dataset):
             raise InputError(
                 f"sample {sample.token!r} lacks the cameras {absent}, which the model expects; it "
                 f"has {sorted(present)}. With --allow-missing-cameras (allow_missing_cameras=True) "
-                "absent ones are left blank, as long as one is there."
+                "absent cameras are left blank if at least one camera is present."
             )
         partial_dataset = copy.copy(self.dataset)
         partial_dataset.cameras = tuple(name for name in cameras if name in present)
@@ -112,13 +113,14 @@ def _add_blank_cameras(item: dict[str, Any], cameras: Sequence[str]) -> dict[str
 
     Returns:
         The item with images (V, 3, H, W) and matrices (V, 4, 4) of all cameras. ``img_path`` is
-        None for an absent one.
+        None for an absent camera.
     """
     sample = item["data_samples"].clone()
     meta = sample.metainfo
     images = item["inputs"]["img"]
     intrinsics = meta["cam2img"][0]
     augmentation = meta["img_aug_matrix"][0]
+    # An absent camera has the intrinsics of the first camera, and a pose without sight of the map.
     blank_matrices = {
         "cam2img": intrinsics,
         "img_aug_matrix": augmentation,

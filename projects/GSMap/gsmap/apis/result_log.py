@@ -17,13 +17,13 @@ _SUFFIX = ".unfinished"
 class ResultLog:
     """File ``OUT.unfinished`` with one line per frame, which becomes ``OUT`` when it is complete.
 
-    A context manager. The frames of an interrupted run with equal settings are reused.
+    The log is a context manager. It reuses the frames of an interrupted run with equal settings.
 
     Args:
         out: The result file.
         settings: Settings that determine the predictions, as plain values.
-        tokens: Tokens of the frames of the run; None allows any in the file.
-        classes: Classes of the model; None allows any in the file.
+        tokens: Tokens of the frames of the run. If None, the file may have frames of any token.
+        classes: Classes of the model. If None, the file may have elements of any class.
 
     Raises:
         RuntimeError: If another process writes the result file.
@@ -67,12 +67,11 @@ class ResultLog:
         return self
 
     def _resume(self) -> None:
-        """Read the finished frames of the file, and cut off what does not belong to this run.
+        """Read the finished frames of the file, and remove other content from the file.
 
-        An incomplete last line is cut off, and the frames of a run with other settings.
-
-        The first line has the settings, every other line a frame. A killed run may leave an
-        incomplete last line.
+        The first line of the file has the settings of a run, and every other line has a frame. If
+        the settings differ from the settings of this run, all frames are removed. Otherwise only an
+        incomplete last line is removed, which a killed run may leave.
         """
         self._file.seek(0)
         head = self._file.readline()
@@ -137,14 +136,15 @@ class ResultLog:
             read_vectors(vectors, classes or (), unknown, gaussians=True)
         except (ValueError, KeyError, TypeError, OverflowError):
             return False
-        return classes is None or not unknown.keys() - {THREE_D}  # elements with heights are valid
+        unknown.pop(THREE_D, None)  # counts the elements with heights, which are valid
+        return classes is None or not unknown
 
     def _require(self, is_valid: bool, line_number: int) -> None:
         """Raise an error about a line that is not valid."""
         if not is_valid:
             raise InputError(
-                f"{self.path}, line {line_number}, is no frame of this run: the file is damaged, "
-                "or another program's. Take it away to begin again, or give another --out."
+                f"{self.path}, line {line_number}, is no frame of this run: the file is damaged or "
+                "was written by another program. Remove it to begin again, or give another --out."
             )
 
     def __exit__(self, *exception: object) -> None:

@@ -121,7 +121,7 @@ def _remedy_for(path: object, default: str) -> str:
 
 
 def _exceeds_file_size(error: BaseException, path: Path) -> bool:
-    """Whether the failed allocation was larger than the file: then a size in it is damaged."""
+    """Whether a failed allocation was larger than a file, because a size in the file is damaged."""
     allocation = re.search(r"allocate (\d+) bytes", str(error))
     if allocation is None or not path.is_file():
         return False
@@ -355,7 +355,9 @@ def _build_settings(
 
 
 def _with_elements_of(settings: dict[str, Any], config: dict[str, Any]) -> dict[str, Any]:
-    """Take ``temporal.elements``, the memory of map elements, from the config: it has no weights.
+    """Replace ``temporal.elements`` in the settings of a checkpoint by the value in the config.
+
+    This setting describes the memory of map elements, which has no weights.
 
     Args:
         settings: Settings of the model in a checkpoint.

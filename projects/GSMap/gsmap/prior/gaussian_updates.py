@@ -160,7 +160,8 @@ def measure(means: FloatArray, angles: FloatArray, lines: LineSamples) -> Measur
     extent, rise = (ends - starts).T
     start_along, start_across = starts.T
     end_along = ends[:, 0]
-    # The segment crosses the normal, where `along` is 0, at this share of its length.
+    # The segment crosses the normal, where `along` is 0, at this share of its length. A segment
+    # that is parallel to the normal has extent 0, and its share is 0.
     fraction = -start_along / np.where(extent == 0, np.inf, extent)
     distances = start_across + fraction * rise
     begins_before = np.minimum(start_along, end_along) <= _ROUNDING_M

@@ -105,7 +105,7 @@ def read_image_folder(
 
 
 def _read_timing(content: Mapping[str, Any]) -> tuple[float | None, int]:
-    """Rate of a calibration file, None if it has none, and its tolerance in nanoseconds."""
+    """Rate in Hz (None if the file has none) and tolerance in ns of a calibration file."""
     rate_hz = float(content["rate_hz"]) if "rate_hz" in content else None
     tolerance_ns = round(float(content.get("max_time_difference_ms", 50.0)) * 1e6)
     is_rate_valid = rate_hz is None or 0 < rate_hz < np.inf
@@ -115,7 +115,7 @@ def _read_timing(content: Mapping[str, Any]) -> tuple[float | None, int]:
 
 
 def _digest(file: Path, frames: Sequence[RigFrame], target_key: bytes) -> str:
-    """Digest of a calibration file, the images of frames, and the key of their rectification."""
+    """Digest of a calibration file, of the images of frames, and of the key of a rectification."""
     digest = hashlib.sha256(file.read_bytes() + target_key)
     for frame in frames:
         for path, _ in frame.images.values():
@@ -258,9 +258,9 @@ def _check_rate(times_ns: Sequence[int], rate_hz: float | None) -> None:
     step_s = float(np.median(np.diff(times_ns))) / 1e9
     if not 0.5 < step_s * rate_hz < 2:
         raise InputError(
-            f"the names of the images read as Unix times ({span_of(times_ns)}), one every "
-            f"{step_s:g} s, and rate_hz says {rate_hz:g} a second: leave rate_hz out if they are "
-            "times, else rename the images (0001.jpg, 0002.jpg, ...)"
+            f"the names of the images can be read as Unix times ({span_of(times_ns)}), one every "
+            f"{step_s:g} s, but rate_hz is {rate_hz:g}: leave rate_hz out if the names are times, "
+            "or else rename the images (0001.jpg, 0002.jpg, ...)"
         )
 
 
@@ -277,8 +277,8 @@ def _usage_notes(
         if not counts[name] == len(paths) == len(frames):
             notes.append(
                 f"camera {name!r}: {counts[name]} of {format_count(len(paths), 'image')} used, for "
-                f"{format_count(len(frames), 'sample')}; the others have no partner among those of "
-                f"{first!r}, by equal names or by times within {tolerance_ns / 1e6:g} ms"
+                f"{format_count(len(frames), 'sample')}; no image of {first!r} has the name of one "
+                f"of the other images, or a time within {tolerance_ns / 1e6:g} ms of it"
             )
     return notes
 

@@ -114,7 +114,7 @@ def _require_columns(names: Collection[str]) -> None:
 
 
 def _time_of(row: Mapping[str, str], time_of: Mapping[str, int]) -> int | None:
-    """Time of a row in nanoseconds; None if its frame is not the name of an image."""
+    """Time of a row in nanoseconds; None if no image has the name in the row."""
     if _FRAME in row:
         name = row[_FRAME]
         return time_of.get(name, time_of.get(Path(name).stem))

@@ -175,7 +175,7 @@ class NuScenesTables:
         self.scene = list(self._records["scene"].values())
 
     def _store(self, table: str, records: Iterable[dict[str, Any]]) -> None:
-        """Store the records of a table by token; linked tables must be stored before."""
+        """Store the records of a table by token. Tables that they refer to must be stored first."""
         records_by_token: dict[str, dict[str, Any]] = {}
         self._records[table] = records_by_token
         for record in records:
@@ -223,9 +223,9 @@ class NuScenesTables:
         if len(lidars) == 1 and self.frame == "ego":
             return cameras, lidars[0]
         raise InputError(
-            f"{self._folder} has no {LIDAR}, whose axes are those of the frame `lidar`; its "
-            f"channels are {sorted(channels)!r:.300}. Name the LiDAR so if its axes are (x right, "
-            "y ahead); else convert with --frame ego, which takes one LiDAR of any name."
+            f"{self._folder} has no {LIDAR}, which defines the frame `lidar`, but the channels "
+            f"{sorted(channels)!r:.300}. Name the LiDAR {LIDAR} if its axes are (x right, y "
+            "ahead); else convert with --frame ego, which takes one LiDAR of any name."
         )
 
     def _read_sample_data(self) -> Iterator[dict[str, Any]]:

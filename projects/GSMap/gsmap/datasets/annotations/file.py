@@ -93,7 +93,7 @@ class AnnotationWriter:
             sample: Sample with a token that is not in the file.
 
         Raises:
-            ValueError: If a shape or a value is wrong, or the token was written before.
+            ValueError: If a shape or a value is wrong, or the file already has the token.
         """
         if sample.token in self._tokens:
             raise InputError(f"sample {sample.token!r} was already written to {self.path}.")
@@ -162,7 +162,7 @@ def write_annotations(
         Number of samples.
 
     Raises:
-        ValueError: If a sample is malformed. No file is written then.
+        ValueError: If a sample is malformed. In this case, no file is written.
     """
     with AnnotationWriter(path, meta, shard=shard, source=source) as writer:
         for sample in samples:

@@ -212,7 +212,8 @@ def motion_blur(image: Image, level: int, rng: np.random.Generator) -> Image:
         level: Severity from 0 to 4.
         rng: Not used.
     """
-    length = 2 * round(_BLUR_LENGTHS[level] * image.shape[1] / 2) + 1  # odd: without a shift
+    # An odd length does not shift the image.
+    length = 2 * round(_BLUR_LENGTHS[level] * image.shape[1] / 2) + 1
     return np.asarray(cv2.blur(image, (length, 1)), dtype=np.uint8)
 
 

@@ -22,7 +22,8 @@ from gsmap.datasets.transforms.image_steps import (
 )
 from gsmap.utils.errors import InputError
 
-_MAX_BILINEAR_SHRINKAGE = 2.0  # beyond it, bilinear sampling of four pixels leaves pixels out
+# By larger factors, bilinear interpolation between four pixels skips some pixels of the image.
+_MAX_BILINEAR_SHRINKAGE = 2.0
 
 
 @TRANSFORMS.register_module()
@@ -30,7 +31,7 @@ _MAX_BILINEAR_SHRINKAGE = 2.0  # beyond it, bilinear sampling of four pixels lea
 class LoadCameraImages(BaseTransform):
     """Load and check the images of all cameras.
 
-    Adds the keys of ``LoadMultiViewImageFromFiles`` of mmdet3d that other transforms read, and
+    It adds the keys of ``LoadMultiViewImageFromFiles`` of mmdet3d that other transforms read, and
     ``lidar2img``, ``img_aug_matrix`` (lists of (4, 4)) and ``img_path``. Smaller images are padded
     at the bottom and right to the size of the largest; ``raw_shapes`` has (height, width) of each
     image before the padding. Unlike in mmdet3d, images are contiguous arrays and not strided views
@@ -97,7 +98,7 @@ class ScaleImages(BaseTransform):
         scale: Factor, > 0. Sizes are rounded down, and the matrices are multiplied by the exact
             ratio of each axis. Either ``scale`` or ``size`` must be given.
         size: Width and height of all images after the transform, in pixels. The padding of smaller
-            images is removed before.
+            images is removed first.
         trained_size: Width and height of the training images in pixels. If ``scale`` leads to
             another length of the longer side, the images are resized to the longer side of
             ``trained_size`` instead, without cropping or padding. They are averaged by area if they

@@ -91,7 +91,7 @@ def map_targets(
     is_unused = orders == PADDING
     points = clamp(points, x_range=x_range, y_range=y_range)
     orders = clamp(orders, x_range=x_range, y_range=y_range)
-    orders[is_unused] = PADDING  # `clamp` has moved it to the edge
+    orders[is_unused] = PADDING  # `clamp` has moved the padding to the edge
     polylines = clamp(polylines, x_range=x_range, y_range=y_range)
     labels = [instance.label for instance in instances]
     return InstanceData(
@@ -114,7 +114,8 @@ def ends_meet(
 ) -> bool:
     """Test whether the ends of a line almost meet.
 
-    Along x and y, they are less than a thousandth of the extent of the map apart.
+    Along x and along y, the distance of the ends must be at most about a thousandth of the map's
+    extent.
 
     Args:
         points: Points of the line in metres. (P, D)

@@ -117,7 +117,8 @@ class MakeInstanceMasks(BaseTransform):
         """Draw the masks.
 
         Raises:
-            ValueError: If the sample has no ground truth, or `FormatMapTargets` is missing before.
+            ValueError: If the sample has no ground truth, or the pipeline has no `FormatMapTargets`
+                before this transform.
         """
         instances = ground_truth_elements(results, self)
         if "gt_instances_3d" not in results:

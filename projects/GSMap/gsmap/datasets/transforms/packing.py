@@ -84,5 +84,7 @@ class PackMapInputs(BaseTransform):
 
 
 def _is_finite(image: NDArray[np.floating[Any]]) -> bool:
-    """Test whether all values are finite. A finite sum proves it fast, but a sum may overflow."""
+    """Test whether all values of an image are finite."""
+    # The sum is fast to compute. If it is finite, so are all values. An infinite sum may also be an
+    # overflow, so then each value is tested.
     return bool(np.isfinite(image.sum()) or np.isfinite(image).all())

@@ -237,6 +237,7 @@ def _nearest(sample: Sample, config: ChamferConfig) -> tuple[IntArray, FloatArra
         config.dim,
     )
     limit = config.thresholds[-1]
+    # Without a cached result, the limit is -inf, so the distances are computed.
     cached_limit, nearest = sample.cache.get(rules, (-np.inf, None))
     if cached_limit < limit:
         nearest = nearest_by_chamfer(

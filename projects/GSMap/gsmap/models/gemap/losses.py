@@ -20,7 +20,7 @@ NORM_EPS = 1e-6  # added to the product of two lengths: an edge may be a single 
 
 
 def shape_features(points: Tensor) -> Tensor:
-    """Length of each edge, cosine and sine of its angle to the edge before.
+    """Length of each edge, and cosine and sine of the angle from the previous edge to the edge.
 
     Args:
         points: Normalised points. (..., P, 2)

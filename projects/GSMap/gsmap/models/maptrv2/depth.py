@@ -32,6 +32,7 @@ def depth_bins(depth_m: Tensor, stride: int, depth_range: tuple[float, float, fl
     low, _, step = depth_range
     blocks = depth_m.unflatten(dim=-1, sizes=(-1, stride))
     blocks = blocks.unflatten(dim=-3, sizes=(-1, stride))  # (..., h, s, w, s)
+    # A pixel without a return is infinitely far, beyond all bins.
     returns = torch.where(blocks == 0, torch.inf, blocks)
     nearest = returns.amin((-3, -1))  # (..., h, w)
     # Position in bins, counted from one bin before the first: bin i is from i + 1 to i + 2.

@@ -28,14 +28,14 @@ def significances(points: Points) -> NDArray[np.float64]:
     areas = np.full(len(points), fill_value=np.inf)
     areas[1:-1] = _triangle_areas(points[:-2], points[1:-1], points[2:])
     remaining = list(range(len(points)))
-    # Position of a neighbour that is to be removed next, as it is no more significant than the
-    # point before; 0 if there is none.
+    # Position of a neighbour that is removed next, because its significance is not larger than that
+    # of the removed point. 0, the position of an end, if there is no such neighbour.
     next_position = 0
     while len(remaining) > 2:
         position = next_position or int(np.argmin(areas[remaining]))
         smallest = areas[remaining.pop(position)]
         next_position = 0
-        # After the removal, the neighbours of the point are at its position and at the one before.
+        # After the removal, the neighbours of the point are at `position` and `position - 1`.
         for neighbour in (position, position - 1):
             if not 0 < neighbour < len(remaining) - 1:
                 continue
