@@ -48,7 +48,7 @@ def main(argv: list[str] | None = None) -> str:
         nargs="+",
         default=[],
         metavar="MODULE",
-        help="modules that register your own metrics, if the parts have some",
+        help="modules that register your own metrics, if the parts have such metrics",
     )
     args = parser.parse_args(argv)
     for module in args.custom_imports:

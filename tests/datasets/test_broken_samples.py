@@ -23,7 +23,7 @@ def test_missing_truncated_and_foreign_images_are_named(build, copied_root):
             dataset[0]
     image = cv2.imread(str(path.with_name("whole.jpg")))
     for damage, message in (
-        (cv2.resize(image, (200, 112)), "has 200 x 112 pixels, its record says"),
+        (cv2.resize(image, (200, 112)), "has 200 x 112 pixels, but its record"),
         (cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE), "has 225 x 400 pixels"),
     ):
         cv2.imwrite(str(path), damage)

@@ -68,4 +68,4 @@ def test_the_check_counts_elements_and_doubts_truth_and_cameras(tmp_path: Path, 
     assert "warning: calibration: camera 'front' " in text
     caplog.clear()
     from_records(wrong, [record("a", looking, here)], AnnotationMeta("x", "ego", "v"), tmp_path)
-    assert "does not say how high the road is in the frame 'ego'" in caplog.text
+    assert "does not contain the height of the road in the frame 'ego'" in caplog.text

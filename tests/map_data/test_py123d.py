@@ -215,7 +215,7 @@ def test_other_tables_are_named(tmp_path):
         cases.write_table(folder / f"{key}.arrow", columns, {})
     text, file = convert(tmp_path)
     tables = "box_detections_se3, camera_semantic.pcam_f0, lidar.lidar_merged"
-    assert f"not read (cameras, poses and maps are): {tables}" in text
+    assert f"only cameras, poses and maps are read, but not the tables {tables}" in text
     check_first_sample(tmp_path, file)
 
 

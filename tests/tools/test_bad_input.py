@@ -104,7 +104,7 @@ test: C K --work-dir w --cfg-options test_evaluator.thresholds=[a] | thresholds 
 test: nowhere.py K | There is no config file nowhere.py
 test: C nowhere.pth | There is no checkpoint nowhere.pth
 test: C foreign.pth --work-dir w | the checkpoint does not fit the model
-test: C maptr.pth --work-dir w | or use them as they start: --cfg-options model.allow_untrained=True
+test: C maptr.pth --work-dir w | or use these parts with their initial weights: --cfg-options model.allow_untrained=True
 export: C maptr.pth --out out.onnx | was never trained with parts
 test: C K --eval | Nothing to do
 test: C K --out . | Is a directory

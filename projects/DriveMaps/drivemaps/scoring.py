@@ -46,7 +46,7 @@ def chamfer_ap(
 
 
 def _with_mean(value_of_class: dict[str, float]) -> dict[str, float]:
-    """Add the mean of all classes, NaN if there is none."""
+    """Add the mean of all classes. Without classes, the mean is NaN."""
     mean = float(np.mean(list(value_of_class.values()))) if value_of_class else np.nan
     return value_of_class | {"mean": mean}
 
@@ -121,10 +121,11 @@ def map_figures(
         drives: Drives with equal classes. (D,)
 
     Returns:
-        Values in [0, 1] by figure, then by class or ``mean``. ``AP`` is the AP of whole elements,
-        ``AP per sample`` the AP of the maps cut to the range of each sample. ``completeness@T`` is
-        the share of the true length within T metres of the predicted map, and ``accuracy@T`` the
-        share of the predicted length within T metres of the true map, over all drives.
+        Values in [0, 1] by figure, then by class or ``mean``. ``AP`` is the AP of whole elements.
+        ``AP per sample`` is the AP of the maps cut to the range of each sample.
+        ``completeness@T`` is the share of the true length within T metres of the predicted map.
+        ``accuracy@T`` is the share of the predicted length within T metres of the true map. Both
+        shares are over all drives.
     """
     classes = drives[0].classes
     whole_pairs = []

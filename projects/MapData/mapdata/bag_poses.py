@@ -177,8 +177,8 @@ class FrameTree:
         if not known_names:
             raise InputError(
                 f"its transforms have no frame {wanted or ' or '.join(VEHICLE_FRAMES)!s}: name the "
-                f"vehicle's with --vehicle-frame, or give --calibration calibration.yaml; there "
-                f"are {sorted(self.frames) or 'no transforms at all'}"
+                f"frame of the vehicle with --vehicle-frame, or give --calibration "
+                f"calibration.yaml; there are {sorted(self.frames) or 'no transforms at all'}"
             )
         for name in known_names:
             self._choose_parents(name)

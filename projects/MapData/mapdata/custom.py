@@ -38,8 +38,9 @@ _UNMOUNTED = (
     "cannot use it."
 )
 _UNKNOWN_ROAD = (
-    "%s does not say how high the road is in the frame 'ego': pictures and inference will take it "
-    "to be 0.31 m below the origin (Argoverse 2's axle); AnnotationMeta(ground_z_m=...) says it."
+    "%s does not contain the height of the road in the frame 'ego': pictures and inference will "
+    "take the road to be 0.31 m below the origin (Argoverse 2's axle); set the height with "
+    "AnnotationMeta(ground_z_m=...)."
 )
 _ALL_ELEMENTS_LOST = (
     "%d of %d records lose all of their elements (the first is %r), as none lies in x_range and "

@@ -227,7 +227,8 @@ class LiveMap:
                 self._logged_warnings.add(line)
         model_cameras = self._config.get("cameras") or pixels
         unknown = set(pixels) - set(model_cameras)
-        # if the model has none of the names, cameras are assigned to it by their directions
+        # If the model has no camera with such a name, the cameras are assigned to the cameras of
+        # the model by their directions.
         if unknown and unknown != set(pixels):
             raise InputError(
                 f"the model has the cameras {list(self._config.cameras)}, but not "

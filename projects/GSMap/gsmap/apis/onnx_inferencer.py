@@ -48,7 +48,7 @@ class OnnxInferencer:
         cameras: Names of the cameras, in the order of images and matrices.
         image_size: Rows and columns of the images, in pixels.
         prior_shape: Shape (classes, H, W) of the window of a map prior; None if the model reads
-            none. The window covers ``x_range`` and ``y_range`` of the metadata.
+            no prior. The window covers ``x_range`` and ``y_range`` of the metadata.
         metadata: Metadata of the file. ``ground_from_frame`` (4, 4), if present, is the transform
             in metres from the annotation frame to the ground below the rear axle (x ahead, y left,
             z up) in the training data. The frame of a vehicle's calibration must have this pose.
@@ -203,7 +203,7 @@ class OnnxInferencer:
             The inputs by their names, in float32.
 
         Raises:
-            ValueError: As a call.
+            ValueError: If an input does not fit, as for a call of the predictor.
         """
         self._check_images(images)
         self._check_signals(meta)
@@ -249,7 +249,7 @@ class OnnxInferencer:
             raise InputError(f"{self.path.name} needs can_bus, {POSE_ONLY_RULE}.")
         raise InputError(
             f"{self.path.name} needs can_bus, {CAN_BUS_RULE}. From poses: motion_signals of "
-            "gsmap.structures.vehicle_signals; zeros for a model that was trained without."
+            "gsmap.structures.vehicle_signals; zeros for a model that was trained without signals."
         )
 
     def _stream_inputs(self, meta: Mapping[str, Any], stream: Scenes | None) -> dict[str, Any]:
@@ -270,6 +270,7 @@ class OnnxInferencer:
         (previous,) = stream.previous([frame])
         continues = previous is not None
         if previous is None:
+            # For the first frame of a drive, the motion is the identity and 0 s have passed.
             previous = StreamState(frame, values=self._initial_memory)
         motion = frame.motion_from(previous.frame)  # (4, 4)
         seconds = frame.seconds_after(previous.frame)

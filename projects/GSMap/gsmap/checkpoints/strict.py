@@ -91,8 +91,8 @@ def adapt_state(
     if untrained and not allow_untrained:
         raise InputError(
             "the checkpoint was never trained with parts of the config's model: "
-            f"{summarize_names(untrained)}. Give the config that it was trained with, or use them "
-            "as they start: --cfg-options model.allow_untrained=True."
+            f"{summarize_names(untrained)}. Give the config that it was trained with, or use these "
+            "parts with their initial weights: --cfg-options model.allow_untrained=True."
         )
 
 

@@ -130,9 +130,8 @@ def decode_image(
         ) from error
     if image is None:
         raise BrokenSampleError(
-            f"{where}: {path} has {width} x {height} pixels, its record says {size}, and the "
-            "calibration is for that: copy the original, or make the annotation file for these "
-            "images."
+            f"{where}: {path} has {width} x {height} pixels, but its record and its calibration "
+            f"are for {size}: copy the original, or make the annotation file for these images."
         )
     return image
 
@@ -258,7 +257,7 @@ def _check_num_pixels(size: tuple[int, int]) -> None:
 
 
 def _require_upright(picture: Image.Image) -> None:
-    """Raise an error for an EXIF rotation: calibrations refer to the stored pixels."""
+    """Raise an error for an EXIF rotation, because calibrations refer to the stored pixels."""
     orientation = picture.getexif().get(_ORIENTATION_TAG)
     if orientation in _ROTATIONS:
         raise _UnfitError(

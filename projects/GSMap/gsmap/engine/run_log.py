@@ -257,8 +257,8 @@ def _missed_elements_warning(runner: Runner, model: Any) -> str | None:
     return (
         f"{num_crowded} of {samples} have more elements (up to {counts.max()}) than the "
         f"model has queries ({queries}): {excess.sum()} elements can never be found. Set "
-        "model.map_head.query_groups=[dict(num=...)] to more (in the template _queries), or take "
-        "a smaller range."
+        "model.map_head.query_groups=[dict(num=...)] (_queries in the template) to a larger "
+        "number, or use a smaller range."
     )
 
 

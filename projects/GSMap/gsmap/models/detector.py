@@ -228,7 +228,7 @@ class MapDetector(Base3DDetector):
             if self.bev_fuser is not None:
                 feats = self.bev_fuser(outputs["bev_feats"], feats)
             outputs = {**outputs, "bev_feats": feats}
-        if self.prior is not None:  # which only models with cameras have
+        if self.prior is not None:  # only models with cameras can have a prior
             outputs = self.prior.fuse(outputs, metas, img_shape=tuple(imgs.shape[-2:]))
         return outputs
 

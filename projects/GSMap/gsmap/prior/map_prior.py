@@ -272,8 +272,8 @@ class MapPrior:
         dx, dy = grid.pixel_size_m
         x = grid.x_range[0] + dx * (np.arange(grid.width) + 0.5)  # (W,)
         y = grid.y_range[0] + dy * (np.arange(grid.height) + 0.5)  # (H,)
-        # The grid lies in a square of num_cells around the origin of the frame. A grid in one
-        # quadrant has a quarter of them.
+        # The grid lies in a square of num_cells around the origin of the frame. If it lies in one
+        # quadrant, it has a quarter of these cells.
         corner_m = max(map(abs, (*grid.x_range, *grid.y_range)))
         num_cells = (2 * corner_m / self.settings.cell_m) ** 2
         if not num_cells <= 4 * _MOST_CELLS:

@@ -10,7 +10,8 @@ from gsmap.utils.errors import InputError
 
 _NUMBER_WORDS = ("auto", "cores", "dynamic")  # texts that some settings take in place of a number
 _SEARCHED_FRAMES = 10  # frames from the one that raises an error
-_UNSUSPECTED = ("data_root", "image_scale")  # last parts of the names that other options set
+# Last parts of the names that are not searched, because other options of commands set these values.
+_UNSUSPECTED = ("data_root", "image_scale")
 
 
 class _Command:

@@ -51,8 +51,8 @@ def convert_argoverse2(options: Argoverse2Options) -> ConversionSummary:
 
     Raises:
         FileNotFoundError: If the split or a requested log is missing.
-        RuntimeError: If no sample is left (allowed for a shard), or a worker process dies. Nothing
-            is written then.
+        RuntimeError: If no sample is left (allowed for a shard), or a worker process dies. In
+            this case, no file is written.
         OSError: If the file cannot be written, for example on a full disk. No partial file remains.
     """
     summary = ConversionSummary(options.classes)

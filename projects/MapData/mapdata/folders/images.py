@@ -277,8 +277,9 @@ def _usage_notes(
         if not counts[name] == len(paths) == len(frames):
             notes.append(
                 f"camera {name!r}: {counts[name]} of {format_count(len(paths), 'image')} used, for "
-                f"{format_count(len(frames), 'sample')}; no image of {first!r} has the name of one "
-                f"of the other images, or a time within {tolerance_ns / 1e6:g} ms of it"
+                f"{format_count(len(frames), 'sample')}; the others have no partner among the "
+                f"images of {first!r}, which has the same name or a time within "
+                f"{tolerance_ns / 1e6:g} ms"
             )
     return notes
 

@@ -221,8 +221,8 @@ def _entries(content: Any, path: Path) -> tuple[list[Mapping[str, Any]], str]:
     if isinstance(first, Mapping) and "e2g_translation" in first and not first.keys() >= _MAPTRV2:
         missing = ", ".join(sorted(_MAPTRV2 - first.keys()))
         raise InputError(
-            f"{path} is an info file of StreamMapNet or MapTracker, or of another form than "
-            f"MapTRv2's: its samples lack {missing}. Convert the data set itself with "
+            f"{path} is an info file of StreamMapNet or MapTracker, or its format is not the one "
+            f"of MapTRv2: its samples lack {missing}. Convert the data set itself with "
             "tools/create_data.py nuscenes or av2."
         )
     for key, frame in (("infos", "lidar"), ("samples", "ego")):

@@ -153,8 +153,8 @@ def _resolve_splits(
         split_of, missing = resolve_scenes(split_list.scenes, names)
     if not split_of:
         raise InputError(
-            f"none of the split's scenes is in {where}: it has {sorted(names.values())[:5]}; give "
-            "--split-file."
+            f"none of the split's scenes is in {where}, which has {sorted(names.values())[:5]}: "
+            "give --split-file."
         )
     notes = []
     if missing:

@@ -126,9 +126,9 @@ def open_layers(root: Path, name: str, classes: Collection[str]) -> MapLayers:
     if not path.is_file():
         raise FileNotFoundError(
             f"no map expansion for {name!r} in {path.parent}, which has "
-            f"{', '.join(maps_in(root)) or 'none'}. Unpack nuScenes' map expansion pack (v1.3) "
-            f"there, or put {path.name} there in its form; for other maps write the annotation "
-            "file with mapdata.custom.from_records (docs/custom_data.md)."
+            f"{', '.join(maps_in(root)) or 'no map'}. Unpack nuScenes' map expansion pack (v1.3) "
+            f"there, or put a file {path.name} of the same format there; for maps of another "
+            "format, write the annotation file with from_records (docs/custom_data.md)."
         )
     skipped: Counter[str] = Counter()
     area_names = set(AREA_CLASSES) & set(classes)

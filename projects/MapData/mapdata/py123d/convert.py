@@ -67,7 +67,7 @@ def convert_py123d(options: Py123dOptions) -> ConversionSummary:
 
     Raises:
         FileNotFoundError: If there is no such split or log.
-        RuntimeError: If no sample is left (allowed for a shard). Nothing is written then.
+        RuntimeError: If no sample is left (allowed for a shard). In this case, no file is written.
         ValueError: If logs differ in the height of the road, or an image is damaged.
     """
     summary = ConversionSummary(options.classes)
@@ -104,7 +104,8 @@ def convert_py123d(options: Py123dOptions) -> ConversionSummary:
         summary.add_sample(options.split, sample)
     tables = sorted({table for log in own_logs for table in log.unused_tables})
     if tables:
-        summary.notes.append(f"not read (cameras, poses and maps are): {', '.join(tables)}")
+        names = ", ".join(tables)
+        summary.notes.append(f"only cameras, poses and maps are read, but not the tables {names}")
     summary.notes.append(f"written to {path}")
     return summary
 
@@ -113,7 +114,7 @@ def _find_logs(options: Py123dOptions) -> list[Path]:
     """Find the folders of the logs of a split.
 
     Raises:
-        FileNotFoundError: If there is none.
+        FileNotFoundError: If the split has no requested log.
     """
     parent = options.root / "logs" / options.split
     folders = []
@@ -132,7 +133,7 @@ def _ground_z_m(logs: Sequence[Log], given_m: float | None) -> float:
     """Height of the road in the frame of the rear axle, which all logs must share.
 
     Raises:
-        ValueError: If logs differ.
+        ValueError: If the heights of two logs differ.
     """
     if given_m is not None:
         return given_m
@@ -141,7 +142,7 @@ def _ground_z_m(logs: Sequence[Log], given_m: float | None) -> float:
         if abs(log.ground_z_m - first.ground_z_m) > _GROUND_TOLERANCE_M:
             raise InputError(
                 f"the road lies {first.ground_z_m:.2f} m above the axle in {first.name} and "
-                f"{log.ground_z_m:.2f} m in {log.name}: convert the vehicles apart (--logs), or "
+                f"{log.ground_z_m:.2f} m in {log.name}: convert each vehicle alone (--logs), or "
                 "give --ground-z."
             )
     return first.ground_z_m

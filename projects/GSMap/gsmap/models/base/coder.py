@@ -77,7 +77,7 @@ class MapCoder:
             pts: Points in metres. (N, P, 2 or 3)
         """
         best = self.best(scores)
-        # Without a margin, `keep_mask` does not read the points: no need to select them.
+        # Without a margin, `keep_mask` does not read the points, so they need not be selected.
         best_pts = pts if self.margin_m is None else pts[best.query_inds]
         is_valid = self.keep_mask(best.scores, best_pts)
         rows = is_valid.nonzero()[:, 0]  # the only synchronisation with the device

@@ -57,7 +57,7 @@ def _projection_rules() -> Rules:
     return tuple(rules)
 
 
-# The release calls our path "down" its "up", and our path "up" its "down".
+# The path "down" of this project is called "up" in the release, and the path "up" is called "down".
 _NECK_RULES = (
     *_path_rules("down", release_path="up", number=1, levels=(6, 5, 4, 3)),
     *_path_rules("up", release_path="down", number=2, levels=(4, 5, 6, 7)),

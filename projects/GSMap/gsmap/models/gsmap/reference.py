@@ -117,7 +117,7 @@ class GaussianReference(PointReference, AddsWeights):
             References of the current frame. (B, ..., D)
         """
         transformed = super().transform_references(references, motion)
-        # Angle of the motion in the plane, which the angle of every Gaussian grows by.
+        # Angle of the motion in the plane. It is added to the angle of every Gaussian.
         rotation = torch.atan2(motion[:, 1, 0], motion[:, 0, 0]).to(transformed)
         while rotation.dim() < transformed.dim():
             rotation = rotation[..., None]
