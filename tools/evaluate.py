@@ -78,7 +78,9 @@ class TruthSettings(NamedTuple):
 
 
 def json_settings(path: Path) -> TruthSettings:
-    """Settings of ground truth in JSON: those of its ``meta``, or nuScenes' where it has none.
+    """Settings of ground truth in JSON.
+
+    They are read from its ``meta``. A missing setting has the value for nuScenes.
 
     Args:
         path: Ground truth, such as ``create_data.py export`` writes it.

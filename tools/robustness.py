@@ -142,7 +142,7 @@ def table(figures: dict[str, list[dict[str, float]]]) -> str:
 
 
 def earlier_figures(path: Path) -> dict[str, list[dict[str, float]]]:
-    """Figures of an earlier run in the output folder; empty without one.
+    """Figures of an earlier run in the output folder; empty without an earlier run.
 
     Raises:
         ValueError: If the file has other contents.

@@ -21,7 +21,8 @@ from gsmap.utils.json_items import items_of
 
 _ADVICE = "give a GeoJSON FeatureCollection"
 _KINDS = ("LineString", "MultiLineString", "Polygon", "MultiPolygon")
-_NO_CRS = "no crs"  # stands for the member `crs` of a file without it, as null has a meaning
+# Value for a file without the member `crs`. None is the value of a member that is null.
+_NO_CRS = "no crs"
 # Names of the system of longitude and latitude on the WGS 84 ellipsoid end in one of these.
 _DEGREES = ("CRS84", "EPSG:4326", "EPSG::4326")
 

@@ -33,7 +33,8 @@ def write_mcap(path: str | Path, replay: Replay) -> None:
 
     Raises:
         FileNotFoundError: If an image is missing.
-        BrokenSampleError: If an image is damaged or not an image; none of its content is written.
+        BrokenSampleError: If an image file is damaged or is not an image. The content of this file
+            is not written.
         RuntimeError: If ``foxglove-sdk`` is missing.
     """
     foxglove = import_extra("foxglove", "viz")

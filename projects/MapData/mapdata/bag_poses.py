@@ -107,7 +107,7 @@ class PoseChain:
         self.span_ns = span_ns
 
     def __call__(self, time_ns: int) -> np.ndarray | None:
-        """Pose of the ground in the root at a time; None if one of the tracks has none. (4, 4)"""
+        """Pose of the ground in the root at a time; None if a track lacks a pose. (4, 4)"""
         pose = self.ground
         for step in self.steps:
             parent_from_child = step.at(time_ns)
@@ -185,7 +185,7 @@ class FrameTree:
             is_moving = any(not self._chosen[frame].is_static for frame in self.chain(name)[:-1])
             if is_moving:
                 break
-        else:  # none of them moves
+        else:  # no frame moves
             name = known_names[0]
             self._choose_parents(name)
         if name != known_names[0]:

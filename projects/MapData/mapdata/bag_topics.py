@@ -108,8 +108,8 @@ def camera_topics(kinds: Mapping[str, str], listing: str) -> dict[str, tuple[str
         listing: Topics of the bag as text, for error messages.
 
     Returns:
-        Topics of the images and of the camera info, by camera; images without any camera info are
-        left out.
+        Topics of the images and of the camera info, by camera. Images without camera info are left
+        out.
 
     Raises:
         ValueError: If there is no camera, or the camera info of a camera is ambiguous.

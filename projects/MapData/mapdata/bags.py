@@ -154,7 +154,10 @@ def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
 
 
 def _sampling_camera(names: Sequence[str]) -> str:
-    """Camera whose images define the times of the samples: a front camera, or else the first."""
+    """Camera whose images define the times of the samples.
+
+    It is a front camera if there is one, and otherwise the first camera.
+    """
     for name in names:
         if "front" in name.lower():
             return name

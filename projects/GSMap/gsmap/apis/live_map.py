@@ -78,11 +78,11 @@ class LiveMap:
             trained in, its pose on the vehicle is taken from the training data, otherwise from
             nuScenes (``lidar``) or Argoverse 2 (``ego``).
         allow_missing_cameras: Whether cameras of the model may be absent.
-        prior: Map of earlier drives, for a model that reads one.
+        prior: Map of earlier drives, for a model that reads a prior.
         update_prior: Write each frame to ``prior`` after it is predicted.
 
     Raises:
-        ValueError: If a prior is given to a model without one, or does not fit it.
+        ValueError: If a prior is given for a model that reads no prior, or does not fit the model.
     """
 
     def __init__(

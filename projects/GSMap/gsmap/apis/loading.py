@@ -131,7 +131,7 @@ def _training_mount(cfg: Config, contents: Checkpoint | None, path: object) -> M
         path: Path of the checkpoint, for messages.
 
     Returns:
-        The mount in the checkpoint, or the usual one if the checkpoint has none.
+        The mount in the checkpoint, or the usual mount if the checkpoint has no mount.
 
     Raises:
         ValueError: If the mount in the checkpoint is not possible on a vehicle.

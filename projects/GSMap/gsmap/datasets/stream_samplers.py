@@ -56,7 +56,7 @@ class _Scene:
         self.has_singles = False  # whether ``waiting`` has single frames
 
     def next_frames(self, in_pieces: bool) -> list[int]:
-        """Return the next piece if ``in_pieces``, else the next single frame."""
+        """Return the next piece if ``in_pieces``, and otherwise the next single frame."""
         if in_pieces and self.has_singles and not self.finish_singles:
             self.waiting.clear()
         if not self.waiting:

@@ -213,7 +213,7 @@ class VectorizedMapDataset(BaseDataset):
         return rig
 
     def _ground_height(self) -> float | None:
-        """Return the height of the road in metres in the file, or in the config if it has none.
+        """Return the height of the road in metres, from the file or else from the config.
 
         Raises:
             ValueError: If the heights in the file and in the config differ.
@@ -263,7 +263,7 @@ class VectorizedMapDataset(BaseDataset):
         return entries
 
     def _copy_without_annotation(self, memo: dict[int, Any] | None = None) -> BaseDataset:
-        """Copy with a new memo: the default memo of mmengine is shared by all calls."""
+        """Copy with a new memo, because all calls share the default memo of mmengine."""
         return super()._copy_without_annotation({} if memo is None else memo)
 
     def sample(self, idx: int) -> MapSample:

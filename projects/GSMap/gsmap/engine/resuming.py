@@ -113,7 +113,12 @@ def _is_number(value: Any) -> bool:
 
 
 def _is_compatible(value: Any, reference: Any) -> bool:
-    """Whether a value can replace another: a finite number, a list of equal length, one type."""
+    """Whether a value can replace a reference value of an optimizer.
+
+    A finite number can replace a number. A list can replace a list of equal length if each entry
+    can replace its entry. None, a text, a number or a tensor can replace None. Other values must
+    have the type of the reference.
+    """
     if isinstance(reference, list | tuple):
         if not isinstance(value, list | tuple) or len(value) != len(reference):
             return False

@@ -135,7 +135,7 @@ def needed_targets(cfg: Config) -> dict[str, Any]:
 
 
 def _class_with_targets(kind: Any) -> type[NeedsTargets]:
-    """Return the class of a part if it declares its targets, else `NeedsTargets`."""
+    """Return the class of a part if the class declares its targets, otherwise `NeedsTargets`."""
     part_class = class_of_type(kind)
     if part_class is not None and issubclass(part_class, NeedsTargets):
         return part_class

@@ -250,7 +250,7 @@ class MapDetector(Base3DDetector):
     def over_time(
         self, outputs: dict[str, Any], batch_data_samples: Samples
     ) -> Iterator[BatchMemory]:
-        """Context of a batch with its memory, or without if the model has none.
+        """Context of a batch with its memory, if the model has a memory.
 
         At the end of the context, the memory and the map prior are updated.
         """

@@ -26,7 +26,7 @@ VERSION = 1
 TileKey = tuple[int, int]
 """Column and row of a tile in the global frame."""
 TilePlace = tuple[int, int, int]
-"""Offset and length of a compressed tile in bytes, and its checksum."""
+"""Offset and length in bytes, and checksum, of a compressed tile."""
 FARTHEST_TILE = 2**30
 """Largest column or row of a tile."""
 RASTER_MAGIC = b"\x89GSPRIOR"
@@ -34,7 +34,7 @@ RASTER_MAGIC = b"\x89GSPRIOR"
 GAUSSIAN_MAGIC = b"\x89GSGAUSS"
 """First bytes of a file of `GaussianPrior`."""
 _START = struct.Struct("<8sII")  # magic, version, length of the header
-# Offset of the index, number of its rows, its checksum, checksum of the header, and magic.
+# Offset, number of rows and checksum of the index; checksum of the header; magic.
 _FOOTER = struct.Struct("<QIII8s")
 _INDEX = np.dtype(
     [("column", "<i4"), ("row", "<i4"), ("offset", "<u8"), ("length", "<u4"), ("crc", "<u4")]

@@ -18,7 +18,8 @@ REACH_M = 1.5
 """Largest distance in metres of a line from a Gaussian that it measures, as in ``build_map``."""
 _LEAST_COSINE = np.cos(np.radians(30.0))  # between a Gaussian and a line that measures it
 _SIGMA_PER_M = 0.02  # standard deviation per metre of distance from the vehicle
-_COVERED = 0.75  # share of the spacing; so near to a Gaussian, along a line, none is added
+# No Gaussian is added nearer to another one, along a line, than this share of the spacing.
+_COVERED = 0.75
 _ROUNDING_M = 1e-3  # covers the rounding of stored positions at the ends of a line
 
 

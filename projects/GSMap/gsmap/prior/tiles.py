@@ -17,8 +17,11 @@ from gsmap.utils.errors import WorkError
 
 Tile = NDArray[np.uint8]
 _LEVEL = 1  # compression level of zlib; higher levels save little on sparse rasters
-_MAPPED_BYTES = 32 << 20  # after reading this from a mapped file, its pages leave memory
-_WASTED_BYTES = 64 << 20  # of replaced tiles in the temporary file, before it is written again
+# After this number of bytes was read from a mapped file, the pages of the file leave memory.
+_MAPPED_BYTES = 32 << 20
+# The temporary file is written again without replaced tiles if they take more bytes than this, and
+# more bytes than the other tiles.
+_WASTED_BYTES = 64 << 20
 
 
 class TileStore:
@@ -183,7 +186,7 @@ class _SpillFile:
         self._used_bytes = 0
 
     def _require_process(self) -> None:
-        """Require the process that made the prior: a fork shares the position in the file."""
+        """Require the process that made the prior: a fork shares its position in the file."""
         if self._process != os.getpid():
             raise WorkError(
                 "a map prior with changes belongs to the process that made it: save it, and load "

@@ -344,11 +344,14 @@ def fuse_gaussians(first: Gaussians, second: Gaussians) -> Gaussians:
 
 
 def gaussians_along(points: Tensor, across_m: float) -> Gaussians:
-    """Create Gaussians that cover lines: sigma along a line is half the distance of its points.
+    """Create Gaussians that cover lines.
+
+    Sigma along a line is half the mean distance of a point from its neighbours.
 
     Args:
         points: Ordered centres in metres. (..., P, 2)
-        across_m: Standard deviation across the line, and the smallest one along it, in metres.
+        across_m: Standard deviation across the line, and the smallest standard deviation along the
+            line, in metres.
 
     Returns:
         Gaussians. (..., P)
@@ -452,11 +455,13 @@ def line_errors(points: Tensor, targets: Tensor, lines: Tensor | None = None) ->
     lengths = steps.square().sum(-1)
     # Position of the nearest place on each segment: 0 at its start and 1 at its end.
     place = (offsets * steps).sum(-1) / lengths.clamp(min=_TINY)
-    # It is clamped to [0, 1]. Only on an open line, it may be less than 0 on the first segment and
-    # more than 1 on the last one.
+    # The position is clamped to [0, 1]. Only on an open line, it may be less than 0 on the first
+    # segment and more than 1 on the last segment.
     closed = (lines[..., :1, :] == lines[..., -1:, :]).all(-1, keepdim=True)  # (..., 1, 1)
     beyond = torch.where(closed, 0.0, torch.inf)
     inner = torch.zeros_like(lengths[..., 1:])  # (..., 1, S - 2)
+    # Lower limits are 0, but -inf on the first segment of an open line. Upper limits are 1, but inf
+    # on the last segment of an open line. (..., 1, S - 1)
     low = torch.cat([-beyond, inner], dim=-1)
     high = torch.cat([inner, beyond], dim=-1) + 1
     nearest = place.clamp(low, high)[..., None] * steps

@@ -71,7 +71,10 @@ def _relative(path: str, root: Path) -> str:
 
 
 def _instances(info: Mapping[str, Any], meta: AnnotationMeta) -> list[MapInstance] | None:
-    """Ground truth of an entry without lines of one point; None if the entry has none."""
+    """Ground truth of an entry; None if the entry has no ground truth.
+
+    Lines of one point are left out.
+    """
     annotation = info.get("annotation")
     if annotation is None:
         return None

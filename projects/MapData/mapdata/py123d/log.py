@@ -186,7 +186,7 @@ class Log:
         return str(self.metadata.get("location") or "")
 
     def map_file(self, root: Path) -> Path | None:
-        """Path of the map; None if the log has none.
+        """Path of the map; None if the log has no map.
 
         Args:
             root: Folder of py123d's data, with ``logs`` and ``maps``.

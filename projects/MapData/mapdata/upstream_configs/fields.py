@@ -22,7 +22,7 @@ class Fields:
         self._values = values
 
     def section(self, name: str) -> dict[str, Any]:
-        """Look up the settings below a name; an empty dict if there are none.
+        """Look up the settings below a name; an empty dict if there are no such settings.
 
         Args:
             name: Dotted name, such as ``model.pts_bbox_head``.

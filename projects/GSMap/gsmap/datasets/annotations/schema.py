@@ -151,7 +151,7 @@ def batch_of(rows: Sequence[dict[str, Any]], schema: pa.Schema) -> pa.RecordBatc
 
 
 def matrices_of(array: pa.FixedSizeListArray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the matrices of a column, NaN where a row has none. (rows, *shape)
+    """Return the matrices of a column, NaN in rows without a matrix. (rows, *shape)
 
     Args:
         array: Column with the entries of matrices.

@@ -187,11 +187,11 @@ def nearest_by_chamfer(
         max_distance: Largest Chamfer distance in metres.
 
     Returns:
-        Two arrays: index of the ground truth, -1 if there is none within ``max_distance``, and its
-        Chamfer distance in metres, infinite without one. (N,) each
+        Two arrays: index of the ground truth, and its Chamfer distance in metres. Without a ground
+        truth within ``max_distance``, the index is -1 and the distance is infinite. (N,) each
 
     Raises:
-        ValueError: If heights count, and a side has none.
+        ValueError: If heights count, and the predictions or the ground truth have no heights.
     """
     pred = _lines(predictions, config, resample=config.resample_predictions)
     gt = _lines(ground_truth, config, resample=config.resample_ground_truth)
@@ -223,7 +223,8 @@ def match_chamfer(
         token: Name of the sample.
 
     Raises:
-        ValueError: If heights count, and a side has none; or as for `check_pair`.
+        ValueError: If heights count, and the predictions or the ground truth have no heights; or
+            for the reasons of `check_pair`.
     """
     return _match(Sample(token, predictions, ground_truth), config)
 

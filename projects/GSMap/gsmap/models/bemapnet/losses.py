@@ -117,7 +117,7 @@ class BezierLosses(LineLosses):
         return super().mask_losses(masks, truths)
 
     def costs(self, case: Case) -> tuple[Tensor, ...]:
-        """Compute the weighted costs of all pairs of a case. (6, n, K)"""
+        """Compute the weighted costs of all pairs of a case, in the order of `COSTS`. (6, n, K)"""
         lines = case.lines
         truth = case.truth
         num_lines = lines.curves.shape[0]

@@ -32,8 +32,8 @@ def _camera_mlp(channels: int) -> nn.Sequential:
 def camera_vector(cam2img: Tensor, img_aug_matrix: Tensor, ego_from_cam: Tensor) -> Tensor:
     """Parameters of a camera as the input vector of the depth net.
 
-    The 22 numbers are fx, fy, cx, cy; a00, a01, tx, a10, a11, ty of the augmentation; and the upper
-    three rows of the pose.
+    The 22 numbers are, in this order, fx, fy, cx and cy of the intrinsics; a00, a01, tx, a10, a11
+    and ty of the augmentation; and the upper three rows of the pose, row by row.
 
     Args:
         cam2img: Intrinsics of the original image, in pixels. (..., >= 3, >= 3)

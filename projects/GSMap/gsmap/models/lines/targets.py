@@ -215,14 +215,15 @@ class FormatLineTargets(BaseTransform):
             )
         points_m = element.points[:, :2].astype(np.float64)
         lines = [points_m]
-        if is_closed(points_m) and element.label in self.edge_classes:  # two edges, not a ring
+        if is_closed(points_m) and element.label in self.edge_classes:
+            # The two longest edges replace the ring.
             lengths_m = np.linalg.norm(np.diff(points_m, axis=0), axis=1)
             longest_edges = np.argsort(lengths_m, kind="stable")[-2:]
             lines = [points_m[start : start + 2] for start in longest_edges]
         parts = []
         for line in lines:
             samples = points_at_steps(line, self.step_m)  # without the end of the line
-            if self.sort_rings and is_closed(line):  # close the ring again
+            if self.sort_rings and is_closed(line):  # append the first point to close the ring
                 samples = np.concatenate([samples, line[:1]])
             for part_m in parts_inside(samples, x_range=grid.x_range, y_range=grid.y_range):
                 parts.append(grid.front_from_metres(part_m))

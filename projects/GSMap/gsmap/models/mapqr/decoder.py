@@ -16,7 +16,8 @@ from gsmap.utils.errors import InputError
 def sine_code(points: Tensor, channels: int) -> Tensor:
     """Sinusoidal positional encoding of points.
 
-    The first half of the channels encodes y, the second x. Each half alternates sine and cosine of
+    The first half of the channels encodes y, and the second half encodes x. In the half of the
+    coordinate v, channel 2 i is the sine and channel 2 i + 1 the cosine of
     2 pi v / 10000^(2 i / half).
 
     Args:

@@ -141,7 +141,7 @@ class BEVMemory(nn.Module, AddsWeights):
         """
         if feats.shape[1] != self.embed_dims:
             raise InputError(
-                f"the map's features have {feats.shape[1]} channels, their memory "
+                f"the map's features have {feats.shape[1]} channels, and their memory has "
                 f"{self.embed_dims}: set temporal.embed_dims={feats.shape[1]}."
             )
         hidden = feats.detach()

@@ -106,7 +106,7 @@ class GatedLayer(nn.Module):
 
 
 def append_cache(cache: Cache | None, new: Cache) -> Cache:
-    """Append keys and values of new tokens to a cache, None for an empty cache."""
+    """Append keys and values of new tokens to a cache, which is None if it is empty."""
     if cache is None:
         return new
     keys = torch.cat([cache[0], new[0]], dim=2)
