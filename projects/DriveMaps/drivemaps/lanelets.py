@@ -112,7 +112,7 @@ def lane_graph(centerlines: Iterable[FloatArray], borders: Sequence[FloatArray])
 
     A line is split where another one begins or ends on it, and only one of several lines on top of
     each other is used. A bound is parallel to its centre line, at the median distance of the
-    borders beside it, or at 1.75 m if there are none.
+    borders beside it, or at 1.75 m if there is no border beside most of it.
 
     Args:
         centerlines: Lines in the direction of travel, in metres. each (n >= 2, 2)
@@ -253,7 +253,8 @@ def _split(lines: Sequence[FloatArray]) -> list[FloatArray]:
             if end // 2 == index:  # line i has the ends 2 i and 2 i + 1
                 continue
             cut = shape.project(shapely.Point(ends[end]))
-            # Compare the direction of this line around the cut with the other line's end.
+            # Compare the direction of this line around the cut with the direction of the other line
+            # at its end.
             around = np.clip([cut - 0.5, cut + 0.5], 0.0, shape.length)
             before, after = shapely.get_coordinates(shapely.line_interpolate_point(shape, around))
             follows = (after - before) @ end_directions[end] > _MIN_SUCCESSOR_COSINE

@@ -110,7 +110,7 @@ def merge_parallel(pieces: np.ndarray, owner: np.ndarray) -> np.ndarray:
 
 
 def _long_side(geometry: shapely.Geometry) -> np.ndarray:
-    """Unit vector along the long side of the rectangle with the smallest area. (2,)"""
+    """Unit vector along the long side of the smallest rectangle around a geometry. (2,)"""
     hull = shapely.get_coordinates(shapely.convex_hull(geometry))
     edges = np.diff(hull, axis=0)
     edge_lengths = np.hypot(edges[:, 0], edges[:, 1])

@@ -28,16 +28,17 @@ def open_input(path: str | Path, options: InputOptions | None = None) -> Source:
 
     Args:
         path: An annotation file, an info file of mmdet3d, a nuScenes-format root, an Argoverse 2
-            log or a folder with some, a folder of images with a calibration file (or that file), a
-            bag, or a folder with just one annotation or info file.
+            log or a folder with logs, a folder of images with a calibration file (or the
+            calibration file), a bag, or a folder with just one annotation or info file.
         options: Options of the readers; None takes the defaults.
 
     Returns:
         The samples.
 
     Raises:
-        FileNotFoundError: If the input does not exist, or a file that it names.
-        ValueError: If it is no such input, or damaged; the message names the reason.
+        FileNotFoundError: If the input, or a file that the input names, does not exist.
+        ValueError: If the path is no such input, or the input is damaged. The message contains the
+            reason.
     """
     path = Path(path)
     options = options or InputOptions()

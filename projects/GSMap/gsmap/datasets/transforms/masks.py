@@ -161,8 +161,8 @@ class MakePVMask(BaseTransform):
         thickness_px: Width of the lines in feature pixels.
         num_classes: Number of channels, one for each class; None for one channel with all classes.
         heights: Whether two-dimensional elements have the heights in the annotation file, as
-            published for Argoverse 2. If the file has none, ``ground_z_m`` is used and a message
-            is logged.
+            published for Argoverse 2. If the file has no heights, ``ground_z_m`` is used and a
+            message is logged.
 
     Raises:
         ValueError: If a number is not positive.

@@ -156,8 +156,9 @@ def change_figures(
     """Compute precision and recall of changes.
 
     A found change is correct if half of its length lies within `NEAR_M` of true changes of its map,
-    class and kind. A true change must be found if it is in view: at least `SHORTEST_M` of a line,
-    or half of the outline of an area, with at least `MIN_VIEWS` samples. It is found if half of its
+    class and kind. A true change must be found if it is in view. This means that at least
+    `SHORTEST_M` of a line, or half of the outline of an area, is in the range of at least
+    `MIN_VIEWS` samples. It is found if half of its
     length in view lies within `NEAR_M` of found changes of its map, class and kind.
 
     Args:
@@ -213,8 +214,8 @@ class _Comparison:
     Attributes:
         hits: Whether each found change is correct. (F,)
         confidences: Confidence of each found change. (F,)
-        limits: Largest threshold of confidence at which the found changes that reach it still find
-            each target, or -1. (T,)
+        limits: Largest threshold of confidence at which each target is found, if only found changes
+            with at least this confidence count; -1 if the target is not found. (T,)
     """
 
     hits: BoolArray
@@ -266,8 +267,8 @@ def _targets(truth: Sequence[MapChange], views: Mapping[str, Views]) -> dict[Map
             continue
         points = change.samples()
         in_view = points[views[change.map_name].count(points) >= MIN_VIEWS]
-        least = len(points) / 2 if is_closed(change.points) else SHORTEST_M / STEP_M  # points
-        if len(in_view) >= max(least, 1):
+        least_points = len(points) / 2 if is_closed(change.points) else SHORTEST_M / STEP_M
+        if len(in_view) >= max(least_points, 1):
             targets[change] = in_view
     return targets
 
@@ -295,7 +296,7 @@ def _confidence_limit(
 
     Args:
         target: The true change.
-        in_view: Its points in view. (M, 2)
+        in_view: Points of the true change that are in view. (M, 2)
         found: Found changes.
         same_kind: Whether kinds must be equal.
     """
