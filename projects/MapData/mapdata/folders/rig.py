@@ -183,8 +183,8 @@ class PoseTrack:
         poses: Transforms from the vehicle to the global frame, in metres. (n, 4, 4)
         gap_ns: Longest gap between two poses in which poses are interpolated. The first pose also
             holds for a tenth of this time before it, and the last pose for a tenth after it.
-        holds: Whether, in a gap longer than ``gap_ns``, the pose before the gap holds until the next
-            pose, and the last pose holds for ever.
+        holds: Whether, in a gap longer than ``gap_ns``, the pose before the gap holds until the
+            next pose, and the last pose holds for ever.
 
     Raises:
         ValueError: If there is no pose, or a pose is not finite.
