@@ -75,7 +75,7 @@ def test_cameras_of_any_channel_are_read_after_those_of_nuscenes(options, damage
 
 def test_a_lidar_of_another_name_is_taken_in_the_frame_of_the_vehicle(options, damaged_root):
     edit(damaged_root, "sensor", channels({"LIDAR_TOP": "LIDAR_ROOF"}))
-    message = r"has no LIDAR_TOP, .*its channels are \['CAM_BACK', .*'LIDAR_ROOF'\].*--frame ego"
+    message = r"has no LIDAR_TOP, .*but the channels \['CAM_BACK', .*'LIDAR_ROOF'\].*--frame ego"
     for read in (open_input, lambda root: convert_nuscenes(replace(options, root=root))):
         with pytest.raises(ValueError, match=message):
             read(damaged_root)

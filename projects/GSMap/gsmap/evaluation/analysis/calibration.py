@@ -19,14 +19,15 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.model_facts import LAW_NAMES
 
 AXES = ("along", "across")
-DISTANCES_M = (0.0, 10.0, 20.0, np.inf)  # limits of the bands of distance from the vehicle
+# Limits of the bands of distance. The first band begins at the vehicle, the last one has no end.
+DISTANCES_M = (0.0, 10.0, 20.0, np.inf)
 LEVELS = np.linspace(0.05, 0.95, num=19)  # probabilities of central intervals
 _STANDARD = (stats.norm(), stats.laplace(scale=0.5**0.5))
 LAWS = dict(zip(LAW_NAMES, _STANDARD, strict=True))
 """Laws of errors (probability distributions) of variance 1, by name."""
 # Probabilities that an error of a normal law lies within one and within two sigma.
 COVERED = (2 * stats.norm.cdf([1.0, 2.0]) - 1).tolist()
-_FEWEST = 100  # smallest number of vertices of a class, to fit factors for the class
+_FEWEST = 100  # smallest number of vertices of a class for which factors of the class are fitted
 _COLUMNS = (  # keys of figures and titles of the columns of the table
     ("nll", "NLL"), ("coverage@1", "68.3 %"), ("coverage@2", "95.4 %"), ("sigma_m", "sigma m"),
     ("error_m", "error m"), ("reliability_error", "reliab."), ("sparsification_error", "spars."),
