@@ -130,7 +130,7 @@ evaluate: nothing.json VAL --polygon-classes divder | no class 'divder'; did you
 evaluate: nothing.json VAL --range 3 3 1 1 | x_range must be (low, high)
 evaluate: nothing.json VAL --out . | Is a directory
 evaluate: nothing.json VAL --bootstrap 1 | intervals need two scenes, two resamples
-evaluate: nothing.json nothing.json --against nothing.json | nothing.json knows no scenes
+evaluate: nothing.json nothing.json --against nothing.json | no list under 'GTs'
 evaluate: nothing.json VAL --shard 0/2 --out o.json --bootstrap | --bootstrap needs all samples: leave out --shard
 evaluate: nothing.json VAL --by weather | --by takes scene, map or a JSON file
 evaluate: VAL --prior nowhere.arrow | no annotation file at nowhere.arrow
