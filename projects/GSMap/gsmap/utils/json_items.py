@@ -3,7 +3,7 @@
 import json
 import re
 from codecs import BOM_UTF8, getincrementaldecoder
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import IO, Any
 
@@ -21,7 +21,7 @@ _DECODER = json.JSONDecoder()
 
 def items_of(
     path: Path, key: str | None, advice: str, other_entries: dict[str, Any] | None = None
-) -> Iterator[tuple[Any, Place]]:
+) -> Generator[tuple[Any, Place], None, None]:
     """Yield the value and the place of each item of a list, with constant memory.
 
     Args:

@@ -16,7 +16,7 @@ from gsmap.evaluation.core.evaluator import MapEvaluator, SampleMatches
 from gsmap.evaluation.core.metric import Sample
 from gsmap.evaluation.core.report import MetricReport
 from gsmap.evaluation.core.results_json import GROUND_TRUTH_KEY, RESULTS_KEY, THREE_D, SampleFile
-from gsmap.structures.elements import MapElements
+from gsmap.structures.elements import FloatArray, MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.errors import InputError
 from gsmap.utils.parallel import ordered_map
@@ -323,7 +323,7 @@ class SamplePairs:
         ]
 
 
-def _range_text(low: np.ndarray, high: np.ndarray) -> str:
+def _range_text(low: FloatArray, high: FloatArray) -> str:
     """Text of a rectangle in metres."""
     return f"x {low[0]:.0f} to {high[0]:.0f} and y {low[1]:.0f} to {high[1]:.0f} m"
 
