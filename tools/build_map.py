@@ -509,14 +509,22 @@ def group_scenes(
 
     Returns:
         Scenes by the name of the scene or of the place.
+
+    Raises:
+        ValueError: If drives are to be joined, and the place of one is unknown.
     """
     if not args.join:
         return {scene: [scene] for scene in scenes}
     place_of_scene = dict(zip(ann.column("scene"), ann.column("map_name"), strict=True))
     groups: dict[str, list[str]] = {}
     for scene in scenes:
-        # read_drive refuses a scene that the file lacks
-        place = place_of_scene.get(scene, "")
+        place = place_of_scene.get(scene)
+        if place == "":
+            raise InputError(
+                f"--join needs the place of each drive, and {scene!r} has no map_name: leave "
+                "--join out, or choose other drives with --scene."
+            )
+        # `read_drive` refuses a scene that the file lacks.
         groups.setdefault(place or scene, []).append(scene)
     return groups
 

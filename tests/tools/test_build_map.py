@@ -74,6 +74,10 @@ def test_drives_of_a_place_are_joined_into_one_map(files, tmp_path, capsys):
     assert len(joined["features"]) == 6  # one drive alone sees a part of them
     scores = json.loads((tmp_path / "maps" / "scores.json").read_text())
     assert scores["merged"]["AP"]["mean"] > 0.95
+    samples[0] = replace(samples[0], scene="unknown", map_name="")
+    write_annotations(two_drives, file.meta, samples)
+    with pytest.raises(ValueError, match="'unknown' has no map_name: leave --join out"):
+        main(command)
     with pytest.raises(SystemExit):
         main([*command, "--changes", str(tmp_path / "old.geojson")])
     assert "leave --join out" in capsys.readouterr().err

@@ -111,8 +111,10 @@ def _vote(
     rows_of_frame: defaultdict[int, list[int]] = defaultdict(list)
     for row, frame_index in enumerate(frames.tolist()):
         rows_of_frame[frame_index].append(row)
-    footprints = {index: drive.footprint(drive.frames[index]) for index in rows_of_frame}
-    edges = [shapely.boundary(shape) for shape in (*areas, *footprints.values())]
+    footprints = {}
+    for frame_index in rows_of_frame:
+        footprints[frame_index] = drive.footprint(drive.frames[frame_index])
+    edges = shapely.boundary([*areas, *footprints.values()])
     # The votes are constant between the edges, so one spot per face is enough.
     faces = shapely.get_parts(shapely.polygonize([shapely.union_all(edges)]))
     spots = shapely.get_coordinates(shapely.point_on_surface(faces))  # (faces, 2)

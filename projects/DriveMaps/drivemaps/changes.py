@@ -106,8 +106,12 @@ def _near_passes(old: MapElements, passes: Sequence[Pass]) -> MapElements:
     Raises:
         ValueError: If their lines are too long in all, as they are sampled every metre later.
     """
-    origins = [frame.origin for one_pass in passes for frame in one_pass.drive.frames]
-    margin_m = _MARGIN_M + max(one_pass.drive.reach_m for one_pass in passes)
+    origins = []
+    reach_m = 0.0
+    for one_pass in passes:
+        origins += [frame.origin for frame in one_pass.drive.frames]
+        reach_m = max(reach_m, one_pass.drive.reach_m)
+    margin_m = _MARGIN_M + reach_m
     low = np.min(origins, axis=0) - margin_m
     high = np.max(origins, axis=0) + margin_m
     is_near = np.zeros(len(old), dtype=np.bool_)

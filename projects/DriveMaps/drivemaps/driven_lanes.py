@@ -1,6 +1,5 @@
 """Centre lines of the lanes that a vehicle has driven, between dividers and boundaries."""
 
-import itertools
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
@@ -86,9 +85,8 @@ def driven_lanes(positions: FloatArray, borders: list[FloatArray]) -> DrivenLane
             if states[start] != _OUTSIDE:
                 stretches.append((offset + start, offset + stop))
         offset += len(lane.centers)
-    centerlines = _join_repeats(
-        np.concatenate([lane.centers for lane in lanes]), stretches, earlier_points
-    )
+    points = np.concatenate([lane.centers for lane in lanes])
+    centerlines = _join_repeats(points, stretches, earlier_points)
     return DrivenLanes(centerlines, driven_m=driven_m, outside_m=outside_m)
 
 
@@ -162,16 +160,25 @@ def _earlier_points(lanes: Sequence[_Lane]) -> IntArray:
         Index, among the points of all lanes, of the first point driven at the place and in the
         direction of each point; -1 if there is none. (points,)
     """
-    points = np.concatenate([lane.centers for lane in lanes])
-    directions = np.concatenate([line_directions(lane.centers) for lane in lanes])
-    is_in_lane = np.concatenate([np.append(lane.kinds != _OUTSIDE, False) for lane in lanes])
+    centers = []
+    all_directions = []
+    in_lane = []
+    for lane in lanes:
+        centers.append(lane.centers)
+        all_directions.append(line_directions(lane.centers))
+        # A point is in a lane if the step after it is; the last point of a track has no step.
+        in_lane.append(np.append(lane.kinds != _OUTSIDE, False))
+    points = np.concatenate(centers)
+    directions = np.concatenate(all_directions)
+    is_in_lane = np.concatenate(in_lane)
     tree = cKDTree(points)
     earlier_points = np.full(len(points), -1)
     for later, neighbours in enumerate(tree.query_ball_point(points, _REPEAT_M)):
         earlier = np.array(neighbours)
         cosines = directions[earlier] @ directions[later]
         is_along = is_in_lane[earlier] & (cosines > _MIN_PARALLEL_COSINE)
-        earlier = earlier[is_along & (earlier < later - _FILTER)]
+        is_earlier_pass = earlier < later - _FILTER  # not one of the points just before
+        earlier = earlier[is_along & is_earlier_pass]
         if len(earlier):
             distances_m = np.linalg.norm(points[earlier] - points[later], axis=1)
             nearest = earlier[distances_m.argmin()]
@@ -197,10 +204,14 @@ def _join_repeats(
     joints = _joints(stretches, earlier_points)
     centerlines = []
     for first, last in stretches:
-        cuts = sorted({first, last, *(cut for cut in joints.values() if first < cut < last)})
-        for start, stop in pairwise(list(cuts)):
-            if stop - start > _MOST_POINTS:
-                cuts += range(start + _MOST_POINTS, stop - _LEAST_POINTS, _MOST_POINTS)
+        meetings = [first, last]  # points at which other stretches meet this one, and its ends
+        for point in set(joints.values()):
+            if first < point < last:
+                meetings.append(point)
+        meetings.sort()
+        cuts = list(meetings)
+        for start, stop in pairwise(meetings):
+            cuts += range(start + _MOST_POINTS, stop - _LEAST_POINTS, _MOST_POINTS)
         for start, stop in pairwise(sorted(cuts)):
             indices = np.arange(start, stop + 1)
             indices[0] = joints.get(start, start)
@@ -217,7 +228,8 @@ def _joints(stretches: Sequence[tuple[int, int]], earlier_points: IntArray) -> d
         earlier_points: First point driven at the place of each point; -1 if there is none. (n,)
     """
     joints = {}
-    for end in itertools.chain.from_iterable(stretches):
+    ends = [point for stretch in stretches for point in stretch]
+    for end in ends:
         meeting = int(earlier_points[end])
         for first, last in stretches:
             if first <= meeting <= last:

@@ -26,6 +26,10 @@ def test_sizes_and_parameters_as_released():
     assert prior.bev.layer.z_range == (-10.0, 10.0)
     assert prior.bev.layer.can_bus_mlp is None
     assert prior.queries.label_encoder.weight.shape == (256, 3)
+    assert prior.bev.output_conv is None  # the features are replaced
+    assert not prior.queries.zero_init
+    assert prior.train_drop == 0
+    assert prior.neutral_keys == ()
     assert model.map_head.instance_embedding.weight.shape == (350, 256)
     trained = sum(p.numel() for p in model.parameters() if p.requires_grad)
     assert trained == 46_960_658

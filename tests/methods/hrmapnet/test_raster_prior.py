@@ -271,6 +271,25 @@ def test_a_neutral_prior_starts_from_the_checkpoint_of_a_model_without_one():
     assert window_of(model).any()
 
 
+def test_a_prior_with_a_part_that_is_not_neutral_is_not_left_untrained_in_silence():
+    state = build_small(0).state_dict()
+    for part in ({"bev": {"layer": None, "residual": False}}, {"queries": {"zero_init": False}}):
+        model = prior_model(1, neutral_start=True, **part)
+        with pytest.raises(ValueError, match="missing: prior"):
+            model.load_state_dict(state)
+
+
+def test_published_training_draws_no_random_numbers_for_dropped_maps():
+    model = prior_model().train()
+    samples = frames(("town", "a", 0.0))
+    metas = [sample.metainfo for sample in samples]
+    outputs = {"bev_feats": torch.zeros(1, 32, 12, 6), "img_feats": None}
+    model.prior.bev = None
+    before = torch.get_rng_state()
+    model.prior.fuse(outputs, metas, img_shape=(64, 96))
+    assert torch.equal(torch.get_rng_state(), before)
+
+
 def test_a_neutral_prior_learns():
     model = prior_model(neutral_start=True).train()
     samples = frames(("town", "a", 0.0), ("town", "b", 3.0))

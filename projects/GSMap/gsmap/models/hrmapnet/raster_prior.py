@@ -75,8 +75,9 @@ class RasterPrior(BaseModule, AddsWeights):
             (``"scene"``), or none (``"none"``).
         train_drop: Probability that a sample of a training reads an empty map, so that the model
             also works without one; 0 as published.
-        neutral_start: Start parts that have no effect, so that the prior can be trained from the
-            checkpoint of a model without one. False starts random parts, as published.
+        neutral_start: Start parts that have no effect (``residual`` of ``bev``, ``zero_init`` of
+            ``queries``), so that the prior can be trained from the checkpoint of a model without
+            one. False starts random parts, as published.
 
     Attributes:
         num_channels: Channels M of the map in each BEV cell.
@@ -103,7 +104,6 @@ class RasterPrior(BaseModule, AddsWeights):
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(init_cfg)
-        self.neutral_keys = ("",) if neutral_start else ()  # "" is the prefix of all keys
         if not isinstance(head, MapHead):
             raise InputError(f"{type(head).__name__} can have no prior, which needs a MapHead.")
         cells = getattr(encoder, "grid", None)
@@ -158,6 +158,10 @@ class RasterPrior(BaseModule, AddsWeights):
                 self.positions = LearnedPositionalEncoding(
                     embed_dims // 2, cells.height, cells.width
                 )
+        bev_is_neutral = self.bev is None or self.bev.output_conv is not None
+        queries_are_neutral = self.queries is None or self.queries.zero_init
+        if bev_is_neutral and queries_are_neutral:
+            self.neutral_keys = ("",)  # the prefix of all keys
         self._given: PlaceMaps | None = None
         self._pending: list[_Pending] = []
         self._maps = self.new_maps()
@@ -251,8 +255,8 @@ class RasterPrior(BaseModule, AddsWeights):
         self.flush()
         windows = []
         for meta in metas:
-            is_dropped = self.training and bool(torch.rand(()) < self.train_drop)
-            windows.append(self.maps.read(None if is_dropped else Place.of(meta)))
+            place = None if self._is_dropped() else Place.of(meta)
+            windows.append(self.maps.read(place))
         cells = F.pixel_unshuffle(torch.stack(windows), self.scale)  # (B, M, H, W) on the host
         device = outputs["bev_feats"].device
         calibration = stack_calibration(metas, self.calibration, device)
@@ -381,6 +385,12 @@ class RasterPrior(BaseModule, AddsWeights):
             softness=self.softness,
             released_pixels=self.released_pixels,
         )
+
+    def _is_dropped(self) -> bool:
+        """Draw whether a sample reads an empty map (``train_drop``)."""
+        if not self.training or self.train_drop == 0:
+            return False  # without a draw, which would change the random numbers of a training
+        return bool(torch.rand(()) < self.train_drop)
 
     def _select_keys(self, cells: Tensor) -> list[Tensor]:
         """Numbers of the known cells of each sample, and which are no padding. 2 x (B, K)"""
