@@ -252,6 +252,7 @@ def test(model: Any, data: dict[str, Any], results: Path) -> dict[str, float]:
     Returns:
         Figures of both metrics.
     """
+    # Without a logger of this level, the metric would log a table for each head.
     MMLogger.get_instance("heads", log_level="ERROR")
     model.eval()
     metric = METRICS.build({"type": "MapMetric", "eval": METRIC_NAMES, "out_file": str(results)})

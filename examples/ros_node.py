@@ -22,8 +22,8 @@ from gsmap import MapElements, MapInferencer
 from gsmap.structures.rigid import rigid
 
 MODEL = "gsmap_r18_minicity"
-# Name of each camera, as in the data of the model or any other, and namespace of its topics
-# image_rect and camera_info.
+# Name of each camera, and the namespace of its topics image_rect and camera_info. A name may be one
+# of the cameras in the training data of the model, or any other name.
 CAMERAS = {"CAM_FRONT": "/front", "CAM_BACK": "/rear"}
 VEHICLE = "base_footprint"  # x ahead, y left, on the road below the rear axle
 MIN_SCORE = 0.3
@@ -72,11 +72,12 @@ class MapNode(Node):
             intrinsics = {}
             mounting = {}
             for name, info in self.infos.items():
-                projection = np.reshape(info.p, (3, 4))
+                projection = np.reshape(info.p, (3, 4))  # of the rectified image
                 intrinsics[name] = projection[:, :3]
                 mounting[name] = self.cam_from_vehicle(info)
+            # CAMERAS may have fewer cameras than the model was trained with.
             self.live = self.inferencer.live(
-                intrinsics, mounting, "vehicle", allow_missing_cameras=True
+                intrinsics, cam_from_frame=mounting, frame="vehicle", allow_missing_cameras=True
             )
         elements = self.live({name: rgb(message) for name, message in self.images.items()})
         confident = elements.select(elements.confidence > MIN_SCORE)

@@ -8,7 +8,9 @@ Example:
     python tools/robustness.py gsmap_r18_minicity --data-root data/minicity --samples 50 --out r
 """
 
-import gsmap  # noqa: F401 - first: it handles Ctrl-C and guards against settings files
+# Imported before all libraries: this handles Ctrl-C during their imports, and keeps them from
+# reading settings files in the working folder.
+import gsmap  # noqa: F401
 
 # isort: split
 import argparse
@@ -51,7 +53,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument(
         "--allow-other-split",
         action="store_true",
-        help="score data of another split than that of the training, whose places it may share",
+        help="score data of another split than the training split, although they may share places",
     )
     add_config_options(parser)
     args = parser.parse_args()
@@ -220,10 +222,11 @@ def main() -> str:
         require_own_split(checkpoint, model.cfg.test_dataloader.dataset)
     if model.temporal is not None and args.samples:
         raise InputError(
-            "--samples tears drives apart, which a model that uses earlier frames needs whole: "
-            "leave it out."
+            "--samples takes single samples out of the drives, but this model uses earlier frames "
+            "and needs whole drives: leave it out."
         )
-    MMLogger.get_instance("robustness", log_level="ERROR")  # without the table of each case
+    # Without a logger of this level, the metric would log a table for each case.
+    MMLogger.get_instance("robustness", log_level="ERROR")
     cases = [(CLEAN, 1), *product(args.kinds, SEVERITIES)]
     measured: dict[str, list[dict[str, float]]] = {}
     with (
@@ -239,7 +242,7 @@ def main() -> str:
             aps = average_precisions(model, settings, args.samples)
             measured.setdefault(kind, []).append(aps)
             bar.update(1)
-            if kind == CLEAN:  # the first case: a fault ends the command before the others
+            if kind == CLEAN:  # the first case, so that an error comes before the long measurement
                 others = other_figures(earlier, measured[CLEAN], args)
         measured.update(others)
         figures = {kind: measured[kind] for kind in (CLEAN, *KINDS) if kind in measured}

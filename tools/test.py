@@ -4,7 +4,9 @@
 Or give the name of a model that ships: ``python tools/test.py gsmap_r18_minicity``.
 """
 
-import gsmap  # noqa: F401 - first: it handles Ctrl-C and guards against settings files
+# Imported before all libraries: this handles Ctrl-C during their imports, and keeps them from
+# reading settings files in the working folder.
+import gsmap  # noqa: F401
 
 # isort: split
 import argparse
@@ -26,14 +28,16 @@ def parse_args() -> argparse.Namespace:
     parser = CommandParser(description=__doc__)
     parser.add_argument("config", help="config, by file or name, or the name of a trained model")
     parser.add_argument(
-        "checkpoint", nargs="?", help="checkpoint, ours or MapTR's; not needed with a name"
+        "checkpoint",
+        nargs="?",
+        help="checkpoint, ours or MapTR's; not needed with the name of a trained model",
     )
     parser.add_argument(
         "--eval",
         nargs="*",
         choices=["chamfer", "chamfer_hard", "raster"],
         default=["chamfer", "raster"],
-        help="metrics; none at all with --out only writes the predictions",
+        help="metrics; without a name after it, the predictions are only written to --out",
     )
     parser.add_argument(
         "--out", type=output_file, metavar="FILE.json", help="write the predictions (MapTR's form)"
@@ -54,7 +58,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument(
         "--allow-other-split",
         action="store_true",
-        help="score data of another split than that of the training, whose places it may share",
+        help="score data of another split than the training split, although they may share places",
     )
     parser.add_argument(
         "--prior",
@@ -120,4 +124,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    # After ``kill``, a rank ends at once: its clean-up would wait for the other ranks.
     run_command(main, clean_up_on_kill=False)

@@ -1,7 +1,9 @@
 #!/usr/bin/env python
 """Train a model: ``python tools/train.py CONFIG``."""
 
-import gsmap  # noqa: F401 - first: it handles Ctrl-C and guards against settings files
+# Imported before all libraries: this handles Ctrl-C during their imports, and keeps them from
+# reading settings files in the working folder.
+import gsmap  # noqa: F401
 
 # isort: split
 import argparse
@@ -113,4 +115,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    # After ``kill``, a rank ends at once: its clean-up would wait for the other ranks.
     run_command(main, clean_up_on_kill=False)

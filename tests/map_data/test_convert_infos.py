@@ -227,7 +227,9 @@ def test_images_have_their_own_size_if_they_are_there(size, recorded, tmp_path):
     summary = convert_infos(path, tmp_path / "a.arrow", tmp_path, "val").text()
     (camera,) = AnnotationFile(tmp_path / "a.arrow")[0].cameras
     assert (camera.width, camera.height) == recorded
-    assert ("FRONT: image not there (taken to have 1600 x 900 pixels)" in summary) == (size is None)
+    assert ("FRONT: image not there (assumed to have 1600 x 900 pixels)" in summary) == (
+        size is None
+    )
 
 
 def test_no_image_outside_of_the_data_root_is_opened(tmp_path):

@@ -31,8 +31,8 @@ _CROSSING = "ped_crossing"
 _BLOCK = 1 << 20  # bytes that are read at once
 _DEEPEST = 20  # largest depth of nested XML elements
 _MOST_PARTS = 10_000_000  # largest number of nodes, ways, relations, and references to them
-# The rings of crosswalks have at most so many nodes in all, as a multiple of the parts of the file:
-# a small file could otherwise use one long line in any number of crosswalks.
+# Largest number of nodes of all crosswalk rings together, as a multiple of the parts of the file.
+# Without this limit, the crosswalks of a small file could repeat one long line any number of times.
 _MOST_USES = 4
 _KINDS = ("node", "way", "relation")
 
@@ -70,10 +70,10 @@ class _Way(NamedTuple):
 
 
 class _Relation(NamedTuple):
-    """Lanelet, area or rule.
+    """Lanelet, area or regulatory element.
 
     Attributes:
-        way_of_role: ID of a way by its role.
+        way_of_role: ID of each member that is a way, by its role, such as ``left``.
         tags: Untrusted tags.
     """
 
@@ -118,18 +118,18 @@ def read_lanelet2(
     crosswalks = parser.crosswalks() if rule is None and _CROSSING in classes else {}
     lines = []
     bounds: set[str] = set()  # IDs of ways that are bounds of crosswalks
-    for number, relation in crosswalks.items():
-        lines.append((_CROSSING, parser.ring_of(number, relation)))
+    for relation_id, relation in crosswalks.items():
+        lines.append((_CROSSING, parser.ring_of(relation_id, relation)))
         bounds.update(relation.way_of_role.values())
-    for number, way in parser.ways.items():
-        if number in bounds:
+    for way_id, way in parser.ways.items():
+        if way_id in bounds:
             continue
         tags = way.tags if rule else _with_class(way.tags, classes)
         name = collector.class_of(tags)
         if name is not None:
             lines.append((name, way.ring_or_line))
-    for number, relation in parser.relations.items():
-        if number not in crosswalks:
+    for relation_id, relation in parser.relations.items():
+        if relation_id not in crosswalks:
             kind = relation.tags.get("type", "")
             collector.unused[f"relation {kind[:40]!r}"] += 1
     is_local = parser.have_local_positions([nodes for _, nodes in lines])
@@ -152,7 +152,7 @@ def _with_class(tags: Mapping[str, str], classes: Sequence[str]) -> dict[str, st
         return {CLASS_KEY: CLASS_OF_TYPE[kind]}
     if kind in classes:
         return {CLASS_KEY: kind}
-    # This names no class, and describes the line string in the count of unused elements.
+    # The value is not a class. It describes the line string in the count of unused elements.
     subtype = tags.get("subtype", "")
     return {CLASS_KEY: f"{kind}/{subtype}" if subtype else kind}
 
@@ -197,7 +197,8 @@ class _Parser:
                     block = file.read(_BLOCK)
                 parser.Parse(b"", True)
             except (expat.ExpatError, ValueError, LookupError) as error:
-                if isinstance(error, InputError):
+                # A LookupError is raised for an unknown encoding.
+                if isinstance(error, InputError):  # of `_error`, which already has the reason
                     raise
                 advice = fetch_advice(start[:200], otherwise="give a Lanelet2 map in OSM XML")
                 raise InputError(f"{self._path} is no valid XML ({error}): {advice}.") from error
@@ -242,36 +243,36 @@ class _Parser:
             key = f"deleted {name}"
             self.num_deleted[key] = self.num_deleted.get(key, 0) + 1
             return
-        number = self._required(attributes, "id", owner=name)
+        element_id = self._required(attributes, "id", owner=name)
         table: dict[str, _Node] | dict[str, _Way] | dict[str, _Relation]
         if name == "node":
             table = self.nodes
-            is_new = number not in table
-            self.nodes[number] = self._node(number, attributes)
+            is_new = element_id not in table
+            self.nodes[element_id] = self._node(element_id, attributes)
         elif name == "way":
             table = self.ways
-            is_new = number not in table
-            self.ways[number] = _Way(self._references, tags=self._tags)
+            is_new = element_id not in table
+            self.ways[element_id] = _Way(self._references, tags=self._tags)
         else:
             table = self.relations
-            is_new = number not in table
-            self.relations[number] = _Relation(self._way_of_role, tags=self._tags)
+            is_new = element_id not in table
+            self.relations[element_id] = _Relation(self._way_of_role, tags=self._tags)
         if not is_new:
-            raise self._error(f"it has {name} {number!r:.40} twice")
+            raise self._error(f"it has {name} {element_id!r:.40} twice")
 
-    def _node(self, number: str, attributes: Mapping[str, str]) -> _Node:
+    def _node(self, node_id: str, attributes: Mapping[str, str]) -> _Node:
         """Check the position of a node."""
         degrees = None
         if "lat" in attributes or "lon" in attributes:
-            latitude = self._number(attributes.get("lat", ""), number)
-            longitude = self._number(attributes.get("lon", ""), number)
+            latitude = self._number(attributes.get("lat", ""), node_id)
+            longitude = self._number(attributes.get("lon", ""), node_id)
             if abs(latitude) > 90 or abs(longitude) > 180:
-                raise self._error(f"node {number!r:.40} has no latitude and longitude in degrees")
+                raise self._error(f"node {node_id!r:.40} has no latitude and longitude in degrees")
             degrees = longitude, latitude
         local = None
         if "local_x" in self._tags and "local_y" in self._tags:
-            x = self._number(self._tags["local_x"], number)
-            y = self._number(self._tags["local_y"], number)
+            x = self._number(self._tags["local_x"], node_id)
+            y = self._number(self._tags["local_y"], node_id)
             local = x, y
         return _Node(degrees, local=local)
 
@@ -297,10 +298,10 @@ class _Parser:
     def _nodes(self, references: Sequence[str]) -> list[_Node]:
         """Find nodes by their IDs."""
         found = []
-        for number in references:
-            if number not in self.nodes:
-                raise self._error(f"a line needs node {number!r:.40}, which is missing")
-            found.append(self.nodes[number])
+        for node_id in references:
+            if node_id not in self.nodes:
+                raise self._error(f"a line needs node {node_id!r:.40}, which is missing")
+            found.append(self.nodes[node_id])
         return found
 
     def have_local_positions(self, lines: Sequence[Sequence[str]]) -> bool:
@@ -332,16 +333,16 @@ class _Parser:
     def crosswalks(self) -> dict[str, _Relation]:
         """Lanelets of the subtype ``crosswalk``, by their IDs."""
         found = {}
-        for number, relation in self.relations.items():
+        for relation_id, relation in self.relations.items():
             if relation.tags.get("subtype") == "crosswalk":
-                found[number] = relation
+                found[relation_id] = relation
         return found
 
-    def ring_of(self, number: str, crosswalk: _Relation) -> list[str]:
+    def ring_of(self, lanelet_id: str, crosswalk: _Relation) -> list[str]:
         """Join both bounds of a crosswalk to a ring.
 
         Args:
-            number: ID of the lanelet.
+            lanelet_id: ID of the lanelet.
             crosswalk: The lanelet.
 
         Returns:
@@ -351,7 +352,7 @@ class _Parser:
         for role in ("left", "right"):
             way = self.ways.get(crosswalk.way_of_role.get(role, ""))
             if way is None or not way.nodes:
-                raise self._error(f"crosswalk {number!r:.40} has no {role} bound")
+                raise self._error(f"crosswalk {lanelet_id!r:.40} has no {role} bound")
             bounds.append(way.nodes)
         left, right = bounds
         ends = [left[-1], right[0], right[-1]]

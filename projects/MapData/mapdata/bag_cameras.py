@@ -148,21 +148,23 @@ def build_camera(
             f"{info_topic} is used, and its distortion is not"
         )
     matrix = p if rectified else k
+    # A camera info without a size is not meant here: `RigCamera` refuses it.
     if min(full_px) > 0 and not _is_pinhole(matrix):
-        # The driver has left this matrix empty: use the other one, which only an image without
-        # distortion allows.
+        # The driver has left this matrix empty. The other one replaces it if the image has no
+        # distortion, because K and P then describe one image.
         empty, used = ("P", "K") if rectified else ("K", "P")
         matrix = k if rectified else p
         if not _is_pinhole(matrix):
             raise InputError(
-                f"{where} has no calibration, K and P have no focal lengths: give --calibration"
+                f"{where} has no calibration, because K and P have no focal lengths: give "
+                "--calibration"
             )
         if has_distortion:
             raise InputError(
                 f"{where} has no focal lengths in {empty}, and {used} alone is not enough with its "
                 "distortion: give --calibration"
             )
-        notes.append(f"{where} has no focal lengths in {empty}, it is 0: {used} is used")
+        notes.append(f"{where} has no focal lengths in {empty}: {used} is used")
     offset_px, binning, size_px = _window(info, full_px)
     image_sizes = images.sizes_px
     is_any_size_unknown = not image_sizes or min(full_px) < 1
@@ -177,8 +179,8 @@ def build_camera(
     else:
         raise InputError(
             f"{where} says {full_px} pixels, binning {binning} and a region of interest from "
-            f"{offset_px}, so {size_px}, but its images have {image_sizes[0]}: record the camera "
-            "info of these images, or give --calibration"
+            f"{offset_px}. This makes images of {size_px} pixels, but its images have "
+            f"{image_sizes[0]}: record the camera info of these images, or give --calibration"
         )
     camera = RigCamera(
         name=name,

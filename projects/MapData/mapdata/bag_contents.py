@@ -20,8 +20,8 @@ from mapdata.ros_bag import library_errors
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _STAMP_END = 12  # index of the first byte after the stamp of a camera info, in ROS 1 and 2
-# Version of the rules for making images, a part of the digest: images that were made by another
-# version are made again.
+# Version of the rules by which images are written. It is a part of the digest that names the folder
+# of the images, so images that were written by another version are not reused.
 _RULES = b"2"
 
 
@@ -34,7 +34,7 @@ class BagContent:
         images: Frame, times and sizes of the images, by their topic.
         tree: Frames of the transforms.
         odometries: Odometry, by topic, parent and child.
-        digest: Digest of all messages.
+        digest: Digest of all messages. The folder of the images is named by it.
         unread: Errors of messages that cannot be read, by topic.
         unreadable: Reason why no message of a topic can be read, by topic.
         unstamped: Number of transforms and poses with the stamp 0, by topic.
@@ -163,6 +163,7 @@ def read_messages(bag: Bag, connections: Sequence[Any]) -> Iterator[tuple[Any, i
         return
     messages = iter(bag.messages(connections))
     while True:
+        # Only the reading is in this context, not the code of the caller, which runs at ``yield``.
         with library_errors():
             message = next(messages, None)
         if message is None:
@@ -243,5 +244,6 @@ def _readable_connections(
             bag.parser(connection)
             readable.append(connection)
         except ValueError as error:
-            content.unreadable[connection.topic] = " ".join(str(error).split())
+            reason = " ".join(str(error).split())  # in one line
+            content.unreadable[connection.topic] = reason
     return readable

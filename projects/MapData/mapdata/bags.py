@@ -29,7 +29,7 @@ from mapdata.options import InputOptions
 from mapdata.ros_bag import library_errors
 
 _TOLERANCE_NS = 50_000_000  # largest difference in time of the images of one sample
-_REACH_NS = 100_000_000  # time before the first and after the last pose for which it holds
+_REACH_NS = 100_000_000  # images up to this time before the first or after the last pose are used
 _CHOOSE = "choose cameras with --topics"
 
 
@@ -78,6 +78,7 @@ def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
     listing = _listing(bag)
     calibration = options.calibration
     notes = list(bag.notes)
+    # Pose of the ground below the vehicle in the vehicle's frame. (4, 4)
     ground = rigid(np.eye(3), (0, 0, options.vehicle_ground_z_m or 0.0))
     check_topics(kinds, options.topics, listing=listing, needs_info=calibration is None)
     if calibration is None:
@@ -90,13 +91,7 @@ def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
         notes += rig_notes
     else:
         calibrated_cameras, ground = read_rig(calibration, ground)
-        images = {name: topic for name, (topic, _) in options.topics.items()}
-        if not images:
-            images = image_topics(kinds)
-        topics = {}
-        for camera, images_setting in calibrated_cameras:
-            topic = _topic_of(camera.name, images_setting, images=images, kinds=kinds)
-            topics[camera.name] = (topic, "")
+        topics = _topics_of(calibrated_cameras, options=options, kinds=kinds)
         content = read_content(bag, topics)
         for name, pair in topics.items():
             _require_messages(name, pair, content=content)
@@ -118,15 +113,7 @@ def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
     requested_count = len(thin_out(times_ns[first], options.rate_hz))
     times_with_pose = _near_poses(times_ns[first], pose_at)
     wanted_ns = thin_out(times_with_pose, options.rate_hz).tolist()
-    frames = []
-    nearest = nearest_images(times_ns, wanted_ns, tolerance_ns=_TOLERANCE_NS)
-    for frame_ns, image_times in zip(wanted_ns, nearest, strict=True):
-        images_of_frame = {}
-        for name, time_ns in image_times.items():
-            images_of_frame[name] = (f"{file_name(name)}/{time_ns}.jpg", time_ns)
-        frames.append(
-            RigFrame(token=f"{path.stem}_{frame_ns}", time_ns=frame_ns, images=images_of_frame)
-        )
+    frames = _group_images(times_ns, wanted_ns, scene=path.stem)
     samples = rig_samples(path.stem, list(rig.values()), frames=frames, pose_at=pose_at)
 
     notes += content.notes() + content.tree.notes + pose_notes
@@ -162,6 +149,48 @@ def _sampling_camera(names: Sequence[str]) -> str:
         if "front" in name.lower():
             return name
     return names[0]
+
+
+def _group_images(
+    times_ns: Mapping[str, np.ndarray], wanted_ns: Sequence[int], scene: str
+) -> list[RigFrame]:
+    """Frames at the wanted times, each with the nearest image of every camera.
+
+    Args:
+        times_ns: Times of the images, ascending, by camera. (n,) each
+        wanted_ns: Times of the frames. (m,)
+        scene: Name of the scene, with which the tokens of the frames begin.
+    """
+    frames = []
+    nearest = nearest_images(times_ns, wanted_ns, tolerance_ns=_TOLERANCE_NS)
+    for frame_ns, image_times in zip(wanted_ns, nearest, strict=True):
+        images = {}
+        for name, time_ns in image_times.items():
+            images[name] = (f"{file_name(name)}/{time_ns}.jpg", time_ns)
+        frames.append(RigFrame(token=f"{scene}_{frame_ns}", time_ns=frame_ns, images=images))
+    return frames
+
+
+def _topics_of(
+    calibrated_cameras: Sequence[tuple[RigCamera, str]],
+    options: InputOptions,
+    kinds: Mapping[str, str],
+) -> dict[str, tuple[str, str]]:
+    """Topics of the images and of the camera info of calibrated cameras, the latter empty.
+
+    Args:
+        calibrated_cameras: Cameras of the calibration file, with their setting ``images``.
+        options: The topics that the user has given.
+        kinds: Type of the messages, by topic.
+    """
+    images = {name: topic for name, (topic, _) in options.topics.items()}
+    if not images:
+        images = image_topics(kinds)
+    topics = {}
+    for camera, images_setting in calibrated_cameras:
+        topic = _topic_of(camera.name, images_setting, images=images, kinds=kinds)
+        topics[camera.name] = (topic, "")
+    return topics
 
 
 def _topic_of(
@@ -272,7 +301,7 @@ def _build_camera(
 def _poses(
     content: BagContent, vehicle: str, ground: np.ndarray
 ) -> tuple[PoseChain | None, list[str]]:
-    """Poses of the ground from the transforms above the vehicle, or else from odometry."""
+    """Poses of the ground from the transforms of the vehicle's frame, or else from odometry."""
     chain = content.tree.poses(vehicle, ground) if vehicle else None
     if chain is not None:
         return chain, []

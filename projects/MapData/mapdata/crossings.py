@@ -1,4 +1,7 @@
-"""Pedestrian crossings as map elements: long edges, or outlines that are open at the patch."""
+"""Pedestrian crossings as map elements: long edges, or outlines that are open at the patch.
+
+The patch is the rectangle around the vehicle to which a local map is cut.
+"""
 
 import numpy as np
 import shapely
@@ -8,7 +11,7 @@ from mapdata.local_map import COLLECTION, LocalPatch, is_line
 
 EDGES = "edges"
 PARALLEL = "parallel"
-CROSSINGS = (UNITED, EDGES, PARALLEL)
+CROSSINGS = (UNITED, EDGES, PARALLEL)  # names of all rules by which crossings become map elements
 EDGE_MARGIN_M = 0.2  # distance from the edge of the patch at which open outlines end
 PARALLEL_COSINE_GAP = 0.01  # one minus the cosine of the largest angle, about 8 degrees
 

@@ -31,7 +31,8 @@ def open_dataset(
     Args:
         cfg: Config of the model.
         source: The samples.
-        mount: Annotation frame of the model; not used if the config names no frame.
+        mount: Annotation frame of the model, and its place in the vehicle. It is not used if the
+            config names no frame.
         ann_file: File to which samples are written. Nothing is written if ``source`` is an
             annotation file in the annotation frame of the model.
 
@@ -56,6 +57,7 @@ def open_dataset(
         settings["ground_z_m"] = None  # the written file contains the height
     settings["ann_file"] = str(ann_file.resolve())
     settings["test_mode"] = True
+    # Accept any split, and the number of coordinates in the file.
     settings["split"] = None
     settings["dim"] = None
     settings["cameras"] = _select_cameras(cfg, samples)
@@ -75,7 +77,7 @@ def _annotation_meta(
     Args:
         cfg: Config of the model.
         samples: Samples of the file.
-        mount: Annotation frame of the samples.
+        mount: Annotation frame of the samples, and the height of the road in it.
         has_poses: Whether the poses of the vehicle are known.
     """
     options = cfg.test_dataloader.dataset

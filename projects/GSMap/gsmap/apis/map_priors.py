@@ -1,4 +1,7 @@
-"""Map priors of a user for a model that reads one."""
+"""Files of map priors for a model that reads one.
+
+A map prior is the map of a place from earlier drives, which is a further input of the model.
+"""
 
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -19,12 +22,16 @@ def require_prior(model: Any) -> None:
 
 
 def maps_for(model: Any, priors: "Sequence[AnyPrior]", update: bool = False) -> Any:
-    """Maps of a user in the form that a model reads.
+    """Prepare the priors of a user for a model.
 
     Args:
         model: A `MapDetector`.
         priors: The priors, one for each place.
-        update: Write each frame to them after it is predicted.
+        update: Write the prediction of each frame to the prior of its place.
+
+    Returns:
+        Object for `use` and `using` of the prior module of the model (``model.prior``), which takes
+        the prior of each sample from it.
 
     Raises:
         ValueError: If the model takes no prior, or a prior does not fit it.
@@ -34,12 +41,12 @@ def maps_for(model: Any, priors: "Sequence[AnyPrior]", update: bool = False) -> 
 
 
 def use_priors(model: Any, paths: Sequence[Path], stack: ExitStack) -> None:
-    """Let a model read files of priors in its tests, without changing them.
+    """Let a model read files of priors in its tests, without changing the files.
 
     Args:
         model: A `MapDetector`.
         paths: The files, one for each place.
-        stack: Closes the priors.
+        stack: Context that closes the priors at its end.
 
     Raises:
         FileNotFoundError: If a file does not exist.
@@ -55,9 +62,10 @@ def open_priors(
     """Open files of priors until the end of a context.
 
     Args:
-        model: A `MapDetector` with a prior, which gives a new file its classes, cells and rule.
+        model: A `MapDetector` with a prior. A new file gets the classes and the cells of the model
+            and its rule for writing predictions.
         paths: The files.
-        stack: Closes the priors.
+        stack: Context that closes the priors at its end.
         update: Reserve the files, to save them later; a file that does not exist is created.
         new_place: Name of the place of a file that is created.
 
@@ -76,7 +84,7 @@ def open_priors(
             with MapPrior(settings, rule=model.prior.test_rule) as empty:
                 empty.save(path)
         prior = open_prior(path, update=update)
-        if isinstance(prior, MapPrior):
+        if isinstance(prior, MapPrior):  # a `GaussianPrior` keeps no file open
             stack.enter_context(prior)
         priors.append(prior)
     return priors

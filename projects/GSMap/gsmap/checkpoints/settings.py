@@ -10,7 +10,8 @@ from mmengine.config import Config, ConfigDict
 
 from gsmap.utils.errors import InputError
 
-MODEL_SETTINGS = "model_settings"  # key in a checkpoint's meta: JSON, since config text is code
+# Key in a checkpoint's meta. The value is JSON, because the text of a config is run as code.
+MODEL_SETTINGS = "model_settings"
 # Settings that only training uses, such as initial weights. A checkpoint must not set them, because
 # some of them load files.
 TRAINING_SETTINGS = {
@@ -91,7 +92,7 @@ def check_settings(settings: Any, config: dict[str, Any]) -> dict[str, Any]:
 
     Args:
         settings: Settings from the JSON in the checkpoint.
-        config: Settings of the model in the config, which are trusted, from `plain`.
+        config: Settings of the model in the config, converted by `plain`. They are trusted.
 
     Returns:
         The settings without `TRAINING_SETTINGS`.

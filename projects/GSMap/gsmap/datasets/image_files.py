@@ -247,7 +247,7 @@ def _decode_other(
 
 
 def _check_num_pixels(size: tuple[int, int]) -> None:
-    """Raise an error for an image (width, height) with more pixels than images of cameras."""
+    """Raise an error if an image (width, height) has more pixels than the limit."""
     width, height = size
     if width * height > _MAX_PIXELS:
         raise _UnfitError(

@@ -5,7 +5,6 @@ import platform
 import sys
 import threading
 import time
-from collections import Counter
 from contextlib import suppress
 from datetime import timedelta
 from typing import NamedTuple
@@ -58,10 +57,11 @@ class RankWatch:
     def __enter__(self) -> "RankWatch":
         host = os.environ["MASTER_ADDR"]
         port = int(os.environ["MASTER_PORT"])
-        patience = timedelta(seconds=self._beat_s)
-        store = dist.TCPStore(host, port, is_master=False, timeout=patience)
-        start = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")
-        self._store = dist.PrefixStore(f"gsmap/{start}", store)
+        answer_timeout = timedelta(seconds=self._beat_s)
+        store = dist.TCPStore(host, port, is_master=False, timeout=answer_timeout)
+        # After a restart by torchrun, heartbeats from before the restart are not read.
+        restart_count = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")
+        self._store = dist.PrefixStore(f"gsmap/{restart_count}", store)
         self.step("its start")
         self._thread.start()
         return self
@@ -123,8 +123,8 @@ class RankWatch:
         wait_s = time.monotonic() - self._step_start_s
         text = (
             f"{_missing_ranks(before=before, after=after)}; this one has waited {wait_s:.0f} s "
-            f"(env_cfg.dist_cfg.timeout is {self._timeout_s:g}): see whether it is stopped, and "
-            "what it reads."
+            f"(env_cfg.dist_cfg.timeout is {self._timeout_s:g}): check whether that process is "
+            "stopped, and which file it is reading."
         )
         sys.stderr.write(f"error: {text}\n")
         sys.stderr.flush()
@@ -138,10 +138,10 @@ def _missing_ranks(before: dict[int, _Report], after: dict[int, _Report]) -> str
         previous_beats = before[rank].beats if rank in before else ""
         if previous_beats == report.beats:
             silent_ranks.append(rank)
-    steps_count = Counter(report.steps for report in after.values())
     last_ranks = []
-    if len(steps_count) > 1:
-        fewest_steps = min(steps_count)
+    all_steps = {report.steps for report in after.values()}
+    if len(all_steps) > 1:  # otherwise no rank is behind the others
+        fewest_steps = min(all_steps)
         last_ranks = [rank for rank, report in after.items() if report.steps == fewest_steps]
     verb = "answer" if silent_ranks else "go on"
     ranks = silent_ranks or last_ranks

@@ -1,4 +1,8 @@
-"""Identity of the scene list behind data, models and results: a name and a digest."""
+"""Identity of the list of scenes in each split: a name and a digest.
+
+Data, models and results contain the identity, so that a model is not tested on scenes of its
+training by mistake.
+"""
 
 import hashlib
 import json
@@ -9,7 +13,9 @@ from typing import Any
 from gsmap.utils.errors import InputError
 
 SPLIT_LIST = "split_list"  # key in annotation files, checkpoints and results
-TRAINED_ON = "trained_on"  # key in results: training list of a model of this data set
+# Key in results: list by which the training data of the model were split. It is only written if the
+# model was trained on the data set that it was tested on.
+TRAINED_ON = "trained_on"
 _IDENTITY = re.compile(r"[\w.+=-]{1,100}(@[0-9a-f]{16})?")
 
 
@@ -71,6 +77,8 @@ def require_same_list(model: Any, data: Any, subject: str, remedy: str) -> None:
 
 def require_results_of(split_list: str, about: Mapping[str, Any], path: object) -> None:
     """Refuse results of a model that was trained on another split than the evaluation data.
+
+    Results for other data, which belong to another split, are refused as well.
 
     Args:
         split_list: Identity of the list of the evaluation data; empty if unknown.

@@ -24,6 +24,7 @@ _SCORE_PT = 6.5  # font size of scores
 _HANDLE = 4 / 3 * (np.sqrt(2) - 1)  # distance of an inner control point from its end point
 _FIRST_QUARTER = np.array([1, 1 + 1j * _HANDLE, _HANDLE + 1j])
 _QUARTERS = _FIRST_QUARTER * 1j ** np.arange(5)[:, None]
+# Four quarters of three points each, and the first point of a fifth one, which closes the circle.
 _CIRCLE = _QUARTERS.ravel()[:13].view(np.float64).reshape(13, 2)
 _CIRCLE_CODES = [Path.MOVETO, *[Path.CURVE4] * 12]
 
@@ -81,7 +82,7 @@ class BEVPanel:
 
 
 def display_extent(grid: BEVGrid, view: FrameView) -> tuple[float, float, float, float]:
-    """Compute the extent of a grid in the display.
+    """Compute the extent of a grid in the display, where x points to the right and y ahead.
 
     Args:
         grid: Extent of the map in the annotation frame.

@@ -54,6 +54,7 @@ def read_map_file(path: Path) -> tuple[ArgoverseStaticMap, dict[str, list[str]]]
             records = content.get(key, {}) if may_be_absent else content[key]
             for element_id, record in records.items():
                 try:
+                    # Any error about the content becomes a ``ValueError`` with its reason.
                     with explain_errors(name, "it is left out"):
                         _check_lines(record, min_points)
                         layers[key][record["id"]] = from_dict(record)

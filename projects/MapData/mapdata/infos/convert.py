@@ -53,7 +53,10 @@ _BEYOND_M = 1.0  # tolerance of the range; roll and pitch move clipped points by
 
 
 def _relative(path: str, root: Path) -> str:
-    """Path of an info file relative to the data root; the file may be from another computer."""
+    """Convert a path in an info file to a path relative to the data root.
+
+    The info file may be from another computer, with another data root.
+    """
     existing = find_file(path, root)
     if existing is not None:
         return existing.as_posix()
@@ -113,7 +116,7 @@ class _ImageSizes:
             return self._sizes[scene, camera]
         if not file.is_file():
             width, height = NUSCENES_SIZE
-            reason = f"image not there (taken to have {width} x {height} pixels)"
+            reason = f"image not there (assumed to have {width} x {height} pixels)"
             self._summary.add_problem(f"{camera}: {reason}", str(file))
             return NUSCENES_SIZE
         size = image_size(file, f"camera {camera}")
@@ -153,8 +156,9 @@ def _nuscenes_sample(
         sweeps.append(sweep_record)
     can_bus = info.get("can_bus")
     if can_bus is not None:
-        # The signals are position (3), quaternion (4) and measurements (9), then the yaw. MapTR,
-        # too, adds position, quaternion and yaw only on loading.
+        # The signals are position (3), quaternion (4), measurements (9) and yaw (2). Only the
+        # measurements are taken from the file. The others follow from the pose, as when MapTR loads
+        # the file.
         measurements = np.asarray(can_bus, np.float64)[7:16]
         can_bus = pose_signals(global_from_ego)
         can_bus[3:7] = np.asarray(info["ego2global_rotation"])
@@ -219,6 +223,8 @@ def _entries(content: Any, path: Path) -> tuple[list[Mapping[str, Any]], str]:
     Returns:
         The entries, and the annotation frame: ``lidar`` (nuScenes) or ``ego`` (Argoverse 2).
     """
+    # Samples of StreamMapNet and MapTracker also have the key ``e2g_translation``. They are listed
+    # under ``samples``, or the whole content is the list.
     entries = content.get("samples", ()) if isinstance(content, Mapping) else content
     first = entries[0] if isinstance(entries, list) and entries else None
     if isinstance(first, Mapping) and "e2g_translation" in first and not first.keys() >= _MAPTRV2:
@@ -249,8 +255,8 @@ def _samples(
 ) -> Iterator[MapSample]:
     """Yield the samples of an info file.
 
-    Ground truth is read from the file. If the file has none, it is extracted from the map
-    expansion, for nuScenes, or else the sample has none.
+    Ground truth is read from the info file. If the file has none, the ground truth of nuScenes is
+    extracted from the map expansion, and samples of Argoverse 2 remain without ground truth.
 
     Args:
         entries: Entries of the info file with their position in it.
@@ -284,7 +290,7 @@ def _samples(
                 sample.instances = local_map.instances(sample.global_from_frame)
             else:
                 reason = f"no ground truth: maps/expansion has no map {sample.map_name!r}"
-                summary.add_problem(f"{reason} (sample kept without)", sample.token)
+                summary.add_problem(f"{reason} (sample kept without it)", sample.token)
         summary.add_sample(meta.split, sample)
         yield sample
 

@@ -190,7 +190,7 @@ def _decoder_of_valid(array: pa.Array, dim: int, name: str) -> Callable[[int], A
         matrices = matrices_of(array, _SHAPES[name])
         return lambda i: matrices[i].copy()
     if name == "points":
-        starts = array.offsets.to_numpy() // dim
+        starts = array.offsets.to_numpy() // dim  # offsets count coordinates, starts count points
         points = array.values.to_numpy().reshape(-1, dim)
         return lambda i: points[starts[i] : starts[i + 1]].copy()
     if pa.types.is_list(array.type):

@@ -191,6 +191,7 @@ def draw(
     for i in range(len(masks)):
         corners = pixels[offsets[i] : offsets[i + 1]]
         num_edges = len(corners) if filled[i] else len(corners) - 1  # a polygon is closed
+        # A line without points has -1 edges.
         edges = np.zeros((max(num_edges, 0), 2, 2), dtype=np.int64)
         cut = np.zeros(len(edges), dtype=np.bool_)
         for j in range(len(edges)):
@@ -203,7 +204,8 @@ def draw(
                 cut[j] |= _side(point[1], limit=height - 1) != 0
             if not cut[j] or _clip_segment(edges[j, 0], edges[j, 1], height=height, width=width):
                 _draw_segment(masks[i], width, start=edges[j, 0], end=edges[j, 1], radius=radius)
-            if edges[j, 0, 1] == edges[j, 1, 1]:  # within one row: the clipped edge has no slope
+            if edges[j, 0, 1] == edges[j, 1, 1]:
+                # A clipped edge within one row has no slope: `_fill` takes the slope of the whole.
                 edges[j, 0] = start
                 edges[j, 1] = end
         if filled[i] and len(corners):

@@ -1,4 +1,7 @@
-"""Camera-aware depth net, after BEVDepth (arXiv 2206.10092)."""
+"""Camera-aware depth net, after BEVDepth (arXiv 2206.10092).
+
+Submodules have the names of BEVDepth's released code, so that released weights can be loaded.
+"""
 
 from collections import OrderedDict
 
@@ -13,7 +16,7 @@ CAMERA_VECTOR_SIZE = 22
 def _conv_bn_relu(
     in_channels: int, out_channels: int, kernel_size: int, dilation: int = 1
 ) -> nn.Sequential:
-    """Build a size-keeping convolution with BatchNorm and ReLU, with the released layer names."""
+    """Build a convolution that keeps the size of the map, with BatchNorm and ReLU."""
     padding = dilation * (kernel_size // 2)
     conv = nn.Conv2d(
         in_channels, out_channels, kernel_size, padding=padding, dilation=dilation, bias=False
@@ -23,7 +26,7 @@ def _conv_bn_relu(
 
 
 def _camera_mlp(channels: int) -> nn.Sequential:
-    """Build the embedding of a camera's parameter vector, with the released layer names."""
+    """Build the embedding of a camera's parameter vector (`camera_vector`)."""
     first = nn.Linear(CAMERA_VECTOR_SIZE, channels)
     second = nn.Linear(channels, channels)
     return nn.Sequential(OrderedDict(fc1=first, relu=nn.ReLU(), fc2=second))
@@ -68,8 +71,8 @@ class SEGate(nn.Module):
         Returns:
             The scaled features. (n, C, h, w)
         """
-        # The checkpoints store the two linear layers as 1x1 convolutions. As such they are slow on
-        # a single pixel.
+        # The checkpoints store both layers as 1x1 convolutions. They are computed as linear layers,
+        # because a convolution is slow on a map of a single pixel.
         reduce = self.conv_reduce
         expand = self.conv_expand
         hidden = F.relu(F.linear(embedding, reduce.weight.flatten(1), reduce.bias))
@@ -176,7 +179,7 @@ class PlainDepthNet(nn.Module):
 
         Args:
             feats: Image features of n cameras. (n, in_channels, h, w)
-            camera_vectors: Not used; the other depth net needs it.
+            camera_vectors: Not used; `CameraAwareDepthNet` needs it.
 
         Returns:
             Depth logits (n, D, h, w) and context (n, C, h, w).

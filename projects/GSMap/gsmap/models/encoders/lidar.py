@@ -20,8 +20,8 @@ from gsmap.utils.errors import WorkError
 class LidarEncoder(BaseModule):
     """BEV features of voxels: PointPillars or SECOND, depending on the configs of its modules.
 
-    The data preprocessor makes the voxels (``voxel=True``). Its range must be the extent of the
-    map.
+    The data preprocessor makes the voxels (``voxel=True``), and the range of the voxels must be the
+    extent of the map.
 
     Args:
         grid: Extent of the map.

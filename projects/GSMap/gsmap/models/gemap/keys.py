@@ -27,7 +27,8 @@ GEMAP = KeyMap(
     (*_GEOMETRY_RULES, *MAPTR.rules),
     unused={
         **CODE_WEIGHTS,
-        # On Argoverse 2, the simple objective uses the head of the full one with weights of zero.
+        # Buffers of the full objective. The released model of Argoverse 2 has them, too: its simple
+        # objective is the full one, with weights of zero for the further losses.
         HEAD + "tau": None,  # not used in any computation
         HEAD + "loss_seg.loss_fn.pos_weight": None,
         HEAD + "loss_pv_seg.loss_fn.pos_weight": None,

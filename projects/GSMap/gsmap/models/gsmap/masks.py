@@ -15,15 +15,16 @@ from gsmap.structures.tensors import constant
 
 
 class GaussianMasks(ElementMasks):
-    """Masks of map elements whose references are Gaussians.
+    """Masks of map elements whose vertices are Gaussians.
 
     Args:
         grid: Extent of the map.
         held_classes: Class indices of elements whose masks have no gradient in the points, only in
             sigma and theta.
-        kwargs: Settings of `ElementMasks`. ``source="gaussians"`` is like ``"points"``, with
-            Gaussians along the points as masks (GSMap Eq. 6). Their integral across a line is its
-            width, and a prediction can equal such a mask.
+        kwargs: Settings of `ElementMasks`. ``source="gaussians"`` is like ``"points"``, but the
+            mask of the ground truth is rendered from Gaussians along its points (GSMap Eq. 6). The
+            integral of this mask across a line is the width of the line. Predictions are rendered
+            from Gaussians as well, so their masks can equal such a mask.
     """
 
     sources: ClassVar[tuple[str, ...]] = ("full", "points", "gaussians")
@@ -61,7 +62,8 @@ class GaussianMasks(ElementMasks):
         """References for the rendering, whose points have no gradient for ``held_classes``.
 
         Args:
-            references: References of the decoder, ``coords`` coordinates first. (M, P, D)
+            references: Predicted vertices of the decoder: ``coords`` coordinates, then the other
+                parameters of the Gaussian. (M, P, D)
             labels: Class indices of their ground truths. (M,)
             coords: Number of coordinates of a point.
         """

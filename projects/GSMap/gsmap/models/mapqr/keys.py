@@ -12,6 +12,7 @@ from gsmap.models.maptr.keys import (
 )
 from gsmap.models.maptrv2.keys import MASK_RULES, MASK_WEIGHTS
 
+# Layer that predicts sampling heights. Only MapQR has it, so it identifies the architecture.
 _HEIGHTS = (
     ENCODER_LAYER + "attentions.1.height_offsets.",
     OUR_ENCODER_LAYER + "cross_attn.height_offsets.",
@@ -19,7 +20,7 @@ _HEIGHTS = (
 MAPQR = KeyMap(
     "mapqr",
     (
-        _HEIGHTS,
+        _HEIGHTS,  # before the rule of MAPTR for all of ``cross_attn.``
         *MAPTR.rules,
         *MASK_RULES,
         (DECODER + "pt_pos_query_projs.{i}.", LAYER + "position_proj."),

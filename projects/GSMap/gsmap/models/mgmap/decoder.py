@@ -97,7 +97,8 @@ class MGMapDecoder(MapDecoder):
                 f"each refinement stage uses the branches of a layer, but there are {refinements} "
                 f"stages and {len(self.layers)} layers: set refinements to 0 to {len(self.layers)}."
             )
-        # Branches of the outputs: of all layers, then of the last layers again for the stages.
+        # Index of the prediction branches of each output: first the outputs of all layers, then the
+        # outputs of the refinement stages, which use the branches of the last layers again.
         first_shared = len(self.layers) - refinements
         self.branches = self.branches + self.branches[first_shared:]
         self.num_masks = num_masks
@@ -201,6 +202,7 @@ class MGMapDecoder(MapDecoder):
         mask = mask_of_points(attn_mask, self.num_points)
         states = last.point_states.flatten(1, 2)  # (B, N * P, C)
         references = last.references.flatten(1, 2)  # (B, N * P, D)
+        # One patch of zeros for all points, unless patches are cropped below.
         patches = fused_feats.new_zeros(1, 1, fused_feats.shape[1], BINS, BINS)
         outputs: list[Decoded] = []
         branches = self.branches[len(self.layers) :]
@@ -208,6 +210,7 @@ class MGMapDecoder(MapDecoder):
             references = references.detach()
             if feats is not None:
                 patches = crop_patches(feats, references[..., :2])
+            # Glimpses are the features of the patches after attention to the states. (B, N * P, C)
             corrected_states, glimpses = stage(states, patches, mask=mask)
             states = torch.cat([states, glimpses], dim=-1)
             references = refine(branch, corrected_states, references)

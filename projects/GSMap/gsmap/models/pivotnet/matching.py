@@ -1,4 +1,8 @@
-"""PivotNet's dynamic matching of pivots with predicted points."""
+"""PivotNet's dynamic matching of the pivots of annotated lines with predicted points.
+
+Pivots are the vertices that define the shape of a line, its two ends among them. Each pivot is
+matched with one predicted point, in order. Predicted points may remain without a pivot.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,16 +13,16 @@ Floats = NDArray[np.floating]
 
 
 def path_costs(costs: Floats) -> Floats:
-    """Compute the lowest costs of matching the first pivots with the first points, in order.
+    """Compute the lowest total costs of matching the first pivots with the first points, in order.
 
-    The first pivot is matched with the first point. Entry (i, j) is the cost of a path in which
-    pivot i is matched with point j; infinite if there is no path.
+    The first pivot is matched with the first point. Entry (i, j) is the lowest cost of matching the
+    pivots 0 to i if pivot i is matched with point j. It is infinite if that is not possible.
 
     Args:
         costs: Differences of m pivots and p points. (..., m, p)
 
     Returns:
-        Costs of the best paths. (..., m, p)
+        Lowest total costs. (..., m, p)
     """
     table = np.full(costs.shape, fill_value=np.inf)
     table[..., 0, 0] = costs[..., 0, 0]

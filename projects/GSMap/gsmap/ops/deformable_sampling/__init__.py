@@ -11,7 +11,7 @@ _sum_rows = fused_operator(
     "deformable_sampling.sum_rows",
     "Tensor table, Tensor weights, Tensor rows",
     lambda table, weights, rows: (len(rows), table.shape[1]),
-    differentiable=2,
+    differentiable=2,  # table and weights
 )
 _deformable_sample = fused_operator(
     "deformable_sampling.deformable_sample",
@@ -24,7 +24,7 @@ _deformable_sample = fused_operator(
 
 def has_kernel(value: Tensor) -> bool:
     """Whether ``backend="auto"`` of `deformable_sample` selects the Triton kernel for a map."""
-    like = at_least_float32(value[:0])
+    like = at_least_float32(value[:0])  # the choice depends on device and type, not on values
     return choose_backend("auto", like, fused=("triton",), kernel="deformable_sample") == "triton"
 
 
@@ -46,7 +46,8 @@ def deformable_sample(
         locations: Sampling points (x, y), [0, 1] over the map. (B, Q, heads, S, 2)
         weights: Attention weights. (B, Q, heads, S)
         backend: A backend of `sum_rows`, or ``"triton"``: one kernel for the forward pass, and one
-            for the backward pass. The latter adds the gradient of the map in any order.
+            for the backward pass. The latter sums the gradient of the map in an order that differs
+            between runs.
 
     Returns:
         Sums of all heads, concatenated, differentiable in ``value``, ``locations`` and

@@ -207,7 +207,8 @@ def soft_backward_kernel(
             dy = offset_y - t * edge_y
             # The gradient is derived in `_scatter` of ``numba.py``. EPS and rounding move t off the
             # nearest point of the edge, so the derivative by t is not 0 between the ends. The slip
-            # is computed from (dx, dy) instead of EPS, so that it also covers rounding.
+            # is the negative of this derivative, divided by the squared length of the edge. It is
+            # computed from (dx, dy) instead of EPS, so that it also covers rounding.
             between = (along >= 0) & (along <= 1)
             slip = tl.where(between, 2 * (dx * edge_x + dy * edge_y) / length2, 0.0)
             share = tl.where(edge_index == edge, weight, 0.0)

@@ -1,4 +1,8 @@
-"""Changes of the map on the report page: lines of each frame, and their table."""
+"""Map changes on the report page: their lines in each frame, and a table of all changes.
+
+A change is a map element, or a part of one, that was added, removed or moved since an old map was
+made.
+"""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -21,7 +25,7 @@ from gsmap.visualization.page.tables import Table
 
 
 class ChangeLayer:
-    """Changes of the places of an annotation file.
+    """Changes of the maps in which the samples of an annotation file lie.
 
     Args:
         path: File of ``build_map.py --changes`` or of MiniCity; None for no changes.
@@ -58,7 +62,7 @@ class ChangeLayer:
             line = MapElements.from_polylines([change.points], [0]).to_frame(frame_from_global)
             pieces = clip_to_box(line.points, self._meta.x_range, self._meta.y_range)
             if pieces and is_closed(line.points):
-                pieces = [line.points]
+                pieces = [line.points]  # the outline of an area is drawn whole, not cut to lines
             for piece in pieces:
                 self._shown.add(index)
                 entry = {
@@ -70,7 +74,7 @@ class ChangeLayer:
         return entries
 
     def notes(self) -> list[str]:
-        """Describe the number of changes, and of those in range of the frames so far."""
+        """One sentence with the number of changes, and how many of them `entries` has returned."""
         if not self._is_shown:
             return []
         counts = Counter(change.kind for change in self._changes)
@@ -99,7 +103,7 @@ def _distance(change: MapChange) -> str:
 
 
 def _drives(change: MapChange) -> str:
-    """Number of drives that agree, of those in view."""
+    """Number of drives that confirm the change, of all drives past it; empty if unknown."""
     if change.passes is None:
         return ""
     agreeing, in_view = change.passes
