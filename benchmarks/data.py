@@ -81,7 +81,7 @@ def measure_loading(path: Path, reads: int = 5000) -> dict[str, float]:
     """
     start = time.process_time()
     file = AnnotationFile(path)
-    file.instance_counts()
+    file.instance_counts()  # reads the number of elements of each sample, as a training does first
     open_s = time.process_time() - start
     start = time.process_time()
     for row in np.random.default_rng(1).integers(len(file), size=1000):
@@ -102,8 +102,9 @@ def measure_loading(path: Path, reads: int = 5000) -> dict[str, float]:
 class PerItemGroundTruth:
     """Ground truth that is made for each item by a walk over all records of the map.
 
-    It is made with the devkit, as in data loaders that make ground truth while they load. It is
-    compared with ``NuScenesLocalMap``, which is prepared once for each map.
+    It uses the devkit, as in data loaders that make ground truth while they load, and has the
+    classes divider (0), crossing (1) and boundary (2). It is compared with ``NuScenesLocalMap``,
+    which is prepared once for each map.
 
     Args:
         nusc_map: Map of the devkit.
@@ -148,6 +149,7 @@ class PerItemGroundTruth:
         segments = shapely.union_all(self._areas("road_segment", patch, to_frame=to_frame))
         lanes = shapely.union_all(self._areas("lane", patch, to_frame=to_frame))
         surface = shapely.union_all([segments, lanes])
+        # Outlines end 0.2 m inside the range, which leaves out the edge of the range itself.
         inner = box.buffer(-0.2, join_style="mitre")
         for ring in _rings(surface):
             for piece in shapely.get_parts(shapely.line_merge(ring.intersection(inner))):
@@ -210,6 +212,7 @@ def per_item_orders(instances: Sequence[MapInstance], num_points: int) -> list[n
         points = instance.points
         if is_closed(points):
             rings = []
+            # A closed ring repeats its first point, so it has one start less than points.
             for k in range(min(len(points), num_points) - 1):
                 ring = np.roll(points[:-1], k, axis=0)
                 rings.append(resample(np.concatenate([ring, ring[:1]])))
@@ -253,14 +256,16 @@ def _cpu_ms(work: Callable[[], Any]) -> float:
 
 
 def measure_ground_truth(root: Path, annotations: Path, repeats: int = 3) -> dict[str, float]:
-    """Measure ground truth per frame, from maps that are prepared once, and made per item.
+    """Measure two ways of making the ground truth of a frame.
 
-    Both are measured in turns.
+    One takes it from a map that is prepared once (`NuScenesLocalMap`), the other walks over all
+    records of the map for each frame (`PerItemGroundTruth`). Passes over all poses alternate
+    between the two.
 
     Args:
         root: Data root with the map expansion.
         annotations: Annotation file with the poses.
-        repeats: Number of passes of each of the two over all poses; the fastest counts.
+        repeats: Number of passes of each way over all poses; the fastest pass counts.
 
     Returns:
         CPU time in milliseconds per frame (``prepared_ms``, ``per_item_ms``) and their ratio.
@@ -292,11 +297,11 @@ def measure_ground_truth(root: Path, annotations: Path, repeats: int = 3) -> dic
 
 
 def measure_pipeline(config: Any, root: Path, count: int = 20) -> dict[str, float]:
-    """Measure the training pipeline with ground truth from the file, and made per item.
+    """Measure the training pipeline with two sources of ground truth.
 
-    Ground truth that is made per item comes from a walk over the records of the map, and its orders
-    of points are resampled by one call per point, as in MapTR's data set. Both pipelines have equal
-    transforms of images, and are measured in turns.
+    One reads it from the annotation file. The other makes it for each item by a walk over the
+    records of the map, and resamples its orders of points by one call per point, as in MapTR's data
+    set. Both pipelines have equal transforms of images, and their passes alternate.
 
     Args:
         config: Config of a ``VectorizedMapDataset``.

@@ -99,7 +99,7 @@ def run(args: argparse.Namespace) -> None:
             with args.out.open("a") as file:
                 file.write(line + "\n")
 
-    publish_line(f"{name}, torch {torch.__version__}; medians of do_bench\n")
+    publish_line(f"{name}, torch {torch.__version__}; medians of triton.testing.do_bench\n")
     publish_line("| " + " | ".join(COLUMNS) + " |")
     publish_line("| " + " | ".join(["---"] * len(COLUMNS)) + " |")
     verdicts: dict[str, bool] = {}
@@ -119,7 +119,7 @@ def run(args: argparse.Namespace) -> None:
         publish_line("| " + " | ".join([case.kernel, case.size, *cells]) + " |")
     correct_kernels = [name for name, correct in verdicts.items() if correct]
     wrong_kernels = sorted(verdicts.keys() - set(correct_kernels))
-    publish_line(f"\n{backends.SWITCH}={','.join(correct_kernels)} (right here)")
+    publish_line(f"\n{backends.SWITCH}={','.join(correct_kernels)} (correct on this device)")
     if wrong_kernels:
         raise SystemExit(f"error: wrong or failed: {', '.join(wrong_kernels)}.")
 
@@ -272,6 +272,7 @@ def sampling_cases(reduced: bool) -> Iterator[Case]:
                     value, (height, width), locations, weights, backend=backend
                 )
 
+            # Values that ``dtype`` represents exactly: all backends compute with equal inputs.
             value = torch.randn(batch, height * width, 8, 32).to(dtype).float()
             locations = random_locations((batch, queries, 8, 4), (height, width))
             weights = torch.rand(batch, queries, 8, 4)
@@ -329,9 +330,10 @@ def kernel_sampling_cases(reduced: bool) -> Iterator[Case]:
                 value, shape, uv, visible, weights, offsets, bilinear=bilinear, backend=backend
             )
 
-        lift = 0.5 + torch.linspace(-2, 2, heads) / depth[:, None]  # (Q, heads)
+        # Image positions of a point at several heights above each BEV cell, one for each head.
+        v = 0.5 + torch.linspace(-2, 2, heads) / depth[:, None]  # (Q, heads)
         u = (angle + 0.5)[..., None].expand(-1, -1, heads)
-        uv = torch.stack([u, lift.clamp(0.01, 0.99).expand_as(u)], dim=-1)
+        uv = torch.stack([u, v.clamp(0.01, 0.99).expand_as(u)], dim=-1)
         if not bilinear:
             uv = uv.half().float()  # so that float32 and float64 round to equal pixels
         index = torch.arange(samples)

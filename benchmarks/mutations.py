@@ -80,6 +80,7 @@ def run(args: argparse.Namespace) -> None:
         # Over all rooms, these numbers add up to `args.number`.
         num_mutants = (args.number + number) // len(args.rooms)
         order = rng.permutation(len(places))
+        # No module has an empty name, so the tests run on the code as it is.
         unchanged = verdict(module="", source="", tests=tests_of(room, None), seconds=None)
         if unchanged != SURVIVED:
             raise InputError(f"the tests of {room} fail without a mutation: repair them first.")
@@ -198,7 +199,7 @@ def _changes(node: ast.expr) -> list[dict[str, object]]:
         case ast.BinOp(op=op) | ast.BoolOp(op=op) if type(op) in OPERATORS:
             return [{"op": OPERATORS[type(op)]()}]
         case ast.UnaryOp(op=ast.Not() | ast.Invert() | ast.USub() as op, operand=operand):
-            return [{"operand": ast.UnaryOp(op, operand)}]  # twice, so that it has no effect
+            return [{"operand": ast.UnaryOp(op, operand)}]  # applied twice, the operator cancels
         case ast.Constant(value=bool(value)):
             return [{"value": not value}]
         case ast.Constant(value=int(value) | float(value)):
@@ -260,7 +261,7 @@ def verdict(module: str, source: str, tests: Sequence[str], seconds: float | Non
 
 def _run_tests(module: str, source: str, tests: Sequence[str]) -> None:
     """Run pytest in this process, which imports the mutant."""
-    os.setsid()
+    os.setsid()  # a process group, so that `verdict` can end the processes of the tests as well
     sys.meta_path.insert(0, _Finder(module, source))
     sink = os.open(os.devnull, os.O_WRONLY)
     os.dup2(sink, 1)

@@ -22,7 +22,7 @@ SETTINGS = PriorSettings(("divider", "boundary", "ped_crossing"), "benchmark")
 RULES: tuple[WriteRule, ...] = (KeepMaximum(), LastSeen(), HitMissCounts())
 LINES_M = (-10.0, -3.5, 0.0, 3.5, 10.0)  # position of each line across the road
 STEP_M = 5.0  # distance between frames
-ROW_M = 10_000.0  # length of a straight road; the next one is 200 m beside it
+ROW_M = 10_000.0  # extent of a piece of the road along y; the next piece is 200 m beside it
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -79,8 +79,8 @@ def prediction(index: int) -> NDArray[np.float32]:
 
 
 def pose_at(distance_m: float) -> NDArray[np.float64]:
-    """Pose on a road of straight pieces, whose direction changes slowly. (4, 4)"""
-    row, along_m = divmod(distance_m, ROW_M)
+    """Pose on a road of parallel pieces along y, each of which winds slowly. (4, 4)"""
+    row, along_m = divmod(distance_m, ROW_M)  # index of the piece, and the position on it
     yaw = 0.3 * math.sin(distance_m / 300)
     pose = np.eye(4)
     pose[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]

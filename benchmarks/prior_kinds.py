@@ -154,7 +154,8 @@ def compare(length_km: float) -> str:
     length_m = 1000 * length_km
     frames = drives(length_m)
     lines = true_lines(length_m)
-    draw(frames[0][1])  # compiles the kernels
+    # Compile the kernels of drawing and of reading before anything is timed.
+    draw(frames[0][1])
     GaussianPrior(SETTINGS).read(frames[0][0], GRID)
     rows = []
     for rule in RULES:
@@ -253,11 +254,13 @@ def _share_within_2_sigma(prior: GaussianPrior, length_m: float) -> float:
     num_near = 0
     for label in range(len(SETTINGS.classes)):
         means, covariances, values = prior.gaussians(label)
-        means = means[values >= prior.rule.least_value]
-        sigmas = np.sqrt(np.linalg.eigvalsh(covariances)[values >= prior.rule.least_value, 0])
+        is_drawn = values >= prior.rule.least_value
+        means = means[is_drawn]
+        # Gaussians are long along the line: the smallest eigenvalue is the variance across it.
+        sigmas = np.sqrt(np.linalg.eigvalsh(covariances)[is_drawn, 0])
         errors = np.full(len(means), np.inf)
-        for offset_m, of_class in _LINES:
-            if of_class == label:
+        for offset_m, line_label in _LINES:
+            if line_label == label:
                 line = road(distances_m, offset_m)
                 nearest = np.abs(line[:, 1] - means[:, 1, None]).argmin(axis=1)
                 errors = np.minimum(errors, np.abs(line[nearest, 0] - means[:, 0]))

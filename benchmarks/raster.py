@@ -199,8 +199,8 @@ def rendering_table(args: argparse.Namespace) -> str:
                 gaussians, grid, upstream=upstream, backend=backend, repeats=args.repeats
             )
             pixels = ellipse_pixels(few, grid) * factor
-            # Any renderer writes and reads the masks once, and computes two exponentials per pixel,
-            # in the forward and in the backward pass.
+            # Any renderer writes the masks once and reads their gradients once. It computes two
+            # exponentials per pixel, one in the forward and one in the backward pass.
             floor_s = 4 * upstream.numel() * per_byte_s + 2 * pixels * per_exponential_s
             cells = rendering_cells(
                 reference=reference.scale(factor),
@@ -321,7 +321,7 @@ def training_table(args: argparse.Namespace) -> str:
     device = torch.device(args.device)
     height, width = TRAINING_SIZE
     grid = BEVGrid((-15, 15), (-30, 30), height=height, width=width)
-    num_matched = args.instances // 4  # the instances are of a batch of 4 samples
+    num_matched = args.instances // 4  # one of the 4 samples of the batch, in all decoder layers
     num_truths = min(15, num_matched)
     lines = random_polylines(num_matched, grid).to(device)
     targets = draw_polylines(lines, grid)

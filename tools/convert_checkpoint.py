@@ -1,4 +1,4 @@
-"""Convert a checkpoint of an original repository to the format of GSMap, or back to its format."""
+"""Convert a checkpoint of a method's original repository to the format of GSMap, or back."""
 
 from pathlib import Path
 

@@ -154,7 +154,7 @@ class Step:
         command = self.command if shell else [sys.executable, *self.command]
         print(f"{position} {self.title}: {shlex.join(command)}", flush=True)
         start_s = time.monotonic()
-        environment = {**os.environ, "PYTHON": sys.executable}
+        environment = {**os.environ, "PYTHON": sys.executable}  # read by the shell scripts
         status = subprocess.run(
             command,
             cwd=shipped_path(),
@@ -295,6 +295,8 @@ def training_steps(training: Training, folder: Path, budget: Budget) -> Iterable
     checkpoint = work / f"epoch_{training.epochs}.pth"
     train = data_root(folder, budget, "train")
     val = data_root(folder, budget, "val")
+    # ``--data-root`` below sets the folder of all data sets. The first of these options takes
+    # precedence over it for the training.
     options = [
         f"train_dataloader.dataset.data_root={train}",
         f"train_cfg.max_epochs={training.epochs}",
@@ -376,7 +378,7 @@ def main() -> None:
     for name in args.models:
         shipped += shipped_steps(name, folder, budget)
     trained = [*data_steps(folder, budget, "train"), prior_step(folder, budget)]
-    if "MapTR" not in args.models:  # the start of every training
+    if "MapTR" not in args.models:  # other models are trained on from it, so the table has it
         trained += shipped_steps("MapTR", folder, budget)
     for training in runs:
         trained += training_steps(training, folder, budget)

@@ -14,7 +14,7 @@ def test_a_kernel_is_measured_in_the_interpreter(tmp_path):
     command = ["-m", "benchmarks", "kernels", "--device", "cpu", "--reduced", "--out", out]
     result = run_python(*command, "--kernels", "deformable_sample", env={"TRITON_INTERPRET": "1"})
     assert result.returncode == 0, result.stderr
-    assert "GSMAP_TRITON_KERNELS=deformable_sample (right here)" in result.stdout
+    assert "GSMAP_TRITON_KERNELS=deformable_sample (correct on this device)" in result.stdout
     assert out.read_text() == result.stdout
     assert out.read_text().count("| deformable_sample | ") == 4
 
@@ -36,4 +36,4 @@ def test_kernels_that_are_wrong_or_fail_are_named_and_the_others_measured(monkey
         kernels.run(args)
     printed = capsys.readouterr().out
     assert "| fails | small | failed: RuntimeError: out of registers |" in printed
-    assert "GSMAP_TRITON_KERNELS=deformable_sample (right here)" in printed
+    assert "GSMAP_TRITON_KERNELS=deformable_sample (correct on this device)" in printed

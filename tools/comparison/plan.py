@@ -66,7 +66,8 @@ def parse_entry(text: str) -> Entry:
     Raises:
         ValueError: If the name is not valid for a folder, or an override has no value.
     """
-    # Split at commas outside of brackets: no closing bracket follows before an opening one.
+    # Split at commas outside of brackets. A comma is inside of brackets, and no place to split, if
+    # the next bracket after it is a closing one.
     first, *options = re.split(r",(?![^\[(]*[\])])", text)
     name, separator, config = first.rpartition("=")
     if not separator:
@@ -217,7 +218,8 @@ def plan(entries: Sequence[Entry], protocol: Protocol) -> list[Run]:
             fault=f"{runs[0].label} and {run.label} use different data",
             remedy="Compare configs of one data set, split, range and class list.",
         )
-    for one, other in combinations(runs[: len(entries)], 2):
+    runs_of_first_seed = runs[: len(entries)]
+    for one, other in combinations(runs_of_first_seed, 2):
         if not differences(one.settings, other.settings):
             raise InputError(
                 f"{one.name} and {other.name} would be the same run: no setting of training "
@@ -246,7 +248,7 @@ def _processes(protocol: Protocol) -> int:
 def _plan_run(entry: Entry, seed: int, protocol: Protocol, processes: int) -> Run:
     """Plan one run; build its data set and its model once, so that faults are found early."""
     initial_weights = None
-    own_options = [  # overrides by the comparison, which overrides of the user replace
+    own_options = [  # overrides of the comparison; overrides of the user take precedence
         f"train_dataloader.batch_size={protocol.batch // processes}",
         "val_evaluator.eval=chamfer,raster",
         f"randomness.seed={seed}",

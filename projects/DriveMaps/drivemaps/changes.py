@@ -92,7 +92,8 @@ def find_changes(
             if not on_known_ground(line, old).any():
                 num_on_new_ground[classes[label]] += 1
     num_not_in_view: Counter[str] = Counter()
-    most_views = views_of_passes(whole_map.points[:, :2], passes).max(axis=0)  # of any pass. (M,)
+    # For each vertex, the number of frames that have it in range, in the pass with the most. (M,)
+    most_views = views_of_passes(whole_map.points[:, :2], passes).max(axis=0)
     for index, label in enumerate(whole_map.labels.tolist()):
         vertices = slice(whole_map.offsets[index], whole_map.offsets[index + 1])
         if most_views[vertices].max(initial=0) < MIN_VIEWS:

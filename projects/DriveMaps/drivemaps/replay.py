@@ -43,8 +43,9 @@ class Moment:
         if elements.scales is None or elements.rotations is None:
             return None
         centres = np.concatenate([np.zeros((0, 3)), *self.lines])
-        # Elements are in the global frame. A rotation by an angle about z has the quaternion
-        # (0, 0, sin(angle / 2), cos(angle / 2)).
+        # The elements are in the global frame: their rotations are turned by the yaw of the frame,
+        # and the centres are the vertices in the annotation frame, one Gaussian per vertex.
+        # A rotation by an angle about z has the quaternion (0, 0, sin(angle / 2), cos(angle / 2)).
         half_angles = (elements.rotations - self.frame.yaw_rad) / 2.0
         quaternions = np.zeros((len(half_angles), 4))
         quaternions[:, 2] = np.sin(half_angles)
@@ -80,7 +81,7 @@ class Replay:
     def moments(self) -> Iterator[Moment]:
         """Iterate over the frames of the drive, each with the part of the map explored so far.
 
-        The range of each frame adds to the explored part.
+        A place is explored once it has been in the range of a frame.
 
         Yields:
             Each frame, in the order of time.
@@ -89,14 +90,14 @@ class Replay:
         views = [self.view.with_mounting(frame.sample.ego_from_frame) for frame in frames]
         frame_tree = cKDTree([frame.origin for frame in frames])
         labels = self.elements.labels.tolist()
-        lines = [shapely.linestrings(line) for line in self.elements.polylines]
+        whole_lines = [shapely.linestrings(line) for line in self.elements.polylines]
         explored = shapely.Polygon()
         for frame, view in zip(frames, views, strict=True):
             explored |= self.drive.footprint(frame)
             map_lines = []
-            for label, line in zip(labels, lines, strict=True):
-                for part in shapely.get_parts(shapely.intersection(line, explored)):
-                    if not part.length:
+            for label, whole_line in zip(labels, whole_lines, strict=True):
+                for part in shapely.get_parts(shapely.intersection(whole_line, explored)):
+                    if not part.length:  # a point where the line touches the explored part
                         continue
                     points = shapely.get_coordinates(part)
                     raised = _raise_to_ground(

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 class MmcvExtFinder:
     """Import finder that loads this file as the module ``mmcv._ext``.
 
-    The last entry of ``sys.meta_path``, so that a compiled ``mmcv._ext`` has priority.
+    It must be the last entry of ``sys.meta_path``, so that a compiled ``mmcv._ext`` has priority.
     """
 
     @staticmethod

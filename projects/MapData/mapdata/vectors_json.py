@@ -36,7 +36,7 @@ def _identity(sample: MapSample, row: int | None) -> dict[str, Any]:
         "sample_token": sample.token,
         "scene": sample.scene,
         "location": sample.map_name,
-        "timestamp": sample.timestamp_ns // 1000,
+        "timestamp": sample.timestamp_ns // 1000,  # in microseconds, as in nuScenes
         "lidar2global_xy": pose[:2, 3].tolist(),
         "patch_angle_deg": float(np.degrees(np.arctan2(pose[1, 0], pose[0, 0]))),
     }

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from minicity.curves import Array
 
-RATE_HZ = 50
-STEP_S = 0.02
+RATE_HZ = 50  # messages per second
+STEP_S = 0.02  # time before and after a message at which the poses of its differences are taken
 GRAVITY = 9.81
 
 
@@ -34,8 +34,8 @@ def pose_messages(
     after = np.array([world_from_ego(float(t + STEP_S)) for t in times])
     car_from_world = np.swapaxes(now[:, :3, :3], 1, 2)  # the inverse of a rotation: its transpose
     velocity = (after[:, :3, 3] - before[:, :3, 3]) / (2 * STEP_S)
-    motion = (after[:, :3, 3] - 2 * now[:, :3, 3] + before[:, :3, 3]) / STEP_S**2
-    acceleration = motion + np.array([0.0, 0.0, GRAVITY])
+    second_derivative = (after[:, :3, 3] - 2 * now[:, :3, 3] + before[:, :3, 3]) / STEP_S**2
+    acceleration = second_derivative + np.array([0.0, 0.0, GRAVITY])
     # Rotation of the car from before to after, in the car's frame.
     rotation = Rotation.from_matrix(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
     quaternions = Rotation.from_matrix(now[:, :3, :3]).as_quat()  # x, y, z, w

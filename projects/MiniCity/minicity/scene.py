@@ -56,8 +56,8 @@ class SceneTask:
         index_in_town: Number of the street within the town, equal in all passes of the street.
         route: Name of the first scene on this street, whose random numbers choose the drive.
         pass_index: Number of earlier passes of the street.
-        expansion: Name of the map file. It is the location, or another name for a pass before
-            streets are repainted.
+        expansion: Name of the file of the map expansion: the location, or another name if the
+            scene is driven before the streets are repainted.
     """
 
     name: str
@@ -213,7 +213,7 @@ class SceneMaker:
         )
 
     def _add_data(self, channel: str, time_s: float, **data: Any) -> None:
-        """Add a ``sample_data`` record and an ``ego_pose`` record with its token and time."""
+        """Add a ``sample_data`` record, and an ``ego_pose`` record with this token and time."""
         pose = self.ego_pose(time_s)
         token = data["token"]
         timestamp = self.timestamp_us(time_s)
@@ -269,8 +269,8 @@ class SceneMaker:
         """Simulate and write a sweep.
 
         Args:
-            k: Number of the last key frame up to the sweep.
-            j: Number of the sweep since the key frame; 0 for the sweep of the key frame.
+            k: Number of the latest key frame at or before the time of the sweep.
+            j: Number of the sweep, counted from 0 at this key frame.
 
         Returns:
             Points in the LiDAR frame, as in the files of nuScenes. (N, 5)
@@ -287,7 +287,8 @@ class SceneMaker:
         folder = "samples" if is_key_frame else "sweeps"
         name = f"{folder}/LIDAR_TOP/{self._stem('LIDAR_TOP', time_s)}.pcd.bin"
         cloud.tofile(self.root / name)
-        next_key_frame = k if is_key_frame else k + 1  # nuScenes assigns sweeps to this one
+        # nuScenes assigns a sweep between two key frames to the sample of the second one.
+        next_key_frame = k if is_key_frame else k + 1
         self._add_data(
             "LIDAR_TOP",
             time_s,
@@ -431,7 +432,8 @@ def _make_surroundings(
     for tree in town.trees[track_distance(town.trees[:, :2]) < PLANT_REACH_M]:
         add_tree(mesh, tree)
         height = tree[2]
-        # The crown is at 0.68 of the height of a tree.
+        # The middle of the crown is at 0.68 of the height of a tree; its shadow is a disc with a
+        # radius of 0.26 of the height.
         crown_shadow = tree[:2] + shadow_shift * 0.68 * height + 0.26 * height * circle
         shadows.append(crown_shadow)
     for pole in town.poles[track_distance(town.poles[:, :2]) < PLANT_REACH_M]:

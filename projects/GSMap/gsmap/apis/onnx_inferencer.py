@@ -326,8 +326,8 @@ class OnnxInferencer:
             values = self.session.run(self._outputs, inputs)
         except Exception as error:  # errors of onnxruntime have no common base class
             raise InputError(
-                f"{self.path} cannot be run ({error!s:.300}): if the inputs are those of its "
-                "cameras, the file is damaged; export it again."
+                f"{self.path} cannot be run ({error!s:.300}): if the inputs come from prepare() of "
+                "this file, the file is damaged; export it again."
             ) from error
         return dict(zip(self._outputs, values, strict=True))
 
@@ -379,9 +379,10 @@ class OnnxInferencer:
         if not unfolded.any():
             return
         orders = shortest_orders(fields["points"][unfolded])  # (n, P)
-        rows = np.arange(len(orders))[:, None]
+        rows = np.arange(len(orders))[:, None]  # (n, 1)
         for name in fields.keys() - {"scores", "labels", "num_pts"}:
-            fields[name][unfolded] = fields[name][unfolded][rows, orders]
+            of_points = fields[name][unfolded]  # (n, P, ...)
+            fields[name][unfolded] = of_points[rows, orders]  # point j becomes ``orders[:, j]``
 
     def write(self, path: str | Path, samples: Iterable[tuple[str, MapElements]]) -> None:
         """Write predictions in the format of ``tools/test.py --out``.

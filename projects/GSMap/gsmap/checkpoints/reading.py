@@ -97,6 +97,8 @@ def refusing(path: object) -> Iterator[None]:
         default = f"it is broken, or holds more than tensors and plain data ({reason}); {_REMEDY}"
         raise InputError(f"{path} was not loaded: {_remedy_for(path, default=default)}.") from error
     except _DAMAGE as error:
+        # Full memory or a failing disk is not a fault of the file, unless torch tried to allocate
+        # more than the whole file, as a damaged size makes it do.
         if is_machine_error(error) and not _exceeds_file_size(error, path=Path(str(path))):
             raise
         default = "fetch it again, or use the checkpoint of an earlier epoch"
@@ -173,11 +175,12 @@ def read_checked(path: str | Path) -> Checkpoint:
         unwrapped = unwrap(content)
         if unwrapped.left_out:
             _log_left_out(path, left_out=tuple(unwrapped.left_out.items()))
+        # `holder` is the dictionary around the state dict. mmengine stores ``meta`` beside it.
         meta = (unwrapped.holder or {}).get("meta") or {}
         if not isinstance(meta, Mapping):
             raise TypeError(f"meta must be a dictionary, got {meta!r:.60}")
         settings = json.loads(meta[MODEL_SETTINGS]) if MODEL_SETTINGS in meta else None
-        facts = {**_registry_facts(path), **meta}
+        facts = {**_facts_of_named_model(path), **meta}  # the file has precedence
         dataset_meta = meta.get("dataset_meta")
         if not isinstance(dataset_meta, Mapping):
             dataset_meta = {}
@@ -201,8 +204,8 @@ def read_checked(path: str | Path) -> Checkpoint:
     return checkpoint
 
 
-def _registry_facts(path: Path) -> dict[str, Any]:
-    """Facts of the registry about the model with this file; empty for another file."""
+def _facts_of_named_model(path: Path) -> dict[str, Any]:
+    """Fields of the entry in `named_models` for a file; empty for a file without an entry."""
     for model in named_models().values():
         if model.file == path:
             return vars(model)
@@ -280,6 +283,8 @@ def adopt_settings(
     overrides = cfg_options or {}
     _adopt_test_data(cfg, checkpoint=checkpoint, overrides=overrides)
     config = plain(cfg.model.to_dict())
+    # The settings of the checkpoint replace ``cfg.model`` below, but only the config may allow
+    # missing weights.
     allow_untrained = cfg.model.setdefault("allow_untrained", False)
     if settings is None or not differences(settings, others=config):
         return []

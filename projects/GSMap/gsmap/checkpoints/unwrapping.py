@@ -63,6 +63,7 @@ def unwrap(content: Any) -> Unwrapped:
     left_out: dict[str, int] = {}
     if len(weights) < len(entries):
         left_out["entries that are no tensors"] = len(entries) - len(weights)
+    # Without dots, the weights are of a single module, and a single number may be one of them.
     if _has_dotted_key(weights):
         counters = [key for key, value in weights.items() if _is_counter(key, value=value)]
         if counters:

@@ -6,9 +6,11 @@ from typing import Any
 from mmdet3d.registry import LOG_PROCESSORS
 from mmengine.runner import LogProcessor, Runner
 
-# Iterations: losses of the layers before the last, Gaussian statistics, data loading time
+# Items that are removed from lines of iterations: losses of the layers before the last, statistics
+# of the Gaussians, and the time of data loading.
 _MINOR = re.compile(r"d\d+\.|data_time:|at_floor:|[\w.]+/[\w.]+:")
-# Evaluations: all metrics of MapMetric except APs of classes and groups and their means
+# Items that are removed from lines of evaluations: all metrics of MapMetric except for the APs of
+# classes and groups and the means of APs.
 _DETAIL = re.compile(r"(.*/)?(chamfer|raster)/(?!.*\bm?AP:)")
 
 
@@ -58,6 +60,7 @@ class MapLogProcessor(LogProcessor):
 
 def _remove_items(line: str, pattern: re.Pattern[str]) -> str:
     """Remove the items of a log line that match a pattern."""
+    # mmengine writes the progress in brackets, then the items. Two blanks separate all of them.
     head, _, rest = line.partition("]  ")
     parts = [f"{head}]"]
     for item in rest.split("  "):

@@ -138,7 +138,8 @@ class MergedGroupsConstructor(DefaultOptimWrapperConstructor):
         parameters = set(inspect.signature(optimizer_type).parameters)
         free_parameters = parameters - set(self.optimizer_cfg)
         on_gpu = all(param.device.type != "cpu" for param in model.parameters())
-        if self.fused_on_gpu and on_gpu and set(_KERNELS) <= free_parameters:
+        may_choose_kernel = set(_KERNELS) <= free_parameters  # the config sets neither of them
+        if self.fused_on_gpu and on_gpu and may_choose_kernel:
             self.optimizer_cfg["fused"] = True
         wrapper = super().__call__(model)
         wrapper.members = self._members
@@ -171,7 +172,8 @@ def fit_optimizer_state(checkpoint: dict[str, Any], wrapper: Any) -> None:
     groups = state["param_groups"]
     param_count = sum(len(indices) for indices in members)
     group_sizes = [len(group["params"]) for group in groups]
-    if len(groups) > len(members) and group_sizes == [1] * param_count:
+    has_group_per_param = group_sizes == [1] * param_count
+    if len(groups) > len(members) and has_group_per_param:
         _merge_state(state, members=members)
         # mmengine may append a group with its base settings, after all others.
         extra_groups = len(wrapper.param_groups) - len(members)
@@ -186,6 +188,7 @@ def fit_optimizer_state(checkpoint: dict[str, Any], wrapper: Any) -> None:
                 extra_values = values[param_count : param_count + extra_groups]
                 scheduler[name] = group_values + extra_values
     run_groups = wrapper.optimizer.param_groups
+    # A different number of groups is reported later, when torch loads the state.
     for group, run_group in zip(state["param_groups"], run_groups, strict=False):
         for name in _KERNELS:
             if name in run_group and name in group:

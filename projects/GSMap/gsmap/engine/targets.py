@@ -51,7 +51,9 @@ def _check_agreement(cfg: Config, steps: list[Any]) -> None:
 
 def _target_settings(head: dict[str, Any]) -> dict[str, Any]:
     """Return the settings of transforms that follow from the config of a head."""
-    head_class: Any = _class_with_targets(head.get("type"))  # mypy: a protocol has no hash
+    # Any, because `_defaults` is cached: mypy requires a hashable argument, and takes protocols for
+    # not hashable.
+    head_class: Any = _class_with_targets(head.get("type"))
     try:
         return head_class.target_settings({**_defaults(head_class), **head})
     except (TypeError, ValueError):  # invalid settings, which the head reports when it is built

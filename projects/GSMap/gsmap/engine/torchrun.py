@@ -11,7 +11,8 @@ import sys
 from gsmap.utils.interrupt import leave_at_once_on_ctrl_c
 
 if __name__ == "__main__":
-    leave_at_once_on_ctrl_c()  # the import of torch takes seconds; then torchrun's handler is set
+    # For Ctrl-C during the import of torch, which takes seconds. Later torchrun sets its handler.
+    leave_at_once_on_ctrl_c()
 # isort: split
 from torch.distributed.elastic.multiprocessing import SignalException
 from torch.distributed.elastic.multiprocessing.errors import ChildFailedError, ProcessFailure

@@ -58,7 +58,7 @@ class MapMetric(BaseMetric):
         if not eval and out_file is None:
             raise InputError(f"eval must name metrics of {metric_names()}, got none.")
         for name in eval:
-            metric_class(name)
+            metric_class(name)  # raises an error for an unknown name
         self.eval = tuple(eval)
         self.thresholds = checked_thresholds(thresholds)
         self.out_file = out_file

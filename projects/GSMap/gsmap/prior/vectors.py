@@ -58,6 +58,7 @@ def covered_cells(
         for first in range(0, len(pieces), _CHUNK):
             chunk = pieces[first : first + _CHUNK]
             lengths = [len(points) for _, _, points in chunk]
+            # Pieces have different numbers of vertices: shorter ones repeat their last vertex.
             padded = np.zeros((len(chunk), max(lengths), 2))
             for row, (_, _, points) in zip(padded, chunk, strict=True):
                 row[: len(points)] = points - corner
@@ -88,6 +89,8 @@ def _pieces_by_tile(
             tiles_along_axes = np.ptp(points, axis=0) / settings.tile_m + 2
             most_pieces = tiles_along_axes.prod()
         else:
+            # The line is cut into segments of a quarter of a tile, see below. Each of its vertices,
+            # which are added below, may begin a shorter segment.
             length_m = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
             most_pieces = length_m / settings.tile_m * 4
         num_pieces += int(most_pieces) + len(line)

@@ -160,7 +160,8 @@ class Scenes:
         Raises:
             ValueError: If the streams are bound to another model.
         """
-        if self.owner is None or self.owner == str(owner):  # a copy stores only the name
+        # In a copy, `self.owner` is the name of the model (`__getstate__`).
+        if self.owner is None or self.owner == str(owner):
             self.owner = owner
         if self.owner is not owner:
             raise InputError(
@@ -220,6 +221,7 @@ class Scenes:
         for state in states:
             self.states[state.frame.scene] = state
             self.states.move_to_end(state.frame.scene)
+        # Streams of this batch are never dropped, even if the batch is larger than the limit.
         while len(self.states) > max(self.max_streams, len(states)):
             self.states.popitem(last=False)
 

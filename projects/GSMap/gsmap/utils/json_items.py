@@ -105,7 +105,11 @@ class _Parser:
             yield self._read_value()
 
     def _require(self, opening: str, where: str) -> None:
-        """Require that the next value begins with a character; invalid JSON is reported later."""
+        """Require that the next value begins with a character.
+
+        Only objects, lists and texts are reported here as values of another kind. The caller then
+        consumes ``opening``, which fails for anything else.
+        """
         character = self._next_character()
         if character != opening and character in _KINDS:
             raise _FormError(_KINDS[character] + where)

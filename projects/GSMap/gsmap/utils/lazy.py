@@ -14,7 +14,7 @@ def lazy_names(
     Args:
         package: ``__name__`` of the package.
         modules: Module, relative to the package, that defines each name.
-        others: Package that defines each name that does not lie in the package.
+        others: Full name of the module that defines each name from another package.
 
     Returns:
         ``__getattr__``, ``__dir__`` and ``__all__``.

@@ -73,7 +73,8 @@ def run_on_ray(
 def _without_cluster_options(words: Sequence[str]) -> list[str]:
     """Remove the options for all shards from a command.
 
-    ``--per-shard`` is followed by any number of words ``NAME=AMOUNT``.
+    ``--per-shard`` is followed by any number of words ``NAME=AMOUNT``, where NAME is a resource of
+    Ray: ``num_cpus``, ``num_gpus`` or ``memory``.
     """
     rest: list[str] = []
     is_resource = False
@@ -167,6 +168,7 @@ class _Run:
                 room_since_s = None
             elif room_since_s is None:
                 room_since_s = now_s
+            # Until a shard has finished, no duration is known, and none is started a second time.
             longest_s = max(self.durations_s, default=math.inf)
             limit_s = max(self.patience_s, 2 * longest_s)
             if room_since_s is not None and now_s - room_since_s > limit_s:

@@ -119,6 +119,7 @@ def plot_result(reports: Sequence[MetricReport]) -> Figure:
                 y_label="" if label else f"{report.name}: precision",
                 colour=colour,
             )
+            # Reliability of the scores of detections; the intervals of vertices have `coverage`.
             score, share, _ = reliability(detections.scores, detections.hits[:, loosest])
             calibration_panel.plot(score, share, "o-", markersize=3, color=colour)
         finish_shares(calibration_panel, "calibration", x_label="score", y_label="share of hits")

@@ -205,12 +205,13 @@ class Argoverse2Map:
         left_neighbours, right_neighbours = self._neighbours
         with_left_line = lanes[left_neighbours[lanes] != NO_LANE]
         with_right_line = lanes[right_neighbours[lanes] != NO_LANE]
-        # Two neighbouring lanes share a line. It is taken once: from the lane on the right of the
-        # line if that lane is in the patch, else from the lane on the left.
-        # Drop the right line of a lane that is the left neighbour of another lane with a left line.
+        # Two neighbouring lanes share a line: the right line of lane A is the left line of lane B.
+        # It is taken once, from B if B is among these lanes, else from A.
+        # First, drop the right line of each lane A that is the left neighbour of a lane B.
         is_shared = np.isin(with_right_line, left_neighbours[with_left_line])
         with_right_line = with_right_line[~is_shared]
-        # Drop the left line of a lane whose left neighbour still gives this line.
+        # Links may be one-sided: A names B as its right neighbour, but B names another left
+        # neighbour. Then the right line of A is kept, and the left line of B is dropped.
         is_shared = np.isin(with_left_line, right_neighbours[with_right_line])
         with_left_line = with_left_line[~is_shared]
         left_paths, right_paths = self._side_paths
@@ -229,8 +230,8 @@ class Argoverse2Map:
 
     def _merged_crossings(self, patch: LocalPatch) -> np.ndarray:
         """Crossings with parallel neighbours united, open at the edge of the patch (MapTRv2)."""
-        pieces, owner = clip_polygons(self._crossings.near(patch), patch)
-        return open_outlines(pieces, owner, patch=patch)
+        pieces, crossing_of_piece = clip_polygons(self._crossings.near(patch), patch)
+        return open_outlines(pieces, crossing_of_piece, patch=patch)
 
     def _crossing_rings(self, patch: LocalPatch) -> np.ndarray:
         """Ring of each crossing, closed along the edge of the patch (MapTR)."""

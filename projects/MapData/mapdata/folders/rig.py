@@ -19,6 +19,7 @@ from gsmap.utils.files import write_bytes
 from mapdata.argoverse2.log import closest_ns
 
 PoseAt = Callable[[int], np.ndarray | None]
+"""Function from a time in nanoseconds to the pose (4, 4) of the vehicle, or None."""
 FISHEYE_MODELS = ("equidistant", "fisheye")
 PLAIN_MODELS = ("plumb_bob", "rational_polynomial", "radtan", "")
 # Valid numbers of distortion coefficients, by distortion model.
@@ -152,7 +153,8 @@ def set_rectification_targets(
         trained: Width, height, fx, fy, cx and cy of the model's cameras, by name.
 
     Returns:
-        Key of the targets, for a digest of the rectified images; empty if no camera has a target.
+        Names and intrinsics of the cameras with a target, as bytes. Callers add them to the digest
+        that names the rectified images. Empty if no camera has a target.
     """
     key = ""
     for camera in rig:

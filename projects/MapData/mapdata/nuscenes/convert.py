@@ -368,7 +368,7 @@ def convert_nuscenes(options: NuScenesOptions) -> ConversionSummary:
         notes.append(f"cameras {names}: name them in `cameras` of a config's data sets.")
     if not (options.root / "can_bus").is_dir():
         notes.append("no CAN bus expansion: acceleration, rotation rate and velocity are 0.")
-    if not options.shard.count:
+    if not options.shard.count:  # a shard has only a part of the positions
         notes += overlap_notes(conversion.positions)
     return conversion.summary
 
@@ -382,6 +382,8 @@ def _source_fingerprint(options: NuScenesOptions) -> str:
         contents.append(folder / "scene.json")
         for path in sorted(folder.glob("*.json")):
             if not is_hidden(path):
+                # Several versions have tables of equal names. Those of the first version have no
+                # prefix, so that the digest of a single version does not depend on its folder.
                 is_first = each == options.versions[0]
                 name = path.name if is_first else f"{folder.name}/{path.name}"
                 sizes[name] = path.stat().st_size

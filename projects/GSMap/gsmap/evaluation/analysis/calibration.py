@@ -116,10 +116,11 @@ def _vertices_of_sample(sample: Sample, config: ChamferConfig) -> Iterator[Verti
             scales=torch.tensor(predictions.scales[span]),
             rotations=torch.tensor(predictions.rotations[span]),
         )
+        # The error along the line is measured to the paired point, the error across to the line.
         target = torch.tensor(orders[nearest_order])
         yield Vertices(
             labels=np.full(len(points), fill_value=predictions.labels[row]),
-            errors=line_errors(means, target, torch.tensor(line)).numpy(),
+            errors=line_errors(means, target, lines=torch.tensor(line)).numpy(),
             sigmas=extents_along_line(gaussians).numpy(),
             distances=np.linalg.norm(points, axis=1),
         )
@@ -208,7 +209,8 @@ def uncertainty_figures(vertices: Vertices, law: str = "normal") -> dict[str, fl
         errors = vertices.errors[:, axis]
         sigmas = vertices.sigmas[:, axis]
         gaps = sparsification(errors, order=sigmas) - sparsification(errors, order=errors)
-        # The density of an error is the density of errors / sigmas, of variance 1, over sigma.
+        # The law has variance 1, so it gives the density of errors / sigmas. The density of the
+        # errors is this density divided by sigma, which adds log(sigma) to the likelihood below.
         log_densities = LAWS[law].logpdf(errors / sigmas)
         values = {
             "nll": (np.log(sigmas) - log_densities).mean(),
@@ -301,9 +303,9 @@ def fit_factors(
     Args:
         vertices: Matched vertices.
         classes: Names of the classes.
-        num_sigmas: Coverage of the interval, as the number n of sigmas in (0, 3] for which a normal
-            law lies within +-n sigma: 1 for 68.3 % of the errors, 2 for 95.4 %. If the tails of the
-            errors differ from the law, the factors fit this interval only.
+        num_sigmas: Number n in (0, 3] that sets the coverage of the interval: the probability of a
+            normal error to lie within n sigma, which is 68.3 % for n = 1 and 95.4 % for n = 2. If
+            the tails of the errors differ from the law, the factors fit this interval only.
         law: Law of the errors, one of ``LAWS``.
 
     Returns:

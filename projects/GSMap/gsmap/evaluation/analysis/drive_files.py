@@ -43,7 +43,10 @@ def drive_frames(
 
 
 def _read_frames(samples: SampleFile, annotations: AnnotationFile) -> list[DriveFrame]:
-    """Read the frames of all drives, as `drive_frames` does; ``samples.about`` is read, too."""
+    """Read the frames of all drives, as `drive_frames` does.
+
+    All of ``samples`` is read, so ``samples.about``, the metadata of the file, is set afterwards.
+    """
     if not annotations.meta.options.get("poses", True):
         raise InputError(f"{annotations.path} knows no poses, which consistency needs.")
     results = samples.path
@@ -51,7 +54,8 @@ def _read_frames(samples: SampleFile, annotations: AnnotationFile) -> list[Drive
     track_ids: dict[str, IntArray | None] = {}
     last_token: dict[bool, str] = {}  # last sample with tracks (True) and without (False)
     items = items_of(results, RESULTS_KEY, "give a result file")
-    # Of both iterables, `samples` reads first, because its errors describe a malformed file.
+    # Both read the file; `zip` advances `samples` first. So `samples` raises the error about a
+    # malformed item, and `item` is known to be well-formed.
     for (token, elements, _), (item, _) in zip(samples, items, strict=True):
         values = [vector.get(TRACK_KEY) for vector in item["vectors"]]
         ids = _convert_tracks(values, results=results, token=token)

@@ -43,7 +43,7 @@ def _aligned_mean(line: FloatArray, others: FloatArray) -> FloatArray:
     """
     orders = [others, others[:, ::-1]]
     if np.allclose(line[0], line[-1]) and np.allclose(others[:, 0], others[:, -1]):
-        ring = others[:, :-1]
+        ring = others[:, :-1]  # without the last point, which repeats the first one
         for shift in range(1, ring.shape[1]):
             rolled = np.roll(ring, shift=shift, axis=1)
             closed = np.concatenate([rolled, rolled[:, :1]], axis=1)
@@ -162,10 +162,10 @@ def fit_prior(
 ) -> MapElements:
     """Fit the constant set of elements with the best AP on a training set.
 
-    Each step adds the element whose new matches increase the area under the precision-recall curve
-    the most: precision times recall of the new matches, with the recall of its class. Its score
-    increases with the share of samples in which it is a new match. An element is a ground truth of
-    the training set, moved to the mean of its matches where this adds matches.
+    Each step adds the element that increases the area under the precision-recall curve of its class
+    the most. The increase is precision times recall, both of the element's new matches alone. Its
+    score increases with its precision, the number of new matches per sample. An element is a ground
+    truth of the training set, moved to the mean of its matches where this adds matches.
 
     Args:
         truth: Ground truth of each training sample.
@@ -189,11 +189,12 @@ def fit_prior(
         _, precision, index = proposals[label]
         if precision < _MIN_PRECISION:
             break
-        line, share = fits[label].take(index)
+        line, refined_precision = fits[label].take(index)
         lines.append(line)
         labels.append(label)
-        # AP_raster drops scores below MIN_SCORE; only the order of scores matters
-        scores.append(MIN_SCORE + (1.0 - MIN_SCORE) * min(share, 1.0))
+        # AP_raster drops scores below MIN_SCORE; otherwise only the order of scores matters. An
+        # element may match several ground truths of a sample, which gives a precision above 1.
+        scores.append(MIN_SCORE + (1.0 - MIN_SCORE) * min(refined_precision, 1.0))
     return MapElements.from_polylines(lines, labels=labels, scores=scores)
 
 

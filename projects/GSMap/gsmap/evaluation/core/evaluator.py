@@ -152,7 +152,7 @@ class MapEvaluator:
 
     def match_empty(self) -> SampleMatches:
         """Match a sample without elements, for the names and shapes of the records."""
-        points = np.empty((0, 3))
+        points = np.empty((0, 3))  # with heights, which metrics in space require
         truth = replace(MapElements.from_polylines(), points=points)
         predictions = replace(MapElements.from_polylines(scores=()), points=points)
         sample = Sample(token="", predictions=predictions, ground_truth=truth)

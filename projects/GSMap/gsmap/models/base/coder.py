@@ -151,6 +151,7 @@ class MapCoder:
         orders = torch.arange(points.shape[1], device=points.device).repeat(len(points), 1)
         line_orders = shortest_orders(points[is_line].cpu().numpy())
         orders[is_line] = torch.from_numpy(line_orders).to(orders)
+        # (M, 1) and (M, P): point j of detection i is its point ``orders[i, j]``.
         rows = torch.arange(len(points), device=points.device)[:, None]
         return {name: values[rows, orders] for name, values in fields.items()}
 
@@ -171,6 +172,8 @@ class DetectionHead(BaseModule, NeedsTargets):
 
     def fit_state(self, state: dict[str, Tensor], prefix: str) -> None:
         """Adapt the state of a checkpoint to the head, in place.
+
+        The base class changes nothing. A subclass may rename or reshape tensors here.
 
         Args:
             state: Tensors of the checkpoint, by name.

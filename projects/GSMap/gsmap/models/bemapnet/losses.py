@@ -59,12 +59,14 @@ class BezierLosses(LineLosses):
         controls: Weight of the control points in matching and loss.
         pieces: Weight of the numbers of pieces in matching and loss.
         curve: Weight of the points of curves in matching and loss.
-        recovery: Weight of the masks' recovery by the curves in matching and loss.
+        recovery: Weight of the recovery loss in matching and loss. It is the dice loss of the
+            annotated mask around the predicted curve, where the mask should be 1.
         mask_points: Number of points, >= 10, at which masks are compared: random points in
             matching, mostly the least certain points of the prediction in the loss. None compares
             all pixels.
-        redrawn_in_px: Whether annotated curves whose masks were drawn from them are in pixels, as
-            in the released code.
+        redrawn_in_px: Whether to keep a peculiarity of the released code. If a line is hidden by
+            others of its class, its mask is drawn from its curve. This converts the targets of the
+            curve loss from [0, 1] to pixels.
 
     Raises:
         ValueError: If ``mask_points`` is less than 10.
@@ -117,7 +119,11 @@ class BezierLosses(LineLosses):
         return super().mask_losses(masks, truths)
 
     def costs(self, case: Case) -> tuple[Tensor, ...]:
-        """Compute the weighted costs of all pairs of a case, in the order of `COSTS`. (6, n, K)"""
+        """Compute the weighted costs of all pairs of a case.
+
+        Returns:
+            A tuple of one tensor, with the costs in the order of `COSTS`. (6, n, K)
+        """
         lines = case.lines
         truth = case.truth
         num_lines = lines.curves.shape[0]
@@ -125,7 +131,7 @@ class BezierLosses(LineLosses):
         all_points = points.flatten(0, 1)
         values = point_sample(truth.masks[None], all_points[None])[0]  # (K, n * 2500)
         values = values.unflatten(1, (num_lines, points.shape[1]))  # (K, n, 2500)
-        # The difference of (n, 1, P, 2) and (K, P, 2) is (n, K).
+        # The inputs (n, 1, P, 2) and (K, P, 2) are broadcast to all pairs, which gives (n, K).
         controls_cost = self.controls * _mean_difference(lines.controls[:, None], truth.controls)
         piece_probs = lines.piece_logits.softmax(dim=-1)  # (n, k)
         pieces_cost = -self.pieces * piece_probs[:, truth.pieces]

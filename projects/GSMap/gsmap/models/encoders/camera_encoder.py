@@ -1,4 +1,4 @@
-"""Base class of the BEV encoders of cameras, and its stacking of the calibration."""
+"""Base class of the BEV encoders of cameras, and the batching of the cameras' calibration."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

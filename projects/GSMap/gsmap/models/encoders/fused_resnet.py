@@ -152,16 +152,19 @@ class FrozenNorms:
 
     def _scale_and_shift(self, norm: Any) -> tuple[Tensor, Tensor]:
         """Scale and shift of a norm with fixed statistics. (C,) each"""
-        # At each replay, a recorded step reads the tensors of the norm. A checkpoint may have been
-        # loaded into them since the recording.
+        # A step that is recorded (as a CUDA graph) must contain the computation of both. Each
+        # replay then reads the tensors of the norm, into which a checkpoint may have been loaded
+        # since the recording.
         if norm.weight.requires_grad or is_recording(norm.weight.device.type):
             return _scale_and_shift(norm)
         versions = tensor_versions(norm)
         constants = self._constants.get(norm)
-        if constants is None or constants[0] != versions:
-            constants = (versions, *_scale_and_shift(norm))
-            self._constants[norm] = constants
-        _, scale, shift = constants
+        if constants is not None:
+            known_versions, scale, shift = constants
+            if known_versions == versions:
+                return scale, shift
+        scale, shift = _scale_and_shift(norm)
+        self._constants[norm] = (versions, scale, shift)
         return scale, shift
 
 
@@ -184,7 +187,7 @@ def _scale_and_shift(norm: Any) -> tuple[Tensor, Tensor]:
 
 
 class _ConvolveReLU(torch.autograd.Function):
-    """Convolution, bias, optional residual and ReLU in one, without the values before the ReLU."""
+    """Convolution, bias, optional residual and ReLU in one. Values before the ReLU are not kept."""
 
     @staticmethod
     def forward(

@@ -22,8 +22,8 @@ CAMERA_MATRICES = ("cam2img", "img_aug_matrix", "ego_from_cam")
 class LSSEncoder(CameraEncoder):
     """Lift image features by predicted depth, sum them in BEV cells, refine by convolutions.
 
-    The cells of the sum have half the side of the output's cells; the second convolution has
-    stride 2.
+    The features are summed in cells with half the side of the output's cells, and the second of the
+    three convolutions has stride 2.
 
     Args:
         grid: Extent of the map; points outside are dropped.
@@ -113,6 +113,7 @@ class LSSEncoder(CameraEncoder):
         context = context.float().unflatten(0, feats.shape[:2])  # (B, V, C, h, w)
         points = self.points(calibration["frame_from_img"], img_shape, feats)
         indices = cell_indices(points, self.cells, self.z_range)  # (B, V, D, h, w)
+        # The first convolution is part of the pooling; the layers after it follow below.
         with torch.autocast(feats.device.type, enabled=False):
             kernel = cast(Tensor, self.downsample[0].weight)
             bev = bev_pool_conv3x3(

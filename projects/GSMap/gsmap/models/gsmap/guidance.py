@@ -30,7 +30,7 @@ class GaussianGuidance(Guidance, AddsWeights):
         ValueError: If the references have no Gaussians.
     """
 
-    neutral_keys = ("embedding.",)
+    neutral_keys = ("embedding.",)  # a checkpoint without the zero embedding can be loaded
 
     def __init__(
         self,

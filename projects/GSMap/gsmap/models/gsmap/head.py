@@ -135,6 +135,7 @@ class GSMapHead(MapHead):
         detections = super().select_detections(fields, best)
         if self.temperatures is None:
             return detections
+        # The temperatures of the class of each detection, (M, 2): along and across the line.
         factors = constant(detections["scales"], self.temperatures)[best.labels]
         gaussians = Gaussians(
             means=detections["pts"][..., :2],
@@ -150,7 +151,7 @@ class GSMapHead(MapHead):
         Args:
             pairs: Matched pairs of the last layer.
         """
-        space = self.reference.space
+        space = self.reference.space  # decodes references to Gaussians
         renders_masks = any(isinstance(loss, MaskLoss) for loss in self.losses.values())
         if space is None or not renders_masks:
             return {}

@@ -1,4 +1,4 @@
-"""Head of HRMapNet: queries without a positional half."""
+"""Head of HRMapNet: queries that are all content, without a positional half as in MapTR."""
 
 from collections.abc import Callable
 from typing import Any
@@ -60,8 +60,10 @@ class ContentDecoder(MapDecoder):
 class HRMapNetHead(MapHead):
     """Map head whose queries have no positional half, as in HRMapNet.
 
-    A query is the sum of the embeddings of its instance and its point. A network of three layers
-    predicts the first reference from it. `RasterPrior` changes the queries by the map.
+    MapTR splits the embedding of a query into a positional half, which predicts the first
+    reference, and a content half. Here a query is one vector: the sum of the embeddings of its
+    instance and its point. A network of three layers predicts the first reference from it.
+    `RasterPrior` conditions the queries on the map prior.
 
     Args:
         decoder: Settings of `ContentDecoder`.
@@ -94,9 +96,11 @@ class HRMapNetHead(MapHead):
         init_matrices(reference.initial)
 
     def queries(self) -> tuple[Tensor, Tensor]:
-        """Queries as the source of the first references, and as content. (N * P, C) each
+        """Queries of all groups in training, and of the first group in prediction.
 
-        All query groups in training, only the first group in prediction.
+        Returns:
+            The vectors that predict the first references, and the content of the queries. Both are
+            one tensor. (N * P, C) each
         """
         embeddings = self.instance_embedding.weight
         if not self.training:

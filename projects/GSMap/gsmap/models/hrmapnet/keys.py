@@ -1,6 +1,7 @@
 """State keys of the released HRMapNet, which is based on MapTRv2, and their names here.
 
-The texts in `rules_of` are pairs ``released=here`` of the rest of the keys, or one name for both.
+`rules_of` takes a prefix of the released keys, a prefix of the keys here, and the remainders of the
+keys as one text: each is ``released=here``, or a single name if both are equal.
 """
 
 from gsmap.checkpoints.key_rules import KeyMap, rules_of

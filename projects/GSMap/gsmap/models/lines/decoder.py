@@ -82,7 +82,7 @@ class AttentionLayer(nn.Module):
         Args:
             tokens: Tokens. (B, Q, C)
             position: Positional encoding of the tokens, added to queries and keys. (B, Q, C)
-            key: Keys of the memory, positional encoding included. (B, S, C)
+            key: Keys of the S vectors of the memory, positional encoding included. (B, S, C)
             memory: Values of the memory. (B, S, C)
             masks: ``attn_mask`` or ``key_padding_mask`` of `nn.MultiheadAttention`, for the
                 cross-attention, or for the self-attention if there is no memory.
@@ -166,7 +166,8 @@ class PointLineDecoder(BaseModule):
         Returns:
             Lines of every class, before the first layer and after each layer.
         """
-        memory = bev.flatten(2).transpose(1, 2) + self.level.weight  # (B, S, C)
+        # The memory has S = H * W vectors, one per cell. (B, S, C)
+        memory = bev.flatten(2).transpose(1, 2) + self.level.weight
         height, width = bev.shape[-2:]
         no_padding = bev.new_zeros((1, height, width))
         cell_position = self.position(no_padding).flatten(2).transpose(1, 2)

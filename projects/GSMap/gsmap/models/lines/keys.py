@@ -1,6 +1,7 @@
 """State keys that the released BeMapNet and PivotNet have in common, and their names here.
 
-The texts in `rules_of` are pairs ``released=here`` of the rest of the keys, or one name for both.
+`rules_of` takes a prefix of the released keys, a prefix of the keys here, and the remainders of the
+keys as one text: each is ``released=here``, or a single name if both are equal.
 """
 
 import torch
@@ -49,5 +50,6 @@ HEAD_RULES = (
     *mlps("output_head.coords_head.", "map_head.coordinates."),
     ("output_head.semantic_heads.{i}.0.", "map_head.semantic_branches.{i}."),
 )
-# Not weights but a setting: class weights of a loss.
+# The released models store the class weights of their loss as a buffer. Here they are a setting of
+# the loss, so a key with this value is left out.
 CLASS_WEIGHTS = {"post_processor.criterion.empty_weight": torch.tensor((1.0, 0.5))}

@@ -87,7 +87,8 @@ class ScatterGatherAttention(BEVDeformableAttention):
             query: Instance queries. (B, N, C)
             reference: References of the points, as in `place_samples`. (B, N * P, D)
             feats: BEV features. (B, C, H, W)
-            frames: Frames of the points, as in `place_samples`.
+            frames: Matrices that transform the sampling offsets of the points, as in
+                `place_samples`, or None. (B, N * P, 2, 2)
             position: Positional encoding of the points. (B, N * P, C)
 
         Returns:
@@ -143,6 +144,8 @@ class MapQRDecoderLayer(MapDecoderLayer):
 
     def forward(self, query: Tensor, _: Tensor, *inputs: Any) -> Tensor:  # type: ignore[override]
         """Update the instance queries.
+
+        The second argument, the positional queries, is not used.
 
         Args:
             query: Instance queries. (B, N, C)

@@ -1,6 +1,7 @@
 """Mapping between the state keys of the released MGMap and of this project.
 
-The texts in `rules_of` are pairs ``released=here`` of the rest of the keys, or one name for both.
+`rules_of` takes a prefix of the released keys, a prefix of the keys here, and the remainders of the
+keys as one text: each is ``released=here``, or a single name if both are equal.
 """
 
 from gsmap.checkpoints.key_rules import KeyMap, Rules, rules_of
@@ -36,6 +37,7 @@ MGMAP = KeyMap(
             "conv1.=stem.0. bn1.=stem.1. conv_1.conv.=fusion.0. conv_1.bn.=fusion.1. "
             "neck.convs.{i}.conv.=levels.{i}.0. neck.convs.{i}.norm.=levels.{i}.1.",
         ),
+        # The first rule that matches a key is applied, so the gates come before their blocks.
         *_gate_rules(),
         *_BLOCKS,
         *rules_of(

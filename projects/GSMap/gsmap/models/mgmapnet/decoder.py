@@ -28,8 +28,8 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
         dropout: Probability of setting a value to zero in training, in [0, 1].
         self_attn: Settings of the self-attention.
         cross_attn: Settings of the attention to the BEV.
-        reference_dims: Number of coordinates of a reference in its position code; None to use the
-            learned position instead.
+        reference_dims: Number of leading entries of each reference that are encoded as the position
+            of its instance in the attention to the BEV. None uses the learned position instead.
         kwargs: Further arguments of `MapDecoderLayer`.
     """
 
@@ -119,7 +119,7 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
         if self.reference_code is not None:
             encoded_entries = by_instance[..., : self.reference_dims]
             position = self.reference_code(encoded_entries.flatten(2))
-        frames = None
+        frames = None  # matrices that transform the sampling offsets of each point
         if self.guidance is not None:
             # Each level halves both sides, so all levels share the rotations of the finest one.
             frames = self.guidance.frames(reference, feats[0])
@@ -164,10 +164,10 @@ class MGMapNetDecoded(Decoded):
 
 @MODELS.register_module()
 class MGMapNetDecoder(MapDecoder):
-    """Decoder of instance and point queries that refine one reference (MGMapNet).
+    """Decoder of MGMapNet, with instance queries and point queries.
 
-    Its inputs are instance queries with one reference each. All points of an instance start from
-    this reference.
+    The inputs are instance queries with one reference each. The points of an instance all start
+    from this reference, and each layer refines each of them.
 
     Args:
         layer: Settings of `MGMapNetDecoderLayer`. Its ``reference_dims`` applies from the second
@@ -177,7 +177,7 @@ class MGMapNetDecoder(MapDecoder):
         kwargs: Further arguments of `MapDecoder`.
     """
 
-    point_queries = False
+    point_queries = False  # the input has a query per instance, not per point
     layer_class = MGMapNetDecoderLayer
 
     def __init__(

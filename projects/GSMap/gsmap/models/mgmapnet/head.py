@@ -89,6 +89,7 @@ def convert_decoder(decoder: PartConfig) -> PartConfig:
     if class_of(self_attn) is DecoupledSelfAttention:
         replaced_parts["self_attn"] = layer.pop("self_attn")
     cross_attn = layer.get("cross_attn") or {}
+    # Settings without a type are of `BEVDeformableAttention`, the default of `MapDecoderLayer`.
     if class_of(cross_attn) in (None, BEVDeformableAttention):
         replaced_parts["cross_attn"] = layer.pop("cross_attn", None)
     configured_parts = {name: part for name, part in replaced_parts.items() if part}

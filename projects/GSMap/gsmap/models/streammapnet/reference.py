@@ -23,7 +23,7 @@ class LineReference(PointReference):
         num_points: Points per instance P.
         coords: Coordinates D of a point: 2, or 3 for points with height.
         z_range: Lowest and highest z in metres, for points with height.
-        points_per_state: Argument of `PointReference`.
+        points_per_state: Number of points that one query initialises, as in `PointReference`.
     """
 
     def __init__(

@@ -123,7 +123,10 @@ def by_instance(leaf: Tensor, num: int) -> Tensor:
 
 
 def leaf_names(count: int) -> list[str]:
-    """Names in the memory of the leaves of `Queries`: states, then references."""
+    """Names under which the memory stores the leaves of `Queries`, as `tree_flatten` lists them.
+
+    The leaves are the tensors of the state and of the position, and the references as the last one.
+    """
     return [*(f"queries_{number}" for number in range(count - 1)), "references"]
 
 
@@ -302,12 +305,14 @@ class Propagation(FlowHook):
             point_states=head.decoder.point_states(state),
             reference=self.propagated.reference.flatten(1, 2),
         )
+        # Coordinates are the first entries of a reference: (B, K * P, D) -> (B, K, P, 2 or 3).
         pred = pred[..., : previous.shape[-1]].reshape(previous.shape)
         target = head.reference.transform_points(previous, self.past.now_from_then)
         has_target = (previous.flatten(2) != 0).any(-1)  # unmatched queries have zeros (B, K)
         weight = has_target & self.past.continues[:, None]
         distances = F.smooth_l1_loss(pred, target, reduction="none", beta=self.memory.beta)
-        total = (distances.sum((-1, -2)) * weight).sum() / previous.shape[-2]
+        num_points = previous.shape[-2]
+        total = (distances.sum((-1, -2)) * weight).sum() / num_points
         return self.memory.loss_weight * total / (weight.sum() + 1e-10)
 
 

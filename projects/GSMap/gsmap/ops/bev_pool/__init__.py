@@ -113,10 +113,11 @@ def bev_pool_conv3x3(
     table = context.permute(0, 1, 3, 4, 2).flatten(0, 3) @ taps  # (B V h w, 9 O)
     table = table.view(-1, weight.shape[0])  # row = pixel * 9 + tap
     starts = counts.flatten().cumsum(0).view_as(counts) - counts  # first point of each cell
-    # An output cell sums the points of its 3 x 3 neighbours. The points of a neighbour are a range
-    # of the sorted points, with a first point and a length, in the order of the filter's taps.
-    # `order` lists the points of all ranges. Its entry i is a point of a range that begins at entry
-    # `range_starts` of the list and at point `firsts`: point i - range_starts + firsts.
+    # An output cell sums the points of its 3 x 3 neighbours, in the order of the filter's taps. The
+    # points of a neighbour are a range of the sorted points: `firsts` and `lengths`, (B H W 9,).
+    # `order` lists the points of all these ranges, one range after the other; a range begins at
+    # entry `range_starts` of the list. So entry i of the list, if it lies in range r, is the sorted
+    # point firsts[r] + (i - range_starts[r]). `shift` is firsts[r] - range_starts[r] for each i.
     lengths = _neighbours(counts)
     firsts = _neighbours(starts)
     total = int(lengths.sum())
@@ -128,7 +129,7 @@ def bev_pool_conv3x3(
         output_size=total,
     )
     order = torch.arange(total, device=cells.device) + shift
-    bag_ends = lengths.view(-1, 9).sum(-1).cumsum(0)
+    bag_ends = lengths.view(-1, 9).sum(-1).cumsum(0)  # a bag is the nine ranges of an output cell
     sums = F.embedding_bag(
         pixels[order] * 9 + tap,
         table,

@@ -66,6 +66,7 @@ def render_gaussians(
             )
         batch_shape = means.shape[:-2]
         flat = gaussians.reshape(math.prod(batch_shape), means.shape[-2], 5)
+        # Corner of the raster with the smallest x and y, and the sides of a pixel, in metres.
         frame = [grid.x_range[0], grid.y_range[0], *grid.pixel_size_m]
         # The second Triton kernel replaces the first one if the user has enabled it.
         in_warps = backend == "triton" and "render_gaussians_in_warps" in backends.AUTO_KERNELS

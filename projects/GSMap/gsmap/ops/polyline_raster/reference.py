@@ -50,7 +50,7 @@ def _segment_distance(pixels: Tensor, start: Tensor, end: Tensor, eps: float) ->
     """Squared distances of points from segments. (..., 2) each -> (...)"""
     edge = end - start
     offsets = pixels - start
-    length2 = (edge.square().sum(-1) + eps).clamp(min=1e-38)
+    length2 = (edge.square().sum(-1) + eps).clamp(min=1e-38)  # no division by 0 for a point
     along = ((offsets * edge).sum(-1) / length2).clamp(0, 1)
     return (offsets - along[..., None] * edge).square().sum(-1)
 

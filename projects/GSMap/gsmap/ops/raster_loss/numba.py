@@ -117,6 +117,7 @@ def _blur_row(images, channels, row, span, window, line, out):
     # Because of the margin, these are not the row and column of the first pixel, but of the top
     # left of its window.
     first = row * pitch + span[0] * channels
+    # The blur along the row reads a window of pixels from the left edge of the last window on.
     size = (pixels + len(window)) * channels
     _convolve(images.reshape(images.size), first, stride=pitch, window=window, out=line, size=size)
     _convolve(line, 0, stride=channels, window=window, out=out, size=pixels * channels)
@@ -159,8 +160,10 @@ def _derivatives(maps, pixels, out):
 
     ``maps`` contains the blurred p, t, p^2 + t^2 and p t of one pixel after another, and ``out``
     receives three derivatives per pixel. With A, B, C and D for the results of `_ssim_terms`, SSIM
-    is A B / (C D). The blurred p is in all four of them, the blurred p^2 only in D, and the blurred
-    p t only in B.
+    is A B / (C D). The blurred p is in all four of them, with the derivatives 2 t, -2 t, 2 p and
+    -2 p. The blurred p^2 is only in D, with the derivative 1, and the blurred p t only in B, with
+    the derivative 2. So the derivative of SSIM with respect to the blurred p is
+    2 (t (B - A) + p SSIM (C - D)) / (C D).
     """
     for k in range(pixels):
         p = maps[4 * k]
@@ -209,7 +212,8 @@ def _prepare_instance(preds, targets, weight, radius, products, spans, sums):
         right = spans[0, row, 1]
         pred = preds[row, left:right]
         target = targets[row, left:right]
-        # Four channels of the row, from the first pixel of the span, behind the margin.
+        # The row in `products`, from the first pixel of the span on. The margin shifts rows and
+        # columns by the radius, and a pixel has four channels.
         out = products[row + radius, 4 * (left + radius) :]
         l1, predicted, foreground, excess = _fill_products(pred, target, weight=weight, out=out)
         sums[0] += l1
@@ -314,7 +318,8 @@ def loss_backward(preds, targets, window, radius, weight, factors, grads, first,
             pixels = _blur_row(
                 products, 4, row=row, span=spans[1, row], window=window, line=line, out=maps
             )
-            # Three channels of the row, from the first pixel of the span, behind the margin.
+            # The row in `slopes`, from the first pixel of the span on. The margin shifts rows and
+            # columns by the radius, and a pixel has three channels.
             out = slopes[row + radius, 3 * (spans[1, row, 0] + radius) :]
             _derivatives(maps, pixels, out=out)
         for row in range(preds.shape[1]):

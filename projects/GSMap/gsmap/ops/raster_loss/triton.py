@@ -20,8 +20,9 @@ from gsmap.ops.raster_loss.reference import MIN_COVERAGE, SSIM_C1, SSIM_C2
 
 BLOCK = 256
 OPTIONS = {"num_warps": 4, "enable_fp_fusion": True}
-# With fused multiply-adds, a - b * c is the rounding error of b * c where a is the rounded product.
-# It must be 0 there, as in the windows of empty masks.
+# Where both masks are empty, numerator and denominator of SSIM are the same product, and their
+# difference must be exactly 0. A fused multiply-add would subtract an unrounded product from a
+# rounded one, which leaves the rounding error.
 EXACT_OPTIONS = {**OPTIONS, "enable_fp_fusion": False}
 C1 = tl.constexpr(SSIM_C1)
 C2 = tl.constexpr(SSIM_C2)
@@ -149,6 +150,8 @@ def sums_kernel(
     p = tl.load(preds + n * pixels + index, mask=ok, other=0.0)
     t = tl.load(targets + n * pixels + index, mask=ok, other=0.0)
     excess = (weight - 1) * t
+    # The sums in the order of the reference: w |p - t|, w p, 1 - SSIM, w t, w - 1, windows with
+    # part of the target, windows with part of either mask, where w = 1 + excess.
     out = sums + (n * tl.num_programs(0) + tl.program_id(0)) * 7
     tl.store(out, tl.sum((1 + excess) * tl.abs(p - t)))
     tl.store(out + 1, tl.sum((1 + excess) * p))
@@ -179,7 +182,9 @@ def slopes_kernel(window, maps, slopes, height, width, TAPS: tl.constexpr, BLOCK
         maps, window, n=n, index=index, pixels=pixels, width=width, TAPS=TAPS, BLOCK=BLOCK
     )
     # SSIM = A B / (C D) with the four terms A, B, C and D in this order. The blurred p is in all
-    # of them, the blurred p^2 only in D, and the blurred p t only in B.
+    # of them, with the derivatives 2 t, -2 t, 2 p and -2 p. The blurred p^2 is only in D, with the
+    # derivative 1, and the blurred p t only in B, with the derivative 2. So the derivative of SSIM
+    # with respect to the blurred p is 2 (t (B - A) + p SSIM (C - D)) / (C D).
     scale = 1 / (low_mean * low_var)
     ssim = top_mean * top_cov * scale
     change = t * (top_cov - top_mean) + p * ssim * (low_mean - low_var)

@@ -11,7 +11,7 @@ _EPS = 1e-6  # added to the union, so that two empty masks have IoU 0
 _pairwise_minima = fused_operator(
     "soft_iou.pairwise_minima",
     "Tensor preds, Tensor targets",
-    lambda preds, targets: (len(preds), len(targets)),
+    shape=lambda preds, targets: (len(preds), len(targets)),
 )
 
 
