@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--reference-samples",
         type=int,
         default=100,
-        help="number of samples for the algorithm of the reference, which is linear in them",
+        help="number of samples for the algorithm of the reference, whose time is linear in it",
     )
     parser.add_argument(
         "--size",
@@ -287,7 +287,7 @@ def _reference_table(frames: list[Record], count: int, grid: BEVGrid) -> str:
             f"{our_map:.6f}",
         ]
         rows.append(row)
-    header = ["metric", "reference's way, ms", "ours, ms", "ratio", "its mAP", "our mAP"]
+    header = ["metric", "reference, ms", "ours, ms", "ratio", "reference mAP", "our mAP"]
     return markdown_table(header, rows)
 
 

@@ -1,4 +1,7 @@
-"""Effect of the raster loss on Gaussians that lie off their line, by its reduction over pixels."""
+"""Effect of the raster loss on Gaussians that lie off their line, for each reduction of the loss.
+
+A reduction is the way in which the loss is averaged over the pixels of an element.
+"""
 
 import argparse
 import math
@@ -42,7 +45,8 @@ def run(args: argparse.Namespace) -> None:
         args: Parsed options of ``add_arguments``.
     """
     parts = [
-        "-dL / d log sigma in thousandths, along / across the line; + grows, - shrinks. "
+        "-dL / d log sigma in thousandths, along / across the line: the loss enlarges Gaussians if "
+        "it is positive, and shrinks them if it is negative. "
         f"A line of 60 m, {POINTS} round Gaussians, raster {GRID.height} x {GRID.width}, "
         f"mean over {args.seeds} seeds. Rows: error of the centres, columns: sigma.\n"
     ]

@@ -1,6 +1,7 @@
 """Operators on the pretended GPU: sets by their launches and waits, and counterparts for the CPU.
 
-See `benchmarks.pretended_gpu`.
+The pretended GPU (`benchmarks.pretended_gpu`) computes on the CPU. It counts the kernels that would
+be launched on a GPU, and the times at which the host would wait for it.
 """
 
 from collections.abc import Callable
@@ -15,7 +16,8 @@ from gsmap.ops.kernel_sampling.reference import sample_kernels_reference
 
 aten = torch.ops.aten
 
-# Operations without a launch. Views have none either, but their schemas declare them.
+# Operations without a launch. Views have no launch either. They are not listed, because the schema
+# of an operation shows that its result is a view.
 FREE = {
     aten.detach.default,
     aten.alias.default,
@@ -98,7 +100,7 @@ def _efficient_attention_backward(
     *_: Any,
     **options: Any,
 ) -> tuple[Tensor, ...]:
-    """Gradients of `_efficient_attention` in query, key and value; the bias has zeros.
+    """Gradients of `_efficient_attention` in query, key and value; the gradient of the bias is 0.
 
     Args:
         grad: Gradient of the result. (B, heads, N, C)

@@ -44,7 +44,7 @@ def parse_args() -> argparse.Namespace:
         "--score-thr",
         type=float,
         default=0.4,
-        help="initial score of the slider; of a film, the least score",
+        help="least score of the elements that are drawn; a page has a slider to change it",
     )
     parser.add_argument(
         "--image-width",
@@ -60,12 +60,12 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument(
         "--by",
         metavar="map|scene|distance|FILE",
-        help="a table of AP by parts, as of tools/evaluate.py",
+        help="add a table of AP of each part of the data, as --by of tools/evaluate.py",
     )
     parser.add_argument(
         "--allow-other-split",
         action="store_true",
-        help="models may be trained on another split, which may hold places of this one",
+        help="accept models of another training split, although places of --ann may be in it",
     )
     parser.add_argument(
         "--law",
@@ -94,7 +94,7 @@ def main() -> str:
     is_foreign = _PAGE.exists() and not is_own_page(_PAGE)
     args = parse_args()
     if args.out is _PAGE and is_foreign:  # without --out
-        raise FileExistsError(f"{_PAGE} is there, and no page of this command: give --out PAGE.")
+        raise FileExistsError(f"{_PAGE} exists and is no page of this command: give --out PAGE.")
     paths = [args.results]
     if args.compare:
         paths.append(args.compare)

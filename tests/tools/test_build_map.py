@@ -162,7 +162,7 @@ def test_no_file_of_another_program_is_replaced(files, tmp_path, name, content):
     results, ann = files
     (tmp_path / name).write_bytes(content)
     words = [str(results), "--ann", str(ann), "--out", str(tmp_path), "--origin", "48", "11"]
-    with pytest.raises(ValueError, match=rf"{name} is there, and no file of this command"):
+    with pytest.raises(ValueError, match=rf"{name} exists and is no file of this command"):
         main([*words, "--formats", "geojson", "osm"])
     assert (tmp_path / name).read_bytes() == content
     assert os.listdir(tmp_path) == [name]
@@ -196,7 +196,7 @@ def test_a_folder_or_a_pipe_under_the_name_of_a_map_is_refused(files, tmp_path):
     words = [str(results), "--ann", str(ann), "--out", str(tmp_path)]
     for make in (Path.mkdir, os.mkfifo):
         make(tmp_path / "scene.geojson")
-        with pytest.raises(ValueError, match=r"scene\.geojson is there, and no file"):
+        with pytest.raises(ValueError, match=r"scene\.geojson exists and is no file"):
             main(words)
         os.rename(tmp_path / "scene.geojson", tmp_path / make.__name__)
 

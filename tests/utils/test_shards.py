@@ -112,7 +112,7 @@ def test_no_shard_replaces_a_file_of_another_program(tmp_path):
     for name in (path, manifest):
         for content in (b"", b"mine", b"ARROW1" + bytes(100_000), b'{"shard": 1}'):
             name.write_bytes(content)
-            with pytest.raises(ValueError, match=f"{name.name} is there, and no file of this"):
+            with pytest.raises(ValueError, match=f"{name.name} exists and is no file of this"):
                 write_annotations(target, meta, [], Shard(1, 3))
             assert name.read_bytes() == content
         name.unlink()
@@ -128,7 +128,7 @@ def test_no_shard_of_figures_replaces_a_file_of_another_program(tmp_path):
     target, shard = tmp_path / "figures.json", Shard(0, 2)
     path = shard.path_of(target)
     path.write_bytes(b"mine")
-    with pytest.raises(ValueError, match="is there, and no file of this command"):
+    with pytest.raises(ValueError, match="exists and is no file of this command"):
         require_own_matches(target, shard)
     np.savez_compressed(path.open("wb"), notes=np.array(["a"]))  # as `write_matches` writes it
     require_own_matches(target, shard)

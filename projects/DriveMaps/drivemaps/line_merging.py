@@ -58,11 +58,13 @@ def merge_lines(drive: Drive, label: int, config: MergeConfig) -> list[tuple[Flo
         matches = match_vertices(lines, normals)
         lines = _move_to_means(lines, normals=normals, matches=matches)
     matches = match_vertices(lines, normals_of(lines))
+    # A segment has the index of its first vertex, whose score it takes.
     matched_scores = lines.scores[matches.segments]
     support = lines.scores + np.bincount(matches.vertices, matched_scores, minlength=num_vertices)
     num_frames = drive.count_frames_in_range(lines.points)
     share = support / np.maximum(num_frames, 1)
-    smooth_share = median_filter(share, 3)  # fills in the vertices of sharp corners, without match
+    # A vertex at a sharp corner has no match. The median of three gives it its neighbours' share.
+    smooth_share = median_filter(share, 3)
     confidence = np.minimum(smooth_share, 1.0)
     is_confident = confidence >= config.min_confidence
     parts = _select_parts(lines, matches=matches, confidence=confidence, is_confident=is_confident)

@@ -99,7 +99,7 @@ def _is_pinhole(matrix: np.ndarray) -> bool:
 
 
 def _field(info: Any, name: str) -> np.ndarray:
-    """Array of a camera info; ROS 1 writes its name in capitals."""
+    """Array of a camera info by the name of its field, which is in capitals in ROS 1."""
     values = getattr(info, name) if hasattr(info, name) else getattr(info, name.upper())
     return np.asarray(values, dtype=np.float64)
 
@@ -135,36 +135,18 @@ def build_camera(
     """
     image_topic, info_topic = topics
     where = f"camera {name!r}: its camera info {info_topic}"
-    k = _matrix(info, "k")
-    p = _matrix(info, "p")
-    d = _field(info, "d")
+    distortion = _field(info, "d")
     notes = []
     full_px = (int(info.width), int(info.height))
     rectified = is_rectified(image_topic)
-    has_distortion = bool(d.any())
+    has_distortion = bool(distortion.any())
     if rectified and has_distortion:
         notes.append(
-            f"camera {name!r}: {image_topic} is taken as rectified for its name, so P of "
-            f"{info_topic} is used, and its distortion is not"
+            f"camera {name!r}: {image_topic} is taken as rectified because of its name, so P of "
+            f"{info_topic} is used, and the distortion in {info_topic} is not"
         )
-    matrix = p if rectified else k
-    # A camera info without a size is not meant here: `RigCamera` refuses it.
-    if min(full_px) > 0 and not _is_pinhole(matrix):
-        # The driver has left this matrix empty. The other one replaces it if the image has no
-        # distortion, because K and P then describe one image.
-        empty, used = ("P", "K") if rectified else ("K", "P")
-        matrix = k if rectified else p
-        if not _is_pinhole(matrix):
-            raise InputError(
-                f"{where} has no calibration, because K and P have no focal lengths: give "
-                "--calibration"
-            )
-        if has_distortion:
-            raise InputError(
-                f"{where} has no focal lengths in {empty}, and {used} alone is not enough with its "
-                "distortion: give --calibration"
-            )
-        notes.append(f"{where} has no focal lengths in {empty}: {used} is used")
+    matrix, matrix_notes = _choose_matrix(info, rectified=rectified, where=where)
+    notes += matrix_notes
     offset_px, binning, size_px = _window(info, full_px)
     image_sizes = images.sizes_px
     is_any_size_unknown = not image_sizes or min(full_px) < 1
@@ -187,10 +169,45 @@ def build_camera(
         intrinsics=matrix,
         cam_from_ground=cam_from_ground,
         size_px=size_px,
-        distortion=np.zeros(0) if rectified or not has_distortion else d,
+        distortion=np.zeros(0) if rectified or not has_distortion else distortion,
         model=str(info.distortion_model),
     )
     return camera, notes
+
+
+def _choose_matrix(info: Any, rectified: bool, where: str) -> tuple[np.ndarray, list[str]]:
+    """Choose the camera matrix of the images: P if they are rectified, and K otherwise.
+
+    A driver may leave this matrix empty. The other one replaces it if the camera has no distortion,
+    because K and P then describe one image.
+
+    Args:
+        info: Message with the camera info.
+        rectified: Whether the images are rectified.
+        where: Beginning of messages.
+
+    Returns:
+        The matrix (3, 3), and a note on a replacement. The matrix stays empty for a camera info
+        without a size, which `RigCamera` refuses.
+    """
+    k = _matrix(info, "k")
+    p = _matrix(info, "p")
+    matrix = p if rectified else k
+    has_size = min(int(info.width), int(info.height)) > 0
+    if not has_size or _is_pinhole(matrix):
+        return matrix, []
+    empty, used = ("P", "K") if rectified else ("K", "P")
+    matrix = k if rectified else p
+    if not _is_pinhole(matrix):
+        raise InputError(
+            f"{where} has no calibration, because K and P have no focal lengths: give --calibration"
+        )
+    if _field(info, "d").any():
+        raise InputError(
+            f"{where} has no focal lengths in {empty}, and {used} alone is not enough with its "
+            "distortion: give --calibration"
+        )
+    return matrix, [f"{where} has no focal lengths in {empty}: {used} is used"]
 
 
 def _window(

@@ -176,7 +176,7 @@ def _topics_of(
     options: InputOptions,
     kinds: Mapping[str, str],
 ) -> dict[str, tuple[str, str]]:
-    """Topics of the images and of the camera info of calibrated cameras, the latter empty.
+    """Topics of the images of calibrated cameras, each with an empty topic of the camera info.
 
     Args:
         calibrated_cameras: Cameras of the calibration file, with their setting ``images``.

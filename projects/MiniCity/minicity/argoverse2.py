@@ -25,7 +25,7 @@ LINE_WIDTH_M = 0.15
 DOUBLE_GAP_M = 0.12
 DASH_M, GAP_M = 3.0, 6.0
 SAME_LINE_M = 0.3  # lines closer than this are one line
-WEAR = 0.15
+WEAR = 0.15  # share of the paint that is worn off
 HEIGHT_SMOOTHING_M = 1.0  # heights are stored in steps of about 5 cm
 
 Bounds = tuple[float, float, float, float]
@@ -57,7 +57,9 @@ def make_scene(
         if polygon.intersects(window):
             areas.append(shapely.make_valid(polygon))
     road = shapely.union_all(areas)
-    scene = SceneMap(height=height_grid(heights, bounds, trusted=road.buffer(ROI_ISOCONTOUR_M)))
+    # Argoverse 2 measures heights up to this distance from the road (its region of interest).
+    trusted = road.buffer(ROI_ISOCONTOUR_M)
+    scene = SceneMap(height=height_grid(heights, bounds, trusted=trusted))
     for polygon in _polygons(road.buffer(WALKWAY_WIDTH_M, join_style="mitre")):
         scene.surfaces.append(Surface(polygon, "walkway"))
     for polygon in _polygons(road):

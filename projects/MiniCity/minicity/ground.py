@@ -73,7 +73,8 @@ def plane_footprints(camera: Camera, homography: Array) -> Footprints:
     # Upper edge of each row, in homogeneous coordinates of the ground. (3, H + 1)
     center = homography @ np.stack([column, rows - 0.5, np.ones(rows.shape)])
     beside = homography @ np.stack([column + 1, rows - 0.5, np.ones(rows.shape)])
-    # The third coordinate is the fall of a ray. A bound keeps rays above the horizon finite.
+    # The third coordinate is the fall of a ray. With a bound on it, rays near and above the horizon
+    # end at a distance of a few kilometres instead of at infinity.
     hit = center[:2] / np.minimum(center[2], -4 * HORIZON_EPS)
     hit_beside = beside[:2] / np.minimum(beside[2], -4 * HORIZON_EPS)
     distance = np.linalg.norm(hit - camera.center[:2, None], axis=0)

@@ -220,7 +220,7 @@ def test_a_calibration_file_stands_for_infos_and_transforms(drive, minicity_root
         open_input(recorder.path, options(tmp_path, calibration=file))
     del cameras["other"]["size_px"]
     file.write_text(json.dumps({"cameras": cameras}))
-    with pytest.raises(ValueError, match=r"'other'.*beside a bag it needs size_px"):
+    with pytest.raises(ValueError, match=r"'other'.*a camera of a bag needs size_px"):
         open_input(recorder.path, options(tmp_path, calibration=file))
 
 

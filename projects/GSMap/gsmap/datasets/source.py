@@ -194,7 +194,10 @@ def change_frame(
 def _transform_cameras(
     cameras: Sequence[CameraRecord], frame_from_new: np.ndarray
 ) -> list[CameraRecord]:
-    """Return cameras with extrinsics from a new frame, given the transform from it. (4, 4)"""
+    """Return cameras whose extrinsics start from a new frame.
+
+    ``frame_from_new`` is the transform from the new frame to the present one. (4, 4)
+    """
     new_cameras = []
     for camera in cameras:
         cam_from_new = camera.cam_from_frame @ frame_from_new

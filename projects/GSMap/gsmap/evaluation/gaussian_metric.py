@@ -79,6 +79,7 @@ class GaussianMetric(BaseMetric):
             iou = self._matched_iou(masks[is_class], lines=lines, grid=grid)
             sizes = extents[is_class].flatten(start_dim=0, end_dim=1).numpy()
             figures[label] = (iou, sizes)
+        # AT_FLOOR is a factor slightly above 1, as sizes only approach their lower bound.
         at_floor = (scales < AT_FLOOR * predictions["min_scale_m"]).all(dim=-1)
         return at_floor.flatten().numpy(), figures
 

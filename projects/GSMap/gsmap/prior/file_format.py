@@ -141,7 +141,8 @@ def _parse_header(
             raise InputError("classes must be a list.")
         rule = rule_from_settings(values.pop("rule"), rules)
         return PriorSettings(**values), rule
-    except (ValueError, TypeError, RecursionError) as error:  # TypeError: names that are lists
+    # A TypeError is raised for a list in place of a name, a RecursionError for deeply nested JSON.
+    except (ValueError, TypeError, RecursionError) as error:
         text = str(error).rstrip(".")
         raise InputError(f"{path} is damaged: {text}; build it again.") from error
 
@@ -150,7 +151,8 @@ def _parse_index(index: bytes, path: Path, start: int, end: int) -> dict[TileKey
     """Check the index; tiles lie between the bytes ``start`` and ``end``."""
     rows = np.frombuffer(index, dtype=_INDEX)
     first = rows["offset"]
-    longest = end - np.minimum(first, end)  # bytes between the start of a tile and the index
+    # Bytes between the start of a tile and the index. Offsets are unsigned: not below 0.
+    longest = end - np.minimum(first, end)
     inside = (first >= start) & (first <= end) & (rows["length"] <= longest)
     tile_columns = np.abs(rows["column"].astype(np.int64))
     tile_rows = np.abs(rows["row"].astype(np.int64))

@@ -178,8 +178,9 @@ class MapElements:
     def to_frame(self, transform: FloatArray) -> "MapElements":
         """Transform the elements to another frame, by the position and yaw of a pose.
 
-        Ground truth is cut out of maps by the inverse of this transform. Roll and pitch are
-        ignored; they would move a point 30 m away by centimetres.
+        Roll and pitch are ignored; they would move a point 30 m away by centimetres. Ground truth
+        is cut out of a map by position and yaw, too, so this transform to the frame of the map is
+        the exact inverse.
 
         Args:
             transform: Transform from the frame of the elements to the other one, in metres. (4, 4)

@@ -173,8 +173,8 @@ def require_own_file(path: Path, mark: bytes) -> None:
         return
     if not stat.S_ISREG(mode) or not has_mark(path, mark):
         raise InputError(
-            f"{path} is there, and no file of this command, which would replace it: remove it, "
-            "or give another output."
+            f"{path} exists and is no file of this command, which would replace it: remove it, or "
+            "give another output."
         )
 
 

@@ -25,6 +25,7 @@ def starts_a_command() -> bool:
     """Whether this process is ``gsmap`` or a script of ``tools``, but not a worker process."""
     script = os.path.realpath(sys.argv[0]) if sys.argv else ""
     folder, name = os.path.split(script)
+    # Of the folders with scripts, only ``tools`` contains this file.
     is_tool = os.path.isfile(os.path.join(folder, "dist_run.sh"))
     is_command = name == "gsmap" or is_tool or _runs_a_module()
     return is_command and "--multiprocessing-fork" not in sys.orig_argv

@@ -5,7 +5,8 @@ import sys
 from collections.abc import Iterable
 from typing import Any, TextIO
 
-_UNCOMMON = re.compile(r"[^\x20-\x7e\n\t]+")  # absent from nearly all text
+# Characters that may need an escape. Nearly all text has none, so `_escape` is rarely called.
+_UNCOMMON = re.compile(r"[^\x20-\x7e\n\t]+")
 
 
 def printable(text: str) -> str:

@@ -251,7 +251,8 @@ def _draw_scores(
     vehicle_centre = np.array([0, (rear + front) / 2])
     vehicle_size = np.array([width, front - rear])
     obstacles = [vehicle_centre]
-    clearances = [half_size + vehicle_size / 2]  # a text is clear at this distance along x or y
+    # A text is clear of an obstacle if their centres are farther apart than this along x or y.
+    clearances = [half_size + vehicle_size / 2]
     for index in np.argsort(-scores, kind="stable"):
         line = lines[index]
         from_middle = np.abs(np.arange(len(line)) - len(line) // 2)

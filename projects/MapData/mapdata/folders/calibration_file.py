@@ -55,7 +55,7 @@ def read_rig(file: Path, ground: np.ndarray) -> tuple[list[tuple[RigCamera, str]
             with explain_errors(f"{file}, camera {name!r}", remedy="see docs/inference.md"):
                 check_camera_keys(camera)
                 if "size_px" not in camera:
-                    raise InputError("beside a bag it needs size_px: [width, height]")
+                    raise InputError("a camera of a bag needs size_px: [width, height]")
                 rig_camera = create_camera(name, camera, ground=ground, images=())
                 rig.append((rig_camera, str(camera.get("images", ""))))
         return rig, ground
@@ -233,7 +233,7 @@ def create_camera(
 
 
 def _size_of(images: Sequence[Path], where: str) -> tuple[int, int]:
-    """Size of the first image that can be read."""
+    """Size of the first image that can be read; without any, the error of the last is raised."""
     for path in images[:-1]:
         with suppress(ValueError):
             return image_size(path, where)

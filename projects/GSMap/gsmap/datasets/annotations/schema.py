@@ -119,7 +119,7 @@ def _flatten(value: Any, name: str, dim: int, where: str) -> np.ndarray:
         wanted = f"of shape {shape}"
     else:
         num_points = array.size // dim
-        shape = (max(num_points, 2), dim)  # fewer than two points differ from this shape
+        shape = (max(num_points, 2), dim)  # an array of fewer than two points has another shape
         wanted = f"(n >= 2, {dim})"
     if array.shape != shape or array.dtype.kind not in "iuf":
         raise InputError(

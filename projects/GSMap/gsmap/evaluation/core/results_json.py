@@ -28,7 +28,7 @@ GROUND_TRUTH_KEY = "GTs"
 BEZIER = "bezier"
 """Key of a curve with ``degree`` and ``pts`` in place of points; `compact_results` writes it."""
 THREE_D = "3D"
-"""Key of the number of samples with heights among ignored elements."""
+"""Key of the number of samples with heights, among the numbers of ignored elements."""
 SHARD_KIND = "results"
 _LAST_LINE = "]}\n"
 _GAUSSIAN_FIELDS = ("scales", "rotations")
@@ -129,6 +129,7 @@ class SampleFile:
             ValueError: If the sample is not in this place.
         """
         start, length = place
+        # If the file was changed, there may be no JSON of a sample in this place: a ValueError.
         with self.path.open("rb") as file, suppress(ValueError):
             file.seek(start)
             item = json.loads(file.read(length))
@@ -349,7 +350,7 @@ def merge_results(path: Path, shards: Sequence[ShardFile]) -> int:
         for shard in shards:
             file = shard.path.open(encoding="utf-8")
             files.append(stack.enter_context(file))
-        heads = [file.readline() for file in files]
+        heads = [file.readline() for file in files]  # the metadata and the key of the samples
         head = heads[0]
         if len(set(heads)) > 1:
             raise InputError(f"the shards of {path} have different first lines: create them again.")

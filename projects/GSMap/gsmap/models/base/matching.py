@@ -142,7 +142,7 @@ class MapAssigner:
         counts = []
         for index, (query, gt) in enumerate(pairs):
             sample = torch.full_like(query, index)
-            row = gt + truths.first[index]
+            row = gt + truths.first[index]  # index among the ground truths of all samples
             indices.append(torch.stack([sample, query, query + first_query, gt, row]))
             counts.append(query.shape[1])
         host_indices = torch.cat(indices, dim=2)  # (5, L, M)

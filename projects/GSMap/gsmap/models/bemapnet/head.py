@@ -37,6 +37,7 @@ class CurveReference(Reference):
 
     def decode(self, references: Tensor) -> Tensors:
         """Decode references (N, P, 2) to ``pts`` in metres. (N, P, 2)"""
+        # The grid takes the distance from the front first.
         return {"pts": self.grid.metres_from_front(references.flip(-1))}
 
 
@@ -56,7 +57,8 @@ class BezierHead(LineHead):
             end before it.
         losses: Settings of `BezierLosses`.
         embed_dims: Channels C of the lines and of the BEV features.
-        hidden_dims: Hidden channels of the branches and of the map's coordinates.
+        hidden_dims: Hidden channels of the branches, and of the network that computes a feature of
+            D channels for each coordinate (x, y) of the map.
         kwargs: Further arguments of `LineHead`.
 
     Raises:
@@ -133,7 +135,7 @@ class BezierHead(LineHead):
 
         Args:
             layer: Lines of all classes from one decoder layer, as one entry.
-            mean: Mean feature of the map's coordinates. (D,)
+            mean: Mean of the features of all coordinates of the map. (D,)
         """
         # The decoder has one kind of lines, of one point each, for all classes together.
         ((states, logits, masks),) = layer
@@ -169,7 +171,8 @@ class BezierHead(LineHead):
         Args:
             label: Class index.
             states: States of the lines. (B, n, C)
-            mean: Mean feature of the map's coordinates. (D,)
+            mean: Mean of the features of all coordinates of the map. The logit of a coordinate is
+                its product with D outputs of a branch. (D,)
 
         Returns:
             Logits of the joints (B, n, k + 1, 2), of the inner points (B, n, k, d - 1, 2) and of
@@ -231,7 +234,7 @@ class BezierHead(LineHead):
         for label, curve in enumerate(cast(Iterable[Curve], self.curves)):
             is_class = instances.labels_3d == label
             counts = instances.num_pts[is_class]  # numbers of control points
-            largest = curve.weights.shape[-1]
+            largest = curve.weights.shape[-1]  # number of control points of a curve of all pieces
             has_too_many = counts > largest
             has_half_pieces = (counts - 1) % curve.degree != 0
             if (has_too_many | has_half_pieces).any():
@@ -246,6 +249,8 @@ class BezierHead(LineHead):
             controls = controls * curve.control_mask(pieces)[..., None]
             curves = curve(controls, pieces)
             if self.losses.redrawn_in_px:
+                # As in the released code, lines whose masks were drawn from their control points
+                # (`FormatBezierTargets`) have their curves in pixels.
                 size = constant(curves, self.mask_size).flip(0)  # (columns, rows), as points (x, y)
                 is_redrawn = instances.redrawn[is_class, None, None]
                 curves = torch.where(is_redrawn, curves * size, curves)

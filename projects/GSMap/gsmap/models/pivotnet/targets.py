@@ -104,6 +104,7 @@ class FormatPivotTargets(FormatLineTargets):
         """
         size_m = np.array(front_size(grid)) * self.pixel_m
         largest = self.num_points[label]
+        # Ends are level if their distances from the front differ by up to 1 m.
         line_m = orient_line(line * size_m, tolerance=1.0, sort_rings=self.sort_rings)
         areas = significances(line_m)
         pivots = np.flatnonzero(areas >= self.min_area_m2)

@@ -1,4 +1,7 @@
-"""Rasters of polylines and polygons: soft rasters, and masks of ground truth."""
+"""Rasters of polylines and polygons: soft rasters, and masks of ground truth.
+
+Soft rasters follow MapVR (Zhang et al., arXiv 2306.10502).
+"""
 
 import torch
 from torch import Tensor
@@ -23,7 +26,7 @@ _soft_rasters = fused_operator(
     "polyline_raster.soft_rasters",
     "Tensor rings, Tensor is_polygon, int height, int width, float[] softness, bool plain",
     lambda rings, is_polygon, height, width, *_: (len(rings), height, width),
-    differentiable=1,
+    differentiable=1,  # rings
 )
 
 

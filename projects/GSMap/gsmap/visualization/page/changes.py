@@ -39,6 +39,7 @@ class ChangeLayer:
     def __init__(self, path: Path | None, file: AnnotationFile) -> None:
         maps = sorted(set(file.column("map_name")))
         changes = read_changes(path) if path else []
+        # Changes that name no map get the name of the only map of the annotation file.
         self._changes = with_map_names(changes, maps, where=str(path))
         self._is_shown = path is not None
         self._meta = file.meta
@@ -52,7 +53,8 @@ class ChangeLayer:
             view: Orientation of the annotation frame.
 
         Returns:
-            Kind ``kind``, description ``text`` and points ``p`` in centimetres of each piece.
+            A dictionary for each piece of a change in the range: its kind (``kind``), a description
+            (``text``) and its points in centimetres (``p``).
         """
         frame_from_global = invert_rigid(sample.global_from_frame)
         entries = []
