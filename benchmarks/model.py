@@ -175,6 +175,8 @@ def model_and_batch(
     generator = torch.Generator().manual_seed(0)
     cameras, height, width = shape
     images = torch.randn(batch, cameras, 3, height, width, generator=generator).to(args.device)
+    # Encoders project with `lidar2img`. The other matrices are only inputs of the depth network of
+    # camera-aware encoders.
     identities = np.stack([np.eye(4)] * cameras)
     metainfo: dict[str, Any] = {
         "token": "random",
@@ -272,6 +274,7 @@ def add_auxiliary_targets(
     columns = width // stride
     sample.gt_seg = torch.rand(classes, cells.height, cells.width, generator=generator).round()
     sample.gt_pv_seg = torch.rand(views, classes, rows, columns, generator=generator).round()
+    # Depths from 1 to 34 m, in the range of the depth bins of the shipped configs.
     sample.gt_depth = 1 + 33 * torch.rand(views, height, width, generator=generator)
 
 

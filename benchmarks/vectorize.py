@@ -41,6 +41,7 @@ def run(args: argparse.Namespace) -> None:
     head = inferencer.model.map_head
     vectorize_maps = head.lines
     settings = head.vectorizing
+    # The defaults of the other settings are the published values, which hold for FULL_SIZE.
     published_settings = type(settings)(degrees=settings.degrees)
     settings_by_size = {head.map_size: settings, FULL_SIZE: published_settings}
     times_ms: dict[tuple[int, ...], list[float]] = {size: [] for size in settings_by_size}

@@ -63,15 +63,18 @@ def convert(source: Path, target: Path, allow_changes: bool = False) -> str:
     if model_settings and not allow_changes:
         examples = ", ".join(model_settings[:3])[:300]
         raise InputError(
-            f"{source} would become another model: {len(model_settings)} of its settings have no "
-            f"counterpart, {examples}... --allow-changes leaves them out."
+            f"{source} would become another model, since {len(model_settings)} of its settings "
+            f"have no counterpart: {examples}... --allow-changes leaves them out."
         )
     write_text(target, text)
     lines = [f"{target} is written: configs/{conversion.base} with the settings of {source}"]
-    unplaced = {"another model, without": model_settings, "not placed": other_settings}
+    unplaced = {
+        "this is another model, without the settings": model_settings,
+        "other settings without a counterpart": other_settings,
+    }
     for title, names in unplaced.items():
         if names:
-            lines.append(f"{title}, see docs/migration.md:")
+            lines.append(f"{title} (see docs/migration.md):")
             lines += [f"  {name}" for name in names]
     return "\n".join(lines)
 

@@ -203,7 +203,8 @@ def match_shard(args: argparse.Namespace, evaluator: MapEvaluator, settings: Met
         A line with the number of samples and the file.
     """
     require_own_matches(args.out, args.shard)
-    # The results are one file for all shards, or a file of results for this shard.
+    # The results are one file for all shards, or a file of results for this shard. If neither
+    # exists, `digest` raises the error for the first.
     results = args.results
     results_shard = args.shard.path_of(args.results)
     if args.results.exists() or not results_shard.exists():

@@ -85,11 +85,11 @@ def change(where: Path, **entries) -> None:
         (lambda t: change(t, samples=None), r"manifest is damaged .*\['samples'\]"),
         (lambda t: change(t, kind=["results"]), r"manifest is damaged .*\['kind'\]"),
         (lambda t: change(t, target="../val.json"), r"manifest is damaged"),
-        (rename_as_the_third, "is another shard by its manifest: 0 of 3"),
-        (lambda t: change(t, version="0"), r"different work, by version \("),
-        (lambda t: change(t, input="other"), r"different work, by input \('digest', 'other'\)"),
-        (lambda t: change(t, options={"classes": ["b"]}), r"by classes \(\['a'\], \['b'\]\)"),
-        (lambda t: write(t.parent, 2), r"different work, by of \(2, 3\)"),
+        (rename_as_the_third, "than its manifest, which names shard 0 of 3"),
+        (lambda t: change(t, version="0"), r"different work, which differs in version \("),
+        (lambda t: change(t, input="other"), r"which differs in input \('digest', 'other'\)"),
+        (lambda t: change(t, options={"classes": ["b"]}), r"in classes \(\['a'\], \['b'\]\)"),
+        (lambda t: write(t.parent, 2), r"different work, which differs in of \(2, 3\)"),
     ],
 )
 def test_what_is_missing_damaged_double_or_foreign_is_refused(damage, message, tmp_path):

@@ -117,12 +117,12 @@ def uncertainty_report(args: argparse.Namespace, settings: MetricSettings) -> Me
     from gsmap.evaluation.analysis import calibration
 
     classes = settings.classes
-    rules = ChamferConfig(classes)
+    rules = ChamferConfig(classes)  # without AP_chamfer, its default rules match the vertices
     if "chamfer" in args.eval:
         rules = ChamferConfig.from_settings(settings)
     pairs = open_pairs(args, args.results, classes=classes, gaussians=True)
     vertices = calibration.matched_vertices(pairs, rules)
-    law = args.law or law_of(pairs.about)
+    law = args.law or law_of(pairs.about)  # distribution of the errors: "normal" or "laplace"
     if args.reliability:
         from gsmap.visualization.figure import save_figure
         from gsmap.visualization.plots import plot_uncertainty

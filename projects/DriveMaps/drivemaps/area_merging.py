@@ -74,7 +74,8 @@ def _group_by_overlap(areas: np.ndarray, frames: IntArray) -> list[IntArray]:
 
     Args:
         areas: Detections of all frames. (A,)
-        frames: Index of the frame of each detection; only detections of two frames are joined. (A,)
+        frames: Index of the frame of each detection. Two detections of one frame are not joined
+            directly. (A,)
 
     Returns:
         Indices of the detections of each group. each (n,)
@@ -119,9 +120,9 @@ def _vote(
     faces = shapely.get_parts(shapely.polygonize([shapely.union_all(edges)]))
     spots = shapely.get_coordinates(shapely.point_on_surface(faces))  # (faces, 2)
     x, y = spots.T
-    votes = np.zeros(len(faces))  # of frames whose detections contain the spot
-    all_votes = np.zeros(len(faces))  # of frames that have the spot in range
-    support = np.zeros(len(faces))
+    votes = np.zeros(len(faces))  # summed weights of the frames whose detections contain the spot
+    all_votes = np.zeros(len(faces))  # summed weights of the frames that have the spot in range
+    support = np.zeros(len(faces))  # sum over the frames of their best score at the spot
     for frame_index, rows in rows_of_frame.items():
         in_rows = [shapely.contains_xy(areas[row], x, y) for row in rows]
         contains = np.array(in_rows)  # (rows, faces)

@@ -144,6 +144,7 @@ class Drive:
         Returns:
             All elements with a vertex or an edge in the range, and possibly some others.
         """
+        # `reduceat` takes an element from its offset to the next one, so none may be empty.
         nonempty = np.flatnonzero(elements.num_points)
         if not len(nonempty):
             return elements
@@ -221,7 +222,7 @@ def read_drive(
 
 
 def drive_map(rows: Iterable[tuple[int, FloatArray, float]], scored: bool = True) -> MapElements:
-    """Create the map of a drive from simplified elements in a fixed order.
+    """Create the map of a drive: simplify its elements, and sort them.
 
     Args:
         rows: Label, vertices in metres in the global frame, (n, >= 2), and score of each element.

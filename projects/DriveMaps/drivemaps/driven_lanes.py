@@ -26,8 +26,8 @@ _MOST_CROSSING_M = 50.0  # longest stretch without borders, such as a junction, 
 _LANE_CHANGE_M = 1.0  # jump of the middle of the lane between two points
 _FILTER = 5  # points of the median filter along the track
 _REPEAT_M = 1.5  # largest distance of points of one lane, which are at most 2 m apart along it
-_MOST_POINTS = 25  # of a centre line, as lanes differ in width along a track
-_LEAST_POINTS = 3  # between the places at which a lane is divided
+_MOST_POINTS = 25  # number of points after which a centre line is cut, as the width of lanes varies
+_LEAST_POINTS = 3  # smallest number of points between two cuts of a centre line
 _MIN_PARALLEL_COSINE = 0.7  # between the directions of two passes through one lane
 # Kinds of lanes between two points.
 _OUTSIDE = 0
@@ -73,18 +73,19 @@ def driven_lanes(positions: FloatArray, borders: list[FloatArray]) -> DrivenLane
     stretches: list[tuple[int, int]] = []  # indices of their first and last point
     driven_m = 0.0
     outside_m = 0.0
-    offset = 0  # index of the first point of a lane
+    first_point = 0  # index, among the points of all lanes, of the first point of the lane
     for lane in lanes:
         is_lane = lane.kinds != _OUTSIDE
         driven_m += float(lane.steps_m.sum())
         outside_m += float(lane.steps_m[~is_lane].sum())
-        is_repeated = earlier_points[offset : offset + len(lane.centers)] >= 0
-        is_new = ~(is_repeated[:-1] & is_repeated[1:])
+        end_point = first_point + len(lane.centers)
+        is_repeated = earlier_points[first_point:end_point] >= 0
+        is_new = ~(is_repeated[:-1] & is_repeated[1:])  # of the steps between two points
         states = np.where(is_lane & is_new, lane.kinds, _OUTSIDE)
         for start, stop in _runs(states):
             if states[start] != _OUTSIDE:
-                stretches.append((offset + start, offset + stop))
-        offset += len(lane.centers)
+                stretches.append((first_point + start, first_point + stop))
+        first_point = end_point
     points = np.concatenate([lane.centers for lane in lanes])
     centerlines = _join_repeats(points, stretches, earlier_points)
     return DrivenLanes(centerlines, driven_m=driven_m, outside_m=outside_m)

@@ -141,7 +141,8 @@ class ElementCollector:
         self._num_vertices += len(line)
         if self._num_vertices > _MOST_VERTICES:
             raise InputError(
-                f"{self._path} has more than {_MOST_VERTICES:,} vertices: cut the map to the place."
+                f"{self._path} has more than {_MOST_VERTICES:,} vertices: cut out the part of the "
+                "map that you need."
             )
         has_length = len(line) > 1 and bool(np.ptp(line, axis=0).any())
         if not has_length:

@@ -98,10 +98,11 @@ def _without_duplicates(drive: Drive) -> Drive:
     frames = []
     for frame in drive.frames:
         elements = frame.elements
-        kept = may_overlap[elements.labels] | (elements.num_points > _MOST_VERTICES)
-        compared = np.flatnonzero(~kept)
-        kept[compared[_select_distinct(elements.select(compared))]] = True
-        frames.append(replace(frame, elements=elements.select(kept)))
+        is_kept = may_overlap[elements.labels] | (elements.num_points > _MOST_VERTICES)
+        compared = np.flatnonzero(~is_kept)
+        distinct = _select_distinct(elements.select(compared))  # indices into `compared`
+        is_kept[compared[distinct]] = True
+        frames.append(replace(frame, elements=elements.select(is_kept)))
     return replace(drive, frames=frames)
 
 

@@ -32,7 +32,14 @@ def plot_maps(maps: Mapping[str, MapElements], track: np.ndarray, style: MapStyl
     figure.set_figheight(0.4 + rows * (panel_height + 0.5))
     for ax, (title, elements) in zip(axes.ravel(), maps.items(), strict=True):
         lines = [line[:, :2] - low for line in elements.polylines]
-        draw_lines(ax, lines, elements.labels, style, style.colours(elements.labels), 0.8)
+        draw_lines(
+            ax,
+            lines,
+            labels=elements.labels,
+            style=style,
+            colours=style.colours(elements.labels),
+            width_pt=0.8,
+        )
         x, y = (track - low).T
         ax.plot(x, y, ".", color=style.ink, markersize=1.2)
         ax.set(xlim=(0, width), ylim=(0, height), aspect="equal")

@@ -33,7 +33,7 @@ FOLDERS = (  # all modules of these folders are imported
     *(f"gsmap.models.{method.name}" for method in METHODS),
 )
 
-with pause_collection():
+with pause_collection():  # garbage collections would only slow the imports down
     for name in MODULES:
         import_module(name)
     for folder in FOLDERS:

@@ -100,6 +100,7 @@ def _listed_parts(folder: Path) -> list[Path]:
     text = _read_metadata(folder / _METADATA)
     listed_parts = []
     for part in parts_in(folder):
+        # The name must not be a part of a longer name.
         if re.search(rf"(?<![\w.-]){re.escape(part.name)}(?![\w.-])", text):
             listed_parts.append(part)
     return listed_parts
@@ -239,6 +240,6 @@ def suffix_advice(path: Path) -> str | None:
         return f"its recorder was killed: `rosbag reindex {name}`, and rename it to end in .bag"
     if suffixes and suffixes[-1] in _PACKED and set(suffixes) & set(SUFFIXES):
         return f"it is packed ({path.suffix}): unpack it first"
-    if suffixes and suffixes[-1] in SUFFIXES:
+    if suffixes and suffixes[-1] in SUFFIXES:  # in capital letters, such as .BAG
         return f"rename it: the suffix of a bag is {suffixes[-1]}"
     return None

@@ -1,4 +1,4 @@
-"""Records that take cameras and poses from a calibration file (docs/custom_data.md)."""
+"""Records of samples whose cameras and poses come from a calibration file (docs/custom_data.md)."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -88,8 +88,8 @@ def _require_keys(camera: Mapping[str, Any], file: Path) -> None:
     others = sorted(set(camera) - _KEYS)
     if others:
         raise InputError(
-            f"camera {camera.get('name')!r} has {others}: beside a calibration file it may have "
-            f"{sorted(_KEYS)}, and the others come from {file}."
+            f"camera {camera.get('name')!r} has {others}, which {file} defines: leave them out. "
+            f"Beside a calibration file, cameras have only {sorted(_KEYS)}."
         )
 
 
@@ -118,6 +118,8 @@ def _rig_frame(
 def _in_frame(sample: MapSample, record: Mapping[str, Any], meta: AnnotationMeta) -> MapSample:
     """Transform a sample from the frame ``ego`` to the frame of the annotation file."""
     ground_z_m = meta.ground_z_m
+    # `ego_from_frame` of a record is the mounting of the sensor that defines the annotation frame.
+    # Without it, the usual mounting is taken.
     ego_from_frame = record.get("ego_from_frame")
     if ego_from_frame is None:
         mount = Mount(meta.frame, ground_z_m=ground_z_m)

@@ -14,7 +14,7 @@ from mapdata.foxglove_messages import ROS_TYPES, foxglove_parser
 from mapdata.ros_bag import Parser, RosTypes, library_errors
 
 MAGIC = b"\x89MCAP0\r\n"
-_ROS_2_SCHEMAS = ("ros2msg", "ros2idl", "omgidl", "")
+_ROS_2_SCHEMAS = ("ros2msg", "ros2idl", "omgidl", "")  # empty: a topic without a definition
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,7 @@ def is_plain_ros2(path: Path) -> bool:
             return True
         file.seek(0)
         with library_errors():
+            # `import_bounded` limits the memory that a module of mcap may decompress to.
             reader = import_bounded("mcap.reader").make_reader(file)
             if reader.get_header().profile != "ros2":
                 return False
@@ -77,7 +78,7 @@ class McapBag:
         Raises:
             ValueError: If a file is damaged.
         """
-        begin_bag()
+        begin_bag()  # counts decompressed bytes from 0
         self._types = RosTypes()
         for path in self.paths:
             with library_errors(), path.open("rb") as file:

@@ -1,4 +1,7 @@
-"""Bags of ROS 1 and ROS 2, read with rosbags. Other topics stay readable if one is not."""
+"""Bags of ROS 1 and ROS 2, read with rosbags.
+
+If the messages of one topic cannot be parsed, the other topics can still be read.
+"""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -34,7 +37,10 @@ def library_errors() -> Iterator[None]:
 
 
 class _AddressedPath(type(Path())):  # type: ignore[misc]
-    """Path that formats as part of an SQLite URI, with special characters escaped."""
+    """Path that formats as part of an SQLite URI, with special characters escaped.
+
+    rosbags opens ``f"file:{path}"`` without this escape.
+    """
 
     def __format__(self, _: str) -> str:
         return str(self).replace("%", "%25").replace("?", "%3f").replace("#", "%23")
@@ -82,7 +88,9 @@ class RosTypes:
         if not definition:
             return _standard_store()
         if len(definition) > _MOST_LETTERS:
-            raise InputError(f"its definition has {len(definition)} letters, not {_MOST_LETTERS}")
+            raise InputError(
+                f"its definition has {len(definition)} letters, more than {_MOST_LETTERS}"
+            )
         types = _parse_types(self._typesys, msgtype, definition=definition, is_idl=is_idl)
         self._count_fields(types)
         try:
@@ -109,7 +117,8 @@ class RosTypes:
                 return 1
             if node == nodes.NAME:
                 return count_values_of_type(description)
-            # An array has a length; a sequence has any length, and counts as one value.
+            # An array has a length. A sequence, which has any length, counts as one value, as does
+            # an array of numbers.
             (item_node, item_description), length = description
             values = count_values(item_node, item_description)
             if not values:
@@ -129,7 +138,8 @@ class RosTypes:
                 self._field_count += len(constants) + values
                 if self._field_count > _MOST_FIELDS:
                     raise InputError(
-                        f"the types of the bag have more than {_MOST_FIELDS} fields, arrays counted"
+                        f"the types of the bag have more than {_MOST_FIELDS} fields, and items of "
+                        "arrays count as fields"
                     )
             return counts[name]
 
@@ -215,6 +225,7 @@ class RosBag:
 
     def messages(self, connections: Iterable[Any]) -> Iterator[tuple[Any, int, bytes]]:
         """Yield connection, time in nanoseconds and content of messages, in order of time."""
+        # Connections are long tuples with the text of a definition: identities are compared.
         selected_ids = set(map(id, connections))
         streams = []
         for reader in self._readers:

@@ -27,6 +27,7 @@ def unix_time_ns(number: float, unit_ns: int | None = None) -> int | None:
     whole = round(number)
     units = _UNITS_NS if unit_ns is None else (unit_ns,)
     for unit in units:
+        # Integers are multiplied without rounding.
         time_ns = whole * unit if whole == number else round(number * unit)
         if _FROM_NS <= time_ns < _TO_NS:
             return time_ns

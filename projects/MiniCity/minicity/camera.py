@@ -80,13 +80,13 @@ def clip_near(polygon: Array, near_m: float = NEAR_M) -> Array:
         near_m: Least depth of the result, in metres.
 
     Returns:
-        Corners of the part with z >= ``near_m``; m is 0 if the whole polygon is behind it. (m, 3)
+        Corners of the part with z >= ``near_m``; m is 0 if there is no such part. (m, 3)
     """
     corners = []
     for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
         if a[2] >= near_m:
             corners.append(a)
         if (a[2] >= near_m) != (b[2] >= near_m):  # the edge from a to b crosses the plane
-            share = (near_m - a[2]) / (b[2] - a[2])  # of the edge, up to the crossing
-            corners.append(a + share * (b - a))
+            fraction = (near_m - a[2]) / (b[2] - a[2])  # position of the crossing: 0 at a, 1 at b
+            corners.append(a + fraction * (b - a))
     return np.array(corners).reshape(-1, 3)

@@ -7,7 +7,7 @@ import numpy as np
 from minicity.curves import Array, hermite
 from minicity.roads import Lane, Road
 
-CONNECTOR_M = 3.2
+CONNECTOR_M = 3.2  # width of the lane of a `Connector` in map files
 STRAIGHT_RAD = 0.6  # a smaller turning angle counts as straight on
 
 

@@ -8,11 +8,11 @@ from minicity.config import make_rng
 from minicity.curves import Array, arc_lengths, hermite, resample, subline, unit
 from minicity.roads import CrossSection, Road, RoadStyle
 
-PITCH_M = 115.0
-MARGIN_M = 130.0
+PITCH_M = 115.0  # distance of neighbouring grid nodes before their random offsets
+MARGIN_M = 130.0  # from the border of the canvas to the grid
 STATION_M = 3.0  # distance of the points of a centre line
-MIN_ROAD_M = 40.0
-CORNER_M = (4.0, 8.0)
+MIN_ROAD_M = 40.0  # shorter roads have no crossings and no stop lines
+CORNER_M = (4.0, 8.0)  # smallest and largest space for the rounded corners of a junction
 BEND_CUT_M = 40.0  # length of a street that the curve of a bend replaces, on each side
 STEPS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])  # to the neighbour at arm 0, 1, 2 and 3
 
@@ -265,10 +265,11 @@ def mouth_distances(arms: list[tuple[float, float, float]], corner_m: float) -> 
         Metres along each road.
     """
     count = len(arms)
-    distances = [9.0] * count
+    distances = [9.0] * count  # smallest distances
     for i in range(count):
         j = (i + 1) % count
         angle = (arms[j][0] - arms[i][0]) % (2 * np.pi)
+        # The kerbs of nearly opposite roads meet far away or nowhere.
         if angle > 0.9 * np.pi or count == 1:
             continue
         w1 = arms[i][1]  # left side of road i

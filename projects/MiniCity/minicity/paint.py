@@ -39,6 +39,7 @@ def make_scene_map(town: Town, bounds: tuple[float, float, float, float]) -> Sce
             scene.surfaces.append(Surface(walkway, "walkway"))
     for road in town.roads:
         outline = Polygon(road.band(road.section.right_m, road.section.left_m))
+        # The outline may cross itself in a sharp bend, which `buffer(0)` repairs.
         if outline.buffer(0).intersects(window):
             _add_road(scene, road)
     for junction in town.junctions:
@@ -95,13 +96,13 @@ def divider_pieces(road: Road) -> list[tuple[float, float]]:
 
 
 def lane_divider_offsets(road: Road) -> list[float]:
-    """Offsets in metres of the lines between lanes of one direction."""
+    """Offsets in metres of the lines between lanes of one direction, without the outer edges."""
     return [*road.forward_edges[1:-1], *road.backward_edges[1:-1]]
 
 
 def divider_offsets(road: Road) -> list[float]:
     """Offsets in metres of all lines of divider paint, the centre line first."""
-    center = [road.shift_m] if road.has_center_line else []
+    center = [road.shift_m] if road.has_center_line else []  # offset 0 before the shift
     return [*center, *lane_divider_offsets(road)]
 
 

@@ -24,8 +24,8 @@ MIN_PIXELS = 1.2  # quads with a smaller extent are not drawn
 BACKDROP_RADIUS_M = 26.0  # radius of a sphere around any building
 SMALL_RADIUS_M = 9.0  # radius of a sphere around any other object
 SHADOW_FAR_M = 45.0  # largest distance of vehicles with a shadow
-LIGHT_UNDER_VEHICLES = 0.62  # share of light left under a vehicle without sun
-LIGHT_IN_SHADOW = 0.52  # share of light left under a vehicle and in its shadow with sun
+LIGHT_UNDER_VEHICLES = 0.62  # share of the light that remains under a vehicle if no sun shines
+LIGHT_IN_SHADOW = 0.52  # share that remains under a vehicle and in its shadow if the sun shines
 LOWEST_SUN = 0.2  # sine of the elevation below which shadows do not become longer
 TOP_LIGHT = 0.1  # share of the ambient light that depends on the upward part of the normal
 GLOW = 1.3  # brightness of lamps and lit windows under any light
@@ -205,8 +205,9 @@ class _Drawable:
     """Polygon or disc in image coordinates.
 
     Attributes:
-        order: Sort key, smallest drawn first: 0 for buildings and 1 for other objects, minus the
-            distance of the object, the layer inside the object, and minus the depth of the shape.
+        order: Sort key of four numbers; the smallest is drawn first. They are 0 for buildings and 1
+            for other objects; the negative distance of the object; the layer inside the object; and
+            the negative depth of the shape.
         group: Index of the object.
         polygon: Corners in fixed-point pixels, or None. (n, 2)
         disc: x, y and radius in fixed-point pixels, or None.
@@ -295,16 +296,17 @@ def _visible_quads(
     extent = high - low
     outside = (high < 0).any(axis=1) | (low[:, 0] > camera.width) | (low[:, 1] > camera.height)
     small = extent.max(axis=1) < MIN_PIXELS
+    # Layer 0 of a building has the walls and the roof; the layer above has the windows.
     windows = (mesh.layers[index] > 0) & mesh.backdrop[mesh.groups[index]]
     narrow_windows = windows & (extent.min(axis=1) < 2)
-    large_enough = whole & ~(outside | small | narrow_windows)
-    clipped = ~whole & ~windows
+    drawn_whole = whole & ~(outside | small | narrow_windows)
+    drawn_clipped = ~whole & ~windows
     colors = _shade_faces(
         mesh.colors[index], normals, glow=mesh.glow[index], camera=camera, lighting=lighting
     )
     depth = np.linalg.norm(corners.mean(axis=1), axis=1)
     polygons = _fixed_point(px)
-    for k in np.flatnonzero(large_enough | clipped):
+    for k in np.flatnonzero(drawn_whole | drawn_clipped):
         polygon = polygons[k]
         if not whole[k]:
             polygon = _fixed_point(camera.to_pixels(clip_near(corners[k])))
@@ -421,6 +423,7 @@ def occlusion_mask(
     if not len(walls) or not len(small):
         return mask
     eye = camera.center[:2]
+    # The first two corners of a wall are the ends of its lower edge.
     start = mesh.quads[walls, 0, :2]
     end = mesh.quads[walls, 1, :2]
     wall = end - start

@@ -193,7 +193,7 @@ class Footprints:
 def terrain_footprints(terrain: Terrain) -> Footprints:
     """Footprints of the image rows on uneven ground, as medians over the columns."""
     camera = terrain.camera
-    edges = terrain.distances(np.arange(camera.height + 1) - 0.5)
+    edges = terrain.distances(np.arange(camera.height + 1) - 0.5)  # upper edges of rows (H + 1, c)
     distance = np.median(edges[:-1], axis=1)
     return Footprints(
         along=np.median(np.abs(np.diff(edges, axis=0)), axis=1),

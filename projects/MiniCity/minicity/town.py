@@ -122,7 +122,7 @@ def make_town(name: str, seed: int, num_scenes: int) -> Town:
     for road in roads:
         _add_crossings(road, make_rng(seed, name, "crossings", road.index))
     junctions = []
-    for node, meeting in enumerate(meetings):
+    for node, meeting in enumerate(meetings):  # the roads that meet at each node
         if len(meeting) >= 3:
             arms = [(road_index, at_start) for road_index, at_start, _ in meeting]
             junctions.append(make_junction(node, arms, roads=roads))
@@ -169,6 +169,7 @@ def _add_crossings(road: Road, rng: np.random.Generator) -> None:
     if length < MIN_ROAD_M:
         return
     for at_start in (True, False):
+        # Number of lanes that lead to this end of the road.
         lanes_in = road.section.backward if at_start else road.section.forward
         if rng.random() < 0.62:  # a crossing, often with a stop line
             gap_m = CROSSING_GAP_M + float(rng.choice([0.0, 2.0]))
@@ -213,6 +214,7 @@ def _add_surroundings(town: Town, rng: np.random.Generator) -> None:
         surfaces.append(outline)
         pavements.append(outline.buffer(2.5))
     streets = shapely.union_all(surfaces)
+    # The outline of a road in a sharp bend may cross itself, which `buffer(0)` repairs.
     blocked = shapely.union_all([p.buffer(0) for p in [*pavements, *medians, *surfaces]])
     _add_carparks(town, blocked, rng=rng)
     parks = [Polygon(p.outline).union(Polygon(p.driveway)) for p in town.carparks]
@@ -290,6 +292,7 @@ def _add_buildings(town: Town, blocked: Polygon, rng: np.random.Generator) -> No
     centers = np.zeros((0, 2))  # of the houses so far
     for road in town.roads:
         dense = rng.random() < 0.75
+        # Side of the road, 1 for left and -1 for right, and distance of its kerb.
         for sign, kerb in ((1, road.section.left_m), (-1, -road.section.right_m)):
             arc_m = float(rng.uniform(low=0, high=10))
             while arc_m < road.length_m - 5:
@@ -307,6 +310,7 @@ def _add_buildings(town: Town, blocked: Polygon, rng: np.random.Generator) -> No
                 arc_m += front + float(gap)
                 outline = Polygon(house.footprint)
                 center = house.footprint.mean(axis=0)
+                # The larger one of the distances in x and in y.
                 distances = np.abs(centers - center).max(axis=1, initial=0.0)
                 neighbours = np.flatnonzero(distances < LARGEST_HOUSE_M)
                 if blocked.intersects(outline) or _touches_building(town, outline, neighbours):
@@ -355,9 +359,9 @@ def _add_furniture(town: Town, rng: np.random.Generator) -> None:
         for sign, kerb in ((1, road.section.left_m), (-1, -road.section.right_m)):
             first_tree = rng.uniform(low=3, high=12)
             for arc_m in np.arange(first_tree, road.length_m - 3, 11.0):
-                back = road.style.walkway_m + 1.0
+                back = road.style.walkway_m + 1.0  # distance from the kerb: behind the pavement
                 if rng.random() < 0.6:
-                    back = float(rng.uniform(low=0.9, high=1.5))
+                    back = float(rng.uniform(low=0.9, high=1.5))  # on the pavement
                 x, y = road.point(float(arc_m), sign * (kerb + back))
                 if rng.random() < tree_share and not keep_clear.contains(shapely.Point(x, y)):
                     trees.append([x, y, rng.uniform(low=3.5, high=7.5)])

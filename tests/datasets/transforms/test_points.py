@@ -175,7 +175,8 @@ def test_depth_of_a_sweep_between_two_images(road):
     """
     dataset = depth_data(road, at="cameras")
     summary = convert_argoverse2(Argoverse2Options(road, at="cameras", rate_hz=None))
-    assert "LiDAR sweep named by 5 of 6 samples, at most 40 ms away" in summary.notes
+    note = "5 of 6 samples have a LiDAR sweep, at most 40 ms before or after the sample"
+    assert note in summary.notes
     for idx, shift_m in ((0, 0.1), (1, -0.4)):  # 10 ms after a sweep, 40 ms before the next
         data = dataset[idx]["data_samples"]
         assert data.gt_depth.shape == (7, 384, 480)

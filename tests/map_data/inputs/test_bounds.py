@@ -47,7 +47,7 @@ def nested(count: int, last: str) -> str:
         (nested(3, "uint8 x\n"), "more than 10000 fields"),
         (nested(3, ""), "an array of values without any field"),
         (f"a/Nothing[] x\n{PART}a/Nothing\n", "an array of values without any field"),
-        ("#" * 100_001, "definition has 100001 letters, not 100000"),
+        ("#" * 100_001, "definition has 100001 letters, more than 100000"),
     ],
 )
 def test_types_that_take_long_to_make_are_refused(definition, message):

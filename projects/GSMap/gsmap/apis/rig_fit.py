@@ -142,7 +142,7 @@ def fit_start(
     notes = {
         "x_range": "the queries of the map are stretched to it",
         "y_range": "the queries of the map are stretched to it",
-        "frame": "training must learn which axis points ahead; samples in the old frame avoid this",
+        "frame": "training must learn which axis points ahead, unless samples are in the old frame",
     }
     for name, note in notes.items():
         if name in origin and plain(origin[name]) != plain(metainfo[name]):
@@ -273,10 +273,11 @@ def _fit_classes(
     first_rows = _find_class_weights(
         state, initial=initial, old_count=len(trained), new_count=len(names)
     )
-    if all(key.startswith(_GENERATOR_LABELS) for key in first_rows):  # also without any such weight
+    # Without weights of classes, or with embeddings of a generator alone, nothing is reordered.
+    if all(key.startswith(_GENERATOR_LABELS) for key in first_rows):
         return [
             f"classes were {', '.join(trained)}, are {', '.join(names)}: this head's weights of "
-            "classes are taken as they are, where their sizes fit."
+            "classes are loaded without a change of their order, where their sizes fit."
         ]
     old_rows: dict[str, int] = {}  # by class
     new_classes: list[str] = []
@@ -368,7 +369,7 @@ def _training_facts(path: Any, checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     for model in named_models().values():
         if not metadata and Path(str(path)) == model.file:
             metadata = dict(Config.fromfile(shipped_path(model.config)).train_dataloader.dataset)
-            metadata |= metadata["grid"]
+            metadata |= metadata["grid"]  # x_range and y_range
     if not isinstance(metadata, Mapping):
         return {}
     item_types = {"cameras": str, "classes": str, "frame": str, "x_range": float, "y_range": float}
@@ -377,6 +378,7 @@ def _training_facts(path: Any, checkpoint: Mapping[str, Any]) -> dict[str, Any]:
         value = metadata.get(name)
         if not isinstance(value, list | tuple | str):
             continue
+        # The items of a text, such as the name of the frame, are its characters.
         if all(isinstance(item, item_type) for item in value):
             facts[name] = value
     return facts

@@ -21,8 +21,10 @@ def summarize_names(names: Sequence[str], max_names: int = 3) -> str:
         names: State keys, or other names.
         max_names: Number of names to write out.
     """
+    if not names:
+        return "nothing"
     rest = f" and {len(names) - max_names} more" if len(names) > max_names else ""
-    return ", ".join(names[:max_names]) + rest or "nothing"
+    return ", ".join(names[:max_names]) + rest
 
 
 def ours_from_upstream(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -53,14 +55,14 @@ def ours_from_upstream(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def upstream_from_ours(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Rename the keys of a state to upstream's keys, and add the weights that only upstream has.
 
-    Weights of auxiliary heads are left out if the upstream architecture does not contain them.
-    Only training uses these.
+    Weights of auxiliary heads are left out if the upstream architecture does not contain them,
+    since only training uses them.
 
     Args:
         state: Weights by the keys of this project.
 
     Raises:
-        ValueError: If the key map of the state's architecture lacks the key of any other weight.
+        ValueError: If a weight outside of the auxiliary heads has no upstream key.
     """
     key_map = find_key_map(state)
     renamed: dict[str, Tensor] = {}
@@ -77,7 +79,8 @@ def upstream_from_ours(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
             "Without these weights the model would predict other maps, so it is not converted."
         )
     for key, constant in key_map.unused.items():
-        if constant is not None:
+        if constant is not None:  # None marks a key that only some upstream models have
+            # Some constants are expanded tensors, whose elements share memory.
             renamed[key] = constant.clone(memory_format=torch.contiguous_format)
     return renamed
 

@@ -53,5 +53,5 @@ def explain_errors(subject: object, remedy: str) -> Iterator[None]:
         elif not isinstance(error, (ValueError, OSError)) and not from_devkit:
             reason = f"{type(error).__name__}: {error}"
         reason = reason.rstrip(".")
-        advice = "" if reason.endswith(remedy) else f"; {remedy}"
+        advice = "" if reason.endswith(remedy) else f"; {remedy}"  # an inner context may have it
         raise InputError(f"{subject} cannot be used: {reason}{advice}.") from error

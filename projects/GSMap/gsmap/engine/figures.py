@@ -112,7 +112,9 @@ def keep_figures(hub: MessageHub, figures: Mapping[str, Any]) -> None:
     histories: list[LateHistory] = []
     values: list[Tensor] = []
     for name, value in figures.items():
-        if not isinstance(value, Tensor) or value.device.type == "cpu" or name not in scalars:
+        on_device = isinstance(value, Tensor) and value.device.type != "cpu"
+        # The first value of a scalar is not deferred, since mmengine then creates its history.
+        if not on_device or name not in scalars:
             hub.update_scalar(name, value)
             continue
         history = scalars[name]

@@ -84,6 +84,7 @@ def check_optimizer_state(state: Mapping[str, Any], optimizer: Optimizer, path: 
         ValueError: If a setting has another type than in the run, or if an entry is not finite,
             or has neither a single value nor the shape of its parameter.
     """
+    # Groups or parameters of another number are left to torch, which refuses them on loading.
     for group, run_group in zip(state["param_groups"], optimizer.param_groups, strict=False):
         for name in run_group.keys() & group.keys() - {"params"}:
             if not _is_compatible(group[name], reference=run_group[name]):
@@ -115,9 +116,9 @@ def _is_number(value: Any) -> bool:
 def _is_compatible(value: Any, reference: Any) -> bool:
     """Whether a value can replace a reference value of an optimizer.
 
-    A finite number can replace a number. A list can replace a list of equal length if each entry
-    can replace its entry. None, a text, a number or a tensor can replace None. Other values must
-    have the type of the reference.
+    A finite number can replace a number. A list can replace a list of equal length if each of its
+    entries can replace the entry at that position. None, a text, a number or a tensor can replace
+    None. Other values must have the type of the reference.
     """
     if isinstance(reference, list | tuple):
         if not isinstance(value, list | tuple) or len(value) != len(reference):

@@ -137,7 +137,7 @@ class MapRunner(Runner):
 
 
 def _divergence_advice(runner: Runner) -> str:
-    """Return advice after a divergence; ``--resume`` would keep the learning rate."""
+    """Return advice after a divergence: a new run, since ``--resume`` keeps the learning rate."""
     checkpoint = newest_checkpoint(runner.work_dir)
     if checkpoint:
         start = "from its last good checkpoint"
@@ -170,7 +170,8 @@ class RunSummaryHook(Hook):
             start = f"from {source}"
         device = next(model.parameters()).device
         threads = format_count(torch.get_num_threads(), noun="thread")
-        log_dir = getattr(runner, "log_dir", None) or runner._log_dir  # public in FlexibleRunner
+        # `FlexibleRunner` has only `log_dir`, and `Runner` of some versions only `_log_dir`.
+        log_dir = getattr(runner, "log_dir", None) or runner._log_dir
         lines = {
             "model": _describe_model(model),
             "start": start,
@@ -219,6 +220,8 @@ def _describe_data(runner: Runner) -> dict[str, str]:
         dataset = innermost(loader.dataset)
         file = getattr(dataset, "ann_file", type(dataset).__name__)
         lines[name] = f"{format_count(len(loader.dataset), noun='sample')} of {file}"
+    # `dataset` is now the validation set, or the training set without validation. Cameras and map
+    # are equal in both.
     if not hasattr(dataset, "sample"):
         return lines
     cameras = dataset.sample(0).cameras
@@ -248,7 +251,7 @@ def _missed_elements_warning(runner: Runner, model: Any) -> str | None:
     if not groups or not hasattr(innermost(runner.train_dataloader.dataset), "annotations"):
         return None
     counts = _element_counts(runner.train_dataloader)
-    queries = groups[0].num
+    queries = groups[0].num  # the first group predicts
     excess = np.maximum(counts - queries, 0)
     if not excess.any():
         return None

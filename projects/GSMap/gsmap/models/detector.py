@@ -58,10 +58,11 @@ class MapDetector(Base3DDetector):
             effect, for example the Gaussians of GSMap in a checkpoint of MapTR. Trainings accept
             them, all other commands only on request. All other weights must be present, with the
             names of this package or of the published model, and there must be no further ones.
-        autocast: ``"bfloat16"``: backbone, neck and encoders, with nearly all arithmetic, use
-            this type in training. Head, matching and losses run in float32, and no loss scale is
-            needed. A ResNet with fixed batch norms is computed as fused convolutions
-            (`FrozenNorms`). None: no autocast here; ``--amp`` then includes the head.
+        autocast: With ``"bfloat16"``, backbone, neck and encoders, which do nearly all of the
+            arithmetic, use this type in training. Head, matching and losses run in float32, and no
+            loss scale is needed. A ResNet with fixed batch norms is computed as fused convolutions
+            (`FrozenNorms`). With None, the detector does not use autocast; ``--amp`` then runs it
+            with the head included.
         compiled: Compile backbone, neck, encoders and head at the start of a training, which takes
             a minute or more. True, or a mode of ``torch.compile``; ``"reduce-overhead"`` also
             captures CUDA graphs.
@@ -178,7 +179,7 @@ class MapDetector(Base3DDetector):
         return _split_batch(feats, batch_size=len(imgs))
 
     def _fuses_frozen_norms(self, images: Tensor) -> bool:
-        """Whether the backbone runs as fused convolutions: in half precision, on a GPU."""
+        """Whether the backbone runs as fused convolutions: in half-precision training on a GPU."""
         trains_in_half = self.training and bool(self.autocast)
         if not (trains_in_half and images.is_cuda and self.channels_last):
             return False
@@ -204,7 +205,7 @@ class MapDetector(Base3DDetector):
 
     @contextmanager
     def _training_autocast(self) -> Iterator[bool]:
-        """Context manager of ``autocast`` in training, with whether it is in effect."""
+        """Context manager of ``autocast`` in training; yields whether it is in effect."""
         if not (self.training and self.autocast):
             yield False
             return
@@ -285,7 +286,7 @@ class MapDetector(Base3DDetector):
         return scalars
 
     def _losses(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
-        """Losses of the head by name, as scalars or with one value for each of their elements."""
+        """Losses of the head by name. A loss that is not a scalar is to be averaged."""
         if self.step_graphs is not None:
             imgs = self.augment_images(batch_inputs["imgs"])
             metas = [sample.metainfo for sample in batch_data_samples]

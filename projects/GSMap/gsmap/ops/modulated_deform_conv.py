@@ -47,13 +47,13 @@ def modulated_deform_conv(
     tap_rows = torch.arange(weight.shape[2], device=images.device)
     tap_cols = torch.arange(weight.shape[3], device=images.device)
     taps = torch.meshgrid(tap_rows, tap_cols, indexing="ij")
-    coordinates = []  # of the rows, then of the columns
-    shapes = ((-1, 1), (1, -1))  # of `starts` along rows and along columns, for broadcasting
+    coordinates = []  # the row coordinates of the samples, then their column coordinates
+    shapes = ((-1, 1), (1, -1))  # the row starts as (h, 1), and the column starts as (1, w)
     for axis, (shift, tap) in enumerate(zip(shifts, taps, strict=True)):
         starts = torch.arange(out_size[axis], device=images.device) * stride[axis]
         starts = (starts - padding[axis]).view(shapes[axis])
         pixels = shift + starts + tap.reshape(-1, 1, 1) * dilation[axis]  # (B, G, K, h, w)
-        # [-1, 1] over the image, whose first pixel has its centre at (2 * 0 + 1) / size - 1.
+        # `grid_sample` takes [-1, 1] over the image, with pixel i centred at (2 i + 1) / size - 1.
         coordinates.append((2 * pixels + 1) / size[axis] - 1)
     rows, cols = coordinates
     locations = torch.stack([cols, rows], dim=-1).flatten(0, 1).flatten(1, 2)  # (B G, K h, w, 2)

@@ -17,7 +17,8 @@ class GaussianRule:
         least_sigma_m: Smallest standard deviation of a Gaussian across its line, in [0.001, 1]
             metres, which covers the errors that all frames share.
         line_sigma_m: Standard deviation of a drawn line across its direction, in [0.05, 2] metres.
-        decay: Factor of older counts and of older information at each view, in [0.5, 1].
+        decay: Factor of the older hits and misses, and of the inverse older variances, each time
+            that a frame has the Gaussian in view, in [0.5, 1].
         prior_count: Pseudo-count of misses, in [0.01, 100].
         least_value: Smallest value of a drawn Gaussian, in [0, 1]; the value is hits / (hits +
             misses + ``prior_count``).

@@ -19,8 +19,9 @@ def calibration_of(meta: Mapping[str, Any]) -> dict[str, Any]:
         meta: Metadata of the checkpoint or the result file; untrusted.
 
     Returns:
-        ``law``, the distribution of the errors, and ``sigmas``, the half width of the interval in
-        standard deviations; empty if there is no calibration.
+        ``law``, the distribution of the errors, and ``sigmas``, the half width, in standard
+        deviations, of the interval of errors to which the Gaussians were fitted. Empty if there is
+        no calibration.
 
     Raises:
         ValueError: If the law is unknown, or ``sigmas`` is not a number in (0, 3].

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from gsmap.utils.errors import InputError
 
 _NUMBER_WORDS = ("auto", "cores", "dynamic")  # texts that some settings take in place of a number
-_SEARCHED_FRAMES = 10  # frames from the one that raises an error
+_SEARCHED_FRAMES = 10  # number of frames that are searched, from the one that raises the error
 # Last parts of the names that are not searched, because other options of commands set these values.
 _UNSUSPECTED = ("data_root", "image_scale")
 
@@ -77,7 +77,8 @@ def _wanted_kind(old_value: Any, value: Any) -> str | None:
     if isinstance(old_value, bool) and isinstance(value, str | list | tuple | dict):
         return "True or False"
     if _holds_sections(old_value):
-        return None if _is_section(value) or _holds_sections(value) else "dict(...) or a list of it"
+        fits = _is_section(value) or _holds_sections(value)
+        return None if fits else "dict(...) or a list of it"
     if isinstance(old_value, list | tuple) and isinstance(value, str):
         return f"a list, such as [{value}]"
     return None
@@ -183,6 +184,7 @@ def _has_value(scope: Mapping[str, Any], key: str, value: Any) -> bool:
     """Whether a scope has a value under a name, with or without a leading underscore."""
     for name in (key, f"_{key}"):
         found = scope.get(name)
+        # A part may convert a list of the config to a tuple.
         same_kind = type(found) is type(value) or isinstance(found, list | tuple | dict)
         if same_kind and repr(_plain(found)) == repr(_plain(value)):
             return True

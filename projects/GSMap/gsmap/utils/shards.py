@@ -96,7 +96,9 @@ class Shard:
     def write_manifest(
         self, target: Path, kind: str, source: str, options: Mapping[str, Any], samples: int
     ) -> None:
-        """Write the manifest of this shard's complete file; does nothing for `WHOLE`.
+        """Write the manifest of this shard, whose file must be finished.
+
+        For `WHOLE`, nothing is written.
 
         Args:
             target: Path of the complete file.
@@ -149,14 +151,20 @@ def add_shard_options(parser: argparse.ArgumentParser) -> None:
         help="do part I of N, I from 0 to N - 1; tools/merge.py joins the parts",
     )
     group.add_argument("--executor", choices=("ray",), help="make all --shards on a Ray cluster")
-    group.add_argument("--shards", type=int, default=16, help="how many (default: %(default)s)")
+    group.add_argument(
+        "--shards",
+        type=int,
+        default=16,
+        help="number of shards with --executor (default: %(default)s)",
+    )
     group.add_argument(
         "--per-shard",
         nargs="+",
         type=_parse_amount,
         default=[],
         metavar="NAME=AMOUNT",
-        help="resources of each in Ray, such as num_cpus=4 num_gpus=1 (default: num_cpus=1)",
+        help="resources that Ray reserves for each shard, such as num_cpus=4 num_gpus=1 "
+        "(default: num_cpus=1)",
     )
 
 
@@ -231,8 +239,9 @@ def read_shard(path: Path) -> ShardFile:
         raise InputError(f"{path} is missing or does not fit its manifest: make it again.")
     if path != named_path:
         raise InputError(
-            f"{path} is another shard by its manifest: {shard.index} of {shard.count} of "
-            f"{manifest['target']}; remove it, and make the right one."
+            f"{path} has the name of another shard than its manifest, which names shard "
+            f"{shard.index} of {shard.count} of {manifest['target']}: remove it, and make the "
+            "right shard."
         )
     return ShardFile(path=path, manifest=manifest)
 
@@ -261,8 +270,8 @@ def find_shards(target: Path) -> list[ShardFile]:
         differences = _differences(first=first.manifest, other=other.manifest)
         if differences:
             raise InputError(
-                f"{first.path} and {other.path} are shards of different work, by {differences}: "
-                "make the wrong ones again."
+                f"{first.path} and {other.path} are shards of different work, which differs in "
+                f"{differences}: make the wrong ones again."
             )
     count = first.manifest["of"]
     indices = {shard.manifest["shard"] for shard in shards}

@@ -265,14 +265,14 @@ class MapVisualizer(Visualizer):
         config = ChamferConfig(tuple(self.style.classes), (self.match_m,))
         matches = match_chamfer(predictions, truth, config)
         hits = np.full(len(predictions), -1)
-        hits[matches.pred_index] = matches.matched_gt[:, 0]
+        hits[matches.pred_index] = matches.matched_gt[:, 0]  # at the only threshold
         return hits
 
     def _render_masks(self, elements: MapElements) -> np.ndarray:
         """Render the Gaussians of each element to occupancy in [0, 1] (GSMap Eq. 6). (N, H, W)"""
         tensors = []
         for values in (elements.points[:, :2], elements.scales, elements.rotations):
-            flat = torch.as_tensor(values, dtype=torch.float32)  # of the vertices of all elements
+            flat = torch.as_tensor(values, dtype=torch.float32)  # (N * P, 2) or (N * P,)
             tensors.append(flat.unflatten(0, (len(elements), -1)))  # (N, P, 2) or (N, P)
         means, scales, rotations = tensors
         with torch.no_grad():

@@ -87,9 +87,9 @@ def convert_argoverse2(options: Argoverse2Options) -> ConversionSummary:
             _add_problems(summary, log_dir.name, result=result)
         if not len(writer) and not options.shard.count:
             raise WorkError(f"no sample is left for {target}:\n{summary.text()}")
-    note = f"LiDAR sweep named by {len(offsets_ns)} of {len(writer)} samples"
+    note = f"{len(offsets_ns)} of {len(writer)} samples have a LiDAR sweep"
     if offsets_ns:
-        note += f", at most {max(offsets_ns) / 1e6:.0f} ms away"
+        note += f", at most {max(offsets_ns) / 1e6:.0f} ms before or after the sample"
     summary.notes.append(note)
     summary.notes.append(f"written to {writer.path}")
     return summary
@@ -128,7 +128,7 @@ def _listed_logs(
             log_dirs.append(log_by_name[name])
     if not log_dirs:
         raise FileNotFoundError(
-            f"no log of split {split_list.name!r} as asked for in {options.root}."
+            f"{options.root} has none of the requested logs of split {split_list.name!r}."
         )
     return log_dirs
 
@@ -175,7 +175,7 @@ def _add_problems(summary: ConversionSummary, log_id: str, result: LogSamples) -
         for number in numbers:
             summary.add_problem(reason.rstrip("."), f"{number} of {log_id}")
     for kind, count in result.invalid.items():
-        reason = f"invalid polygon among the {kind} takes no part"
+        reason = f"invalid polygon among the {kind} left out"
         summary.add_problem(reason, log_id, count=count)
 
 
@@ -251,7 +251,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--thin-over", default="log", choices=THIN_OVER,
         help="what --rate thins out: each log alone, or the samples of all logs sorted by time, "
-        "as the published systems validate (default: %(default)s)",
+        "as the published systems choose their validation samples (default: %(default)s)",
     )  # fmt: skip
     add("--dim", type=int, default=2, choices=(2, 3), help="coordinates per point")
     add(

@@ -79,8 +79,8 @@ def _possible_duplicates(bounds: np.ndarray, area: np.ndarray) -> tuple[np.ndarr
         area: Area of each strip in square metres. (n,)
 
     Returns:
-        Index of the first and of the second strip of each pair, the first one smaller and
-        ascending. Each (pairs,).
+        Index of the first and of the second strip of each pair. The first index is the smaller
+        one, and the pairs are sorted by it. Each (pairs,).
     """
     low = np.maximum(bounds[:, None, :2], bounds[None, :, :2])
     high = np.minimum(bounds[:, None, 2:], bounds[None, :, 2:])

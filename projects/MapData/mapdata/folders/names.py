@@ -8,7 +8,9 @@ from mapdata.unix_times import unix_time_ns
 
 # The last digits of a name, as a whole number of 10, 13, 16 or 19 digits, and a fraction.
 _TIME = re.compile(r"(?:^|\D)(\d{10}(?:\d{3}|\d{6}|\d{9})?)(?:\.(\d{1,9}))?$")
-_DATE = re.compile(  # 2023100512, with minutes, with seconds and their fractions
+# Year, month, day and hour, such as 2023100512. They may be followed by the minutes, and these by
+# the seconds with the digits of their fraction.
+_DATE = re.compile(
     r"20\d\d(0[1-9]|1[0-2])(0[1-9]|[12]\d|3[01])([01]\d|2[0-3])([0-5]\d([0-5]\d*)?)?"
 )
 

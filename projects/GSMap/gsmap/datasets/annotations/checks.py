@@ -16,7 +16,7 @@ from gsmap.utils.errors import InputError
 _OPTIONAL = {"lidar", "can_bus", "instances", "ego_from_frame"}
 # Words before the names of fields in messages.
 _PREFIXES = {"cameras[]": "camera's ", "lidar": "LiDAR ", "sweeps[]": "sweep's "}
-# Paths that are not relative, lead out of the data root or have other separators.
+# Paths that are empty or absolute, have backslashes or control characters, or have a part "..".
 _OUTSIDE = r"^$|^/|[\\\x00-\x1f]|(^|/)\.\.(/|$)"
 
 
@@ -57,7 +57,7 @@ class _BatchChecker:
         Args:
             array: Array of a column or a field.
             name: Name of the column or field; with ``[]`` for items of a list.
-            rows: Number of the sample of each item. (items,)
+            rows: Index, in the batch, of the sample of each item. (items,)
             where: Beginning of messages.
 
         Raises:
@@ -93,7 +93,7 @@ class _BatchChecker:
 
         Args:
             is_good: Result of the check of each item. (items,)
-            rows: Number of the sample of each item. (items,)
+            rows: Index, in the batch, of the sample of each item. (items,)
             problem: Message about the first wrong item.
 
         Raises:
@@ -130,6 +130,7 @@ def _are_inside(paths: pa.StringArray, *_: object) -> np.ndarray:
     letters = np.frombuffer(text, dtype=np.uint8)
     are_plain = b".." not in text and b"\\" not in text and (letters >= ord(" ")).all()
     are_filled = (np.diff(bounds) > 0).all()
+    # The first letter of path i is letters[bounds[i]].
     if are_plain and are_filled and (letters[bounds[:-1]] != ord("/")).all():
         return np.ones(len(paths), dtype=bool)
     return ~pc.match_substring_regex(paths, _OUTSIDE).to_numpy(zero_copy_only=False)
@@ -218,6 +219,6 @@ _RULES: dict[str, tuple[Callable[..., np.ndarray], str]] = {
 }
 """Test of the items of each field, and message about the first wrong item.
 
-Tests get the array, the number of the sample of each item and the metadata. In messages, {0} is the
+Tests get the array, the index of the sample of each item and the metadata. In messages, {0} is the
 item and {1} is the metadata.
 """

@@ -184,7 +184,7 @@ class ScaleImages(BaseTransform):
         return results
 
     def output_size(self, width: int, height: int) -> tuple[int, int]:
-        """Return (width, height) after the transform, for images of any size. In pixels."""
+        """Return width and height after the transform for images of a given size, in pixels."""
         if self.size is not None:
             return self.size
         return _scaled_size((width, height), cast(float, self.scale))

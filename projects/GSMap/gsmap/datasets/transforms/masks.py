@@ -160,9 +160,9 @@ class MakePVMask(BaseTransform):
             without heights.
         thickness_px: Width of the lines in feature pixels.
         num_classes: Number of channels, one for each class; None for one channel with all classes.
-        heights: Whether two-dimensional elements have the heights in the annotation file, as
-            published for Argoverse 2. If the file has no heights, ``ground_z_m`` is used and a
-            message is logged.
+        heights: Whether two-dimensional elements take their heights from the annotation file, as
+            the published systems do for Argoverse 2. If the file has no heights, ``ground_z_m`` is
+            used and a message is logged.
 
     Raises:
         ValueError: If a number is not positive.
@@ -250,7 +250,10 @@ def channel_of(instance: MapInstance, num_classes: int | None) -> int:
     if num_classes is None:
         return 0
     if not 0 <= instance.label < num_classes:
-        raise InputError(f"label {instance.label} of an element, but num_classes={num_classes}.")
+        raise InputError(
+            f"label {instance.label} of an element is not in [0, {num_classes}), the range for "
+            f"num_classes={num_classes}."
+        )
     return instance.label
 
 

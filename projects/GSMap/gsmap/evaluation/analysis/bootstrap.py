@@ -223,7 +223,7 @@ def resampled_figures(report: MetricReport, resamples: Weights) -> dict[str, Flo
 
     Args:
         report: Report of the metric over all samples.
-        resamples: Resamples of the samples, B in number.
+        resamples: The B resamples.
 
     Returns:
         AP by its flat key, NaN where it does not exist (B,); empty for a metric that ranks no

@@ -17,9 +17,9 @@ KINDS = ("removed", "added", "moved")
 STEP_M = 0.5
 """Distance of the points at which changes are compared."""
 _FARTHEST_M = 1e7  # largest coordinate
-_LONGEST_M = 1e6  # largest length of all changes of a file together
+_LONGEST_M = 1e6  # largest sum of the lengths of all changes of a file
 _LONGEST_NAME = 80  # letters
-_ABSENT = "absent"
+_ABSENT = "absent"  # stands for the value of a key that the file does not contain
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,9 @@ def read_changes(path: str | Path) -> list[MapChange]:
     """Read the changes of ``build_map --changes`` or of MiniCity.
 
     A feature is a line, or a polygon whose outer ring is used. Its properties are ``change`` (one
-    of `KINDS`), ``class`` and, if they are known, ``map``, ``confidence`` and the ``old`` vertices.
+    of `KINDS`) and ``class``. If they are known, it also has ``map``, ``confidence``, the ``old``
+    vertices, ``moved_m`` and ``moved_std_m``. The numbers of drives of `MapChange.passes` are
+    ``passes_not_seen`` (of a removed element) or ``passes_seen``, and ``passes_in_view``.
 
     Args:
         path: File, which may be untrusted. Coordinates are metres of the global frame
@@ -70,7 +72,7 @@ def read_changes(path: str | Path) -> list[MapChange]:
         ValueError: If the file is malformed, or a value is out of range.
     """
     path = Path(path)
-    members: dict[str, Any] = {"crs": _ABSENT}
+    members: dict[str, Any] = {"crs": _ABSENT}  # `items_of` fills in the value of the file
     advice = "give a GeoJSON file of changes (build_map.py --changes, or MiniCity's)"
     changes = []
     total_m = 0.0
@@ -110,6 +112,8 @@ def _read_feature(feature: Any) -> MapChange:
     old_points = None
     if kind == "moved" and "old" in properties:
         old_points = _read_points(properties["old"])
+    # Drives confirm that an element is removed if they do not see it.
+    count_key = "passes_not_seen" if kind == "removed" else "passes_seen"
     return MapChange(
         kind=kind,
         class_name=_read_name(properties, "class"),
@@ -119,7 +123,7 @@ def _read_feature(feature: Any) -> MapChange:
         confidence=float(confidence),
         moved_m=_read_amount(properties, "moved_m"),
         moved_std_m=_read_amount(properties, "moved_std_m"),
-        passes=_read_passes(properties, "passes_not_seen" if kind == "removed" else "passes_seen"),
+        passes=_read_passes(properties, count_key),
     )
 
 
@@ -128,13 +132,13 @@ def _read_amount(properties: Mapping[str, Any], key: str) -> float | None:
     value = properties.get(key)
     if value is None:
         return None
-    if not _is_coordinate(value) or value < 0:
+    if not _is_in_range(value) or value < 0:
         raise InputError(f"`{key}` must be a number of at least 0, got {value!r:.60}")
     return float(value)
 
 
 def _read_passes(properties: Mapping[str, Any], key: str) -> tuple[int, int] | None:
-    """Read a number of drives, and the number of drives in view; None if one is missing."""
+    """Read both numbers of `MapChange.passes`, the first from ``key``; None if one is missing."""
     count = _read_amount(properties, key)
     in_view = _read_amount(properties, "passes_in_view")
     if count is None or in_view is None:
@@ -174,7 +178,7 @@ def _read_points(positions: Any) -> FloatArray:
     for position in positions:
         if not isinstance(position, list) or len(position) < 2:
             raise InputError("a position has fewer than two coordinates")
-        if not _is_coordinate(position[0]) or not _is_coordinate(position[1]):
+        if not _is_in_range(position[0]) or not _is_in_range(position[1]):
             raise InputError(
                 f"coordinates must be metres within {_FARTHEST_M:g} m, got {position!r:.60}"
             )
@@ -187,6 +191,6 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def _is_coordinate(value: Any) -> bool:
-    """Whether a value is a finite number of metres in range."""
+def _is_in_range(value: Any) -> bool:
+    """Whether a value is a finite number between -1e7 and 1e7."""
     return _is_number(value) and abs(value) <= _FARTHEST_M  # false for NaN

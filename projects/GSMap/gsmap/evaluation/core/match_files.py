@@ -29,7 +29,7 @@ def require_own_matches(target: Path, shard: Shard) -> None:
 
     Args:
         target: File for the figures of all shards; it determines the path of the shard.
-        shard: Number of the shard and of all shards.
+        shard: Index of the shard, and number of shards.
 
     Raises:
         ValueError: If another program's file has the name of the shard or of its manifest.
@@ -50,8 +50,8 @@ def write_matches(
 
     Args:
         target: File for the figures of all shards; it determines the path of the shard.
-        shard: Number of the shard and of all shards.
-        matches: Records of each sample of the shard.
+        shard: Index of the shard, and number of shards.
+        matches: Records of each sample of the shard, by name of the metric.
         notes: Notes for the user.
         evaluator: Evaluator, as `MapEvaluator.from_names` creates it from ``settings``.
         settings: Settings of the metrics.
@@ -124,8 +124,8 @@ def report_shards(shards: Sequence[ShardFile]) -> tuple[list[MetricReport], list
                 matches += _split_samples(arrays, evaluator)
         except (*_FAULTS, *DAMAGED_ZIP) as error:
             raise InputError(
-                f"{shard.path} holds no matches by the rules of its manifest ({error!r}): make "
-                "that shard again."
+                f"the matches in {shard.path} do not fit the rules of its manifest ({error!r}): "
+                "make that shard again."
             ) from error
     return evaluator.reports(matches), list(dict.fromkeys(notes))
 
@@ -136,7 +136,7 @@ def _split_samples(arrays: Arrays, evaluator: MapEvaluator) -> list[SampleMatche
     for name in arrays:
         if name.endswith(_TOKENS):
             metrics.add(name.removesuffix(_TOKENS))
-    empty = evaluator.match_empty()
+    empty = evaluator.match_empty()  # a record of each metric, with the names of its arrays
     if metrics != empty.keys():
         raise InputError(f"it has matches of {sorted(metrics)}, not of {sorted(empty)}")
     columns = []

@@ -50,7 +50,7 @@ def sample_line(line: FloatArray) -> FloatArray:
     along = arc_lengths(line)
     length_m = along[-1]
     step_m = max(_STEP_M, length_m / _MOST_STEPS)
-    stop = max(length_m, np.finfo(float).tiny)
+    stop = max(length_m, np.finfo(float).tiny)  # > 0, so that a line of length 0 has its start
     positions = np.append(np.arange(0.0, stop, step=step_m), length_m)
     return np.stack([np.interp(positions, along, column) for column in line.T], axis=-1)
 
@@ -146,7 +146,8 @@ def sospa(first: FloatArray, second: FloatArray, cutoffs_m: Sequence[float]) -> 
         if distances.min() < cutoff:
             gap_cost = cutoff / 2
             sums = np.array(_align_lines(distances, gap_cost, num_starts))  # C, distances of pairs
-            figures[row] = 2 * sums / (gap_cost * sum(distances.shape) + sums[0])
+            without_pairs = gap_cost * sum(distances.shape)  # G: the shape is (m, n)
+            figures[row] = 2 * sums / (without_pairs + sums[0])
     return figures
 
 
@@ -163,8 +164,8 @@ def _pair_sums(
 ) -> FloatArray:
     """Sum r (1 - s), and r times the localisation part, over the best pairs of one class.
 
-    A pair of score r and SOSPA distance s costs r s + (1 - r) / 2 (`PLD`), and its elements without
-    partners r / 2 + 1 / 2. The difference, r (1 - s), is the gain of the pair.
+    A pair of score r and SOSPA distance s costs r s + (1 - r) / 2 (`PLD`). Without partners, its
+    two elements would cost r / 2 and 1 / 2. The difference, r (1 - s), is the gain of the pair.
 
     Args:
         preds: Points of each prediction. n x (m, 2)

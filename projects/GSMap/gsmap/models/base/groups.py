@@ -1,4 +1,4 @@
-"""Groups of instance queries that are matched together."""
+"""Groups of instance queries. Each group is matched to the ground truth separately."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from gsmap.utils.errors import InputError
 
 @dataclass(frozen=True)
 class QueryGroup:
-    """Settings of a group of instance queries that are matched together.
+    """Settings of a group of instance queries, which is matched to the ground truth separately.
 
     Queries of different groups do not attend to each other.
 

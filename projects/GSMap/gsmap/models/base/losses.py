@@ -13,10 +13,10 @@ from gsmap.utils.targets import NeedsTargets
 
 
 class MapLoss(nn.Module, NeedsTargets):
-    """Loss of matched pairs: the weighted sum of `values`, divided by the number of pairs.
+    """Loss of matched pairs: the weighted sum of `values`, divided by ``pairs.avg_factor``.
 
-    A subclass overrides `values` for a sum over pairs, or `forward` for any other loss. The pairs
-    of all decoder layers are processed together.
+    A subclass overrides `values` for a sum over pairs, or `forward` for any other loss. In the
+    first case, the pairs of all decoder layers are processed at once.
 
     Args:
         loss_weight: Weight of the loss, or a weight for each class, applied to the pairs of the
@@ -28,8 +28,9 @@ class MapLoss(nn.Module, NeedsTargets):
         name: Name of the loss, unique in a head. It is logged as ``loss_<name>``.
 
     Raises:
-        TypeError: If a subclass sets a flag as a class attribute, where a misspelt name would have
-            no effect; or if a loss that is not a sum over pairs has a weight for each class.
+        TypeError: If a subclass has a bool as a class attribute: flags are passed to the
+            constructor, which refuses misspelt names. Also if a loss that is not a sum over pairs
+            has a weight for each class.
     """
 
     name: str
@@ -76,6 +77,7 @@ class MapLoss(nn.Module, NeedsTargets):
 
     def forward(self, pairs: MatchedPairs) -> Tensor:
         """Weighted loss of one layer. Without pairs, it is 0 with a gradient of 0. ()"""
+        # A subclass that overrides this method is called the other way round, by `by_layer`.
         (loss,) = self.by_layer(pairs)
         return loss
 
@@ -97,5 +99,6 @@ class MapLoss(nn.Module, NeedsTargets):
             weights = class_weights(self.loss_weight, pairs.gt_labels)
             # The axis of the pairs goes last, where the weights (M,) are broadcast, and back.
             values = (weights * values.movedim(0, -1)).movedim(-1, 0)
-        sums = pairs.by_layer(values).flatten(1).sum(1) / pairs.avg_factor
+        layer_values = pairs.by_layer(values)  # (L, M / L, ...)
+        sums = layer_values.flatten(1).sum(1) / pairs.avg_factor
         return sums if has_class_weights else self.loss_weight * sums

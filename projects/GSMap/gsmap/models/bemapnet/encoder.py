@@ -119,6 +119,8 @@ class BezierBEVEncoder(CameraEncoder):
         ignored = ~on_ground & on_ground.any(dim=-1, keepdim=True)  # (B, S)
         for layer in self.source_layers:
             sources = layer(sources, source_pos, key_padding_mask=ignored)
+        # BEV cells are in the order of line heads, as in the released code: row 0 is at the front.
+        # `turn_raster` converts the outputs to the order of `grid`.
         shape = front_size(self.grid)
         cells_yx = centres([shape], feats.device).flip(-1)  # (H * W, 2), row first, in [0, 1]
         cell_centres = self.grid.metres_from_front(cells_yx)

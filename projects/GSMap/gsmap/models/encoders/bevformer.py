@@ -31,7 +31,9 @@ class SpatialCrossAttention(SamplingAttention):
         ValueError: If ``num_points`` is not a multiple of ``num_heights``.
     """
 
-    fixed_sizes = False  # whether invisible pairs of cell and camera are computed, with weight 0
+    # Whether invisible pairs of cell and camera are computed, too, with weight 0. `StepGraphs` sets
+    # it, since the sizes of tensors in a CUDA graph are fixed.
+    fixed_sizes = False
 
     def __init__(
         self,
@@ -64,6 +66,7 @@ class SpatialCrossAttention(SamplingAttention):
         levels = [img_feats] if isinstance(img_feats, Tensor) else list(img_feats)
         offsets = self.offsets_in_cells(query).chunk(self.num_parts, 3)  # (B, Q, heads, S, 2)
         weights = self.weights(query).chunk(self.num_parts, 3)
+        # `self.num_points` counts the samples of all levels, S * num_parts.
         repeats = self.num_points // (self.num_parts * self.num_heights)
         summed = query.new_zeros(query.shape, dtype=torch.float32)
         cells = [] if self.fixed_sizes else _visible_cells(projection.visible)

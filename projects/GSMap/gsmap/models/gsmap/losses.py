@@ -23,8 +23,8 @@ class MaskLoss(MapLoss):
 
     Args:
         loss_weight: Weight of the loss, or a weight for each class.
-        full_iou: Soft IoU from which a pair has the full loss, or one for each class. Below it, the
-            loss is multiplied by IoU / full_iou. With 0, all pairs have the full loss.
+        full_iou: Smallest soft IoU at which a pair has the full loss, or one for each class. Below
+            it, the loss is multiplied by IoU / full_iou. With 0, all pairs have the full loss.
         flags: Flags of `MapLoss`.
     """
 
@@ -37,7 +37,7 @@ class MaskLoss(MapLoss):
         self.full_iou = full_iou
 
     def check(self, head: BuiltHead) -> None:
-        """Raise ValueError if the head has no Gaussians, or ``full_iou`` other classes."""
+        """Raise ValueError if the head lacks Gaussians or ``full_iou`` does not fit its classes."""
         require_gaussians(self, head)
         check_weight(self, self.full_iou, classes=head.classes)
 

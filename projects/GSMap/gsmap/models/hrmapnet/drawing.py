@@ -30,7 +30,8 @@ def draw_elements(
         classes: Names of the classes.
         areas: Names of the classes whose elements are filled.
         softness: Softness in squared pixels, > 0.
-        released_pixels: Sample each pixel at its lower corner, as the release does.
+        released_pixels: Sample each pixel at its lower corner, as the released code of HRMapNet
+            does, and not at its centre.
 
     Returns:
         Values in [0, 1]. (classes, H, W)
@@ -38,7 +39,9 @@ def draw_elements(
     raster = points_m.new_zeros((len(classes), grid.height, grid.width))
     vertices = grid.px_from_metres(points_m)
     if not released_pixels:
-        vertices = vertices - 0.5  # `soft_rasters` samples pixel (row, col) at (col, row)
+        # `soft_rasters` samples pixel (row, col) at (col, row), its lower corner. The shift by half
+        # a pixel makes it sample the centre.
+        vertices = vertices - 0.5
     for label, name in enumerate(classes):
         lines = vertices[labels == label]
         if not len(lines):

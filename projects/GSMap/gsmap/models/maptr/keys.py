@@ -1,6 +1,7 @@
 """State keys of the released MapTR and their names here, with rules that other models use.
 
-The texts in `rules_of` are pairs ``released=here`` of the rest of the keys, or one name for both.
+The first two arguments of `rules_of` are the prefixes of keys in the release and here. The text
+lists the rest of each key, as ``released=here`` or as one name that both have.
 """
 
 import torch

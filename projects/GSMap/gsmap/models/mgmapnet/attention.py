@@ -213,8 +213,8 @@ class MultiGranularityAttention(PerPointSampling):
     Args:
         embed_dims: Channels C.
         ffn_dims: Hidden channels of the interactions.
-        add_instance: Whether the aggregated instance query is added to its points before they
-            attend to instance queries.
+        add_instance: Whether the aggregated instance query, the weighted sum of its samples, is
+            added to its points before they attend to instance queries.
         p2p: Whether the points of an instance attend to each other and to their states of the
             previous layer (point to point).
         p2i: Whether points attend to the aggregated instance queries of the sample (point to

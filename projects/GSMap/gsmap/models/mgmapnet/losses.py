@@ -102,7 +102,8 @@ class InstanceMaskLoss(MapLoss):
             masks = torch.cat(sorted_masks)
         if masks.shape != logits.shape and len(masks):
             masks = F.interpolate(masks[:, None], size=logits.shape[-2:], mode="area")[:, 0]
-        masks = masks.reshape(logits.shape)  # without a match, an empty tensor of another size
+        # Without a match, `masks` is empty and was not resized.
+        masks = masks.reshape(logits.shape)
         cross_entropy, dice = instance_mask_losses(logits, masks, avg_factor=pairs.avg_factor)
         return self.loss_weight * cross_entropy + self.dice_weight * dice
 

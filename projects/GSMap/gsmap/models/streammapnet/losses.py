@@ -15,7 +15,7 @@ from gsmap.structures.tensors import check_same_shape
 
 @MODELS.register_module()
 class SmoothPointsLoss(MapLoss):
-    """Smooth L1 distance of the points of matched pairs, divided by their number (StreamMapNet).
+    """Smooth L1 distance of matched pairs, averaged over the P points of a pair (StreamMapNet).
 
     Args:
         loss_weight: Weight of the loss.

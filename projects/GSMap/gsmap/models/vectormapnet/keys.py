@@ -1,6 +1,7 @@
 """Mapping between the state keys of the released VectorMapNet and of this project.
 
-The texts in `rules_of` are pairs ``released=here`` of the rest of the keys, or one name for both.
+The first two arguments of `rules_of` are the prefixes of keys in the release and here. The text
+lists the rest of each key, as ``released=here`` or as one name that both have.
 `zeros` lists keys of the release that have no effect there, and no counterpart here.
 """
 

@@ -3,10 +3,11 @@
 r"""Triton kernels: masks of 2D Gaussians, one program per tile of an instance.
 
 The raster of an instance is cut into tiles of TILE x TILE pixels. A program keeps the pixels of one
-tile in registers and loops over the P Gaussians of the instance. Outside of the bounding box of a
-Gaussian, its density is below 1e-8 (``CUT`` in ``reference.py``), at more than sqrt(SQUARED_REACH)
-standard deviations from the mean. If the box misses the tile, a scalar branch skips the Gaussian. A
-NaN Gaussian is never skipped, so the mask becomes NaN.
+tile in registers and loops over the P Gaussians of the instance. At more than sqrt(SQUARED_REACH)
+standard deviations from the mean, the density of a Gaussian is below 1e-8 (``CUT`` in
+``reference.py``). The bounding box of the Gaussian encloses the points that are nearer to the mean.
+If the box misses the tile, a scalar branch skips the Gaussian. A NaN Gaussian is never skipped, so
+the mask becomes NaN.
 
 A pixel at the offset (dx, dy) from the mean has the coordinates u = (c dx + s dy) / sigma_u and
 v = (c dy - s dx) / sigma_v along the axes of the Gaussian, with the cosine c and the sine s of its
@@ -60,7 +61,10 @@ def _tile_pixels(tile, x_min, y_min, step_x, step_y, height, width, TILE: tl.con
 
 @triton.jit
 def _touches(gaussian, left, right, low, high):
-    """Whether the bounding box of a Gaussian meets a tile; true for NaN."""
+    """Whether the bounding box of a Gaussian meets a tile; true for NaN.
+
+    ``gaussian`` points to the 8 parameters of `_prepare`, also in the functions below.
+    """
     mean_x = tl.load(gaussian)
     mean_y = tl.load(gaussian + 1)
     half_x = tl.load(gaussian + 6)

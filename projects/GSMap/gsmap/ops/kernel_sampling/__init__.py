@@ -12,7 +12,7 @@ _sample_kernels = fused_operator(
     "Tensor value, Tensor uv, Tensor weights, Tensor visible_cells, Tensor offsets, int height, "
     "int width, bool bilinear",
     lambda value, uv, weights, *_: (*weights.shape[:3], value.shape[4]),  # (B, Q, heads, C)
-    differentiable=3,
+    differentiable=3,  # the first three tensors have gradients
     dtype=torch.float32,
 )
 
@@ -51,8 +51,8 @@ def sample_kernels(
         bilinear: Interpolate between pixels, with zeros outside of the map, instead of rounding to
             the nearest pixel of the map.
         backend: ``"reference"``, ``"triton"`` or ``"auto"``. ``"triton"`` has one kernel for the
-            forward pass, and one for the backward pass. The latter adds the gradient of the maps in
-            any order.
+            forward pass, and one for the backward pass. The latter adds the gradients of the maps
+            in an order that varies, so repeated runs differ by rounding.
 
     Returns:
         Sums, differentiable in ``value``, ``weights`` and, if bilinear, ``uv``. They have the wider

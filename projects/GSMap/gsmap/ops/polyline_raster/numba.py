@@ -65,10 +65,10 @@ def _visit_edge(start, end, index, frame, reach, eps, columns, distances, edge_i
         stop = max(left, right)  # without a pixel in reach, `right` may be less than `left`
         nearest = distances[row, left:stop]
         row_indices = edge_indices[row, left:stop]
-        first = np.float32(x_min + (left + 0.5) * step_x - x0)
+        first_x = np.float32(x_min + (left + 0.5) * step_x - x0)
         fy = np.float32(offset_y)
         for k in range(len(nearest)):
-            fx = first + columns[k] * pixel_width
+            fx = first_x + columns[k] * pixel_width
             t = min(max(fx * along_x + fy * along_y, np.float32(0)), np.float32(1))
             dx = fx - t * ex
             dy = fy - t * ey

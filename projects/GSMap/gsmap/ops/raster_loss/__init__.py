@@ -19,8 +19,8 @@ _EPS = 1e-6
 _raster_loss_sums = fused_operator(
     "raster_loss.raster_loss_sums",
     "Tensor preds, Tensor targets, Tensor window, float weight",
-    lambda preds, *_: (len(preds), 7),
-    differentiable=1,
+    lambda preds, *_: (len(preds), 7),  # seven sums per mask
+    differentiable=1,  # the first tensor has a gradient
 )
 
 
@@ -101,16 +101,19 @@ def raster_loss(
                 )
                 parts.append(part)
             sums = torch.cat(parts)
+        # With w as above, `predicted` is the sum of w R, `foreground` the sum of w R*, and `excess`
+        # the sum of w - 1. `near_target` and `near_either` count the pixels whose window covers
+        # part of R*, or part of either mask.
         l1, predicted, dissimilarity, foreground, excess, near_target, near_either = sums.unbind(-1)
         pixels = math.prod(preds.shape[1:])
         if normalize == "both":
             l1 = l1 / (predicted + foreground).clamp(min=_EPS)
             dissimilarity = dissimilarity / near_either.clamp(min=1)
         elif normalize == "foreground":
-            floor = MIN_FOREGROUND * pixels  # in pixels, whose w is the foreground weight
+            floor = MIN_FOREGROUND * pixels  # number of pixels; w is `foreground_weight` at each
             l1 = l1 / foreground.clamp(min=foreground_weight * floor)
             dissimilarity = dissimilarity / near_target.clamp(min=floor)
         else:
-            l1 = l1 / (pixels + excess)  # sum of w, as `excess` is the sum of w - 1
+            l1 = l1 / (pixels + excess)  # the sum of w
             dissimilarity = dissimilarity / pixels
         return alpha * l1 + (1 - alpha) * dissimilarity

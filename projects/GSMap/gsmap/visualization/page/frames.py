@@ -120,9 +120,9 @@ def predictions_of(token: str, result: ScoredResult, view: FrameView) -> list[di
 
 def _img_from_display(camera: CameraRecord, view: FrameView) -> np.ndarray:
     """Homography from (right, ahead, 1) on the ground, in metres, to pixels. (3, 3)"""
-    a, b, c = view.ground
+    a, b, c = view.ground  # the plane z = a x + b y + c
     frame_from_display = np.eye(3)
-    if view.forward == "x":
+    if view.forward == "x":  # x is ahead and y is left, so x = ahead and y = -right
         frame_from_display = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
     lift = np.array([[1, 0, 0], [0, 1, 0], [a, b, c], [0, 0, 1]])  # (x, y, 1) -> (x, y, z, 1)
     return camera.img_from_frame[:3] @ lift @ frame_from_display
