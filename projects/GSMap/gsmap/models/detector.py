@@ -256,16 +256,17 @@ class MapDetector(Base3DDetector):
         At the end of the context, the memory and the map prior are updated.
         """
         metas = [sample.metainfo for sample in batch_data_samples]
-        hook = None if self.prior is None else self.prior.hook(outputs)
+        # The hook gets the predictions from the head; the prior is updated with them afterwards.
+        prior_hook = None if self.prior is None else self.prior.hook(outputs)
         with ExitStack() as stack:
             batch = BatchMemory(outputs)
             if self.temporal is not None:
                 batch = stack.enter_context(self.temporal.remember_batch(outputs, metas))
-            if hook is not None:
-                batch.further_hooks = (hook,)
+            if prior_hook is not None:
+                batch.further_hooks = (prior_hook,)
             yield batch
-        if hook is not None:
-            self.prior.keep(hook, metas)
+        if prior_hook is not None:
+            self.prior.keep(prior_hook, metas)
 
     def loss(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
         """All losses as scalars, by name.
