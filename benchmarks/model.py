@@ -98,7 +98,7 @@ def build(path: str, args: argparse.Namespace, raster: str = "") -> Any:
     if cfg.model.get("img_backbone"):
         cfg.model.img_backbone.init_cfg = None
     torch.manual_seed(0)
-    with building(cfg):
+    with building(cfg):  # adds the names of the config and of its parts to errors
         return MODELS.build(cfg.model).to(args.device)
 
 

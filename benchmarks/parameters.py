@@ -26,7 +26,7 @@ def run(args: argparse.Namespace) -> None:
         args: Parsed options of ``add_arguments``.
     """
     cfg = read_config(args.config)
-    with building(cfg):
+    with building(cfg):  # adds the names of the config and of its parts to errors
         counts = count_parameters(MODELS.build(cfg.model), args.depth)
     width = max(map(len, counts))
     print(f"{'module'.ljust(width)}  {'all':>12}  {'trainable':>12}  {'entries':>12}")

@@ -19,13 +19,15 @@ from drivemaps.directed_lines import (
 from gsmap.structures.elements import FloatArray, IntArray
 
 _WIDTH_M = (2.0, 5.0)  # smallest and largest width of a lane whose middle is known
-_MOST_APART_M = 8.0  # between the borders of a lane with, for example, parked cars beside it
+_MOST_APART_M = 8.0  # largest distance of the borders, if cars are parked in the lane, for example
 _MOST_GAP_M = 30.0  # between the positions of successive frames of one track
 _LEAST_STEP_M = 0.5  # a vehicle that moves less stands still
 _MOST_CROSSING_M = 50.0  # longest stretch without borders, such as a junction, between two lanes
 _LANE_CHANGE_M = 1.0  # jump of the middle of the lane between two points
 _FILTER = 5  # points of the median filter along the track
-_REPEAT_M = 1.5  # largest distance of points of one lane, which are at most 2 m apart along it
+# Largest distance of a point from a point of an earlier pass through its lane. The points of a pass
+# are at most 2 m apart.
+_REPEAT_M = 1.5
 _MOST_POINTS = 25  # number of points after which a centre line is cut, as the width of lanes varies
 _LEAST_POINTS = 3  # smallest number of points between two cuts of a centre line
 _MIN_PARALLEL_COSINE = 0.7  # between the directions of two passes through one lane

@@ -86,7 +86,7 @@ def _remove_streets(nodes: list[Node], rng: np.random.Generator) -> None:
 
 
 def random_section(rng: np.random.Generator) -> CrossSection:
-    """Draw the lanes, the widths and the median of a road."""
+    """Choose the lanes, the widths and the median of a road at random."""
     one_way = rng.random() < 0.12
     forward = int(rng.choice([1, 2, 3], p=[0.35, 0.45, 0.2]))
     backward = 0
@@ -111,7 +111,7 @@ def random_section(rng: np.random.Generator) -> CrossSection:
 
 
 def random_style(rng: np.random.Generator) -> RoadStyle:
-    """Draw the paint and the surface of a road."""
+    """Choose the paint and the surface of a road at random."""
     dividers = ["double_yellow", "yellow", "dashed_white", "white"]
     dashes = [(3.0, 3.0), (2.0, 4.0), (4.0, 4.0), (3.0, 2.0)]
     divider = str(rng.choice(dividers, p=[0.4, 0.2, 0.2, 0.2]))

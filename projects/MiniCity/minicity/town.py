@@ -299,7 +299,7 @@ def _add_buildings(town: Town, blocked: Polygon, rng: np.random.Generator) -> No
                 front = float(rng.uniform(low=8, high=16))
                 depth = 3.0 if dense else 9.0
                 setback = road.style.walkway_m + float(rng.uniform(low=1.0, high=depth))
-                house = _draw_building(
+                house = _random_building(
                     road=road,
                     at_m=min(arc_m + front / 2, road.length_m - 0.1),
                     front_offset_m=sign * (kerb + setback),
@@ -324,10 +324,10 @@ def _touches_building(town: Town, outline: Polygon, candidates: NDArray[np.int64
     return any(outline.intersects(Polygon(town.buildings[k].footprint)) for k in candidates)
 
 
-def _draw_building(
+def _random_building(
     road: Road, at_m: float, front_offset_m: float, front_m: float, rng: np.random.Generator
 ) -> Building:
-    """Draw a house beside a road.
+    """Create a random house beside a road.
 
     Args:
         road: The road.

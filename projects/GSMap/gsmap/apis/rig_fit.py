@@ -36,7 +36,7 @@ AZIMUTHS_DEG = {
     "ring_rear_right": -153,
 }  # fmt: skip
 
-# Class embeddings of a generator, which are reordered only together with those of its detector.
+# Class embeddings of a generator. They are reordered only if the class weights of its detector are.
 _GENERATOR_LABELS = "map_head.generator.label."
 # Prefixes of weights with a row for each class, and the number of rows before the first class.
 _CLASS_ROWS = {

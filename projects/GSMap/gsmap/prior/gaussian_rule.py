@@ -12,8 +12,8 @@ class GaussianRule:
     Args:
         spacing_m: Distance of new Gaussians along a line, in [0.2, 5] metres. The standard
             deviation of a Gaussian along its line is half of it.
-        sigma_m: Standard deviation across its line of a prediction without Gaussians, in [0.01, 5]
-            metres.
+        sigma_m: Standard deviation across the line for predictions that have no Gaussians, in
+            [0.01, 5] metres.
         least_sigma_m: Smallest standard deviation of a Gaussian across its line, in [0.001, 1]
             metres, which covers the errors that all frames share.
         line_sigma_m: Standard deviation of a drawn line across its direction, in [0.05, 2] metres.

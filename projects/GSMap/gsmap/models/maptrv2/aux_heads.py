@@ -20,7 +20,7 @@ class DepthSupervision(nn.Module, NeedsTargets):
         kwargs: Arguments of other auxiliary heads; not used.
     """
 
-    transforms = ("MakeDepthMap",)
+    transforms = ("MakeDepthMap",)  # required in the training pipeline
 
     def __init__(self, loss_weight: float = 3.0, name: str = "depth", **kwargs: Any) -> None:
         super().__init__()
