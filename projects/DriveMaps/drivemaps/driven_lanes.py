@@ -224,11 +224,15 @@ def _join_repeats(
 
 
 def _joints(stretches: Sequence[tuple[int, int]], earlier_points: IntArray) -> dict[int, int]:
-    """Points of earlier stretches by the ends of stretches that meet them.
+    """Find the ends of stretches that meet an earlier stretch.
 
     Args:
         stretches: Indices of the first and the last point of each stretch.
         earlier_points: First point driven at the place of each point; -1 if there is none. (n,)
+
+    Returns:
+        For each of these ends, the point of the earlier stretch that it joins. A point near an end
+        of the earlier stretch is replaced by that end.
     """
     joints = {}
     ends = [point for stretch in stretches for point in stretch]

@@ -71,7 +71,7 @@ class LateHistory(HistoryBuffer):
 
     @property
     def _count_history(self) -> Any:
-        """Numbers of scalars behind each value of `HistoryBuffer`."""
+        """Number of scalars whose sum is each value of `HistoryBuffer`."""
         self._waiting.read()
         return self._counts
 

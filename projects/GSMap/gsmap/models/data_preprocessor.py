@@ -29,7 +29,7 @@ class MapDataPreprocessor(Det3DDataPreprocessor):
         for tensor in tensors:
             device_types.add(tensor.device.type)
         if self.device.type == "cpu" or "cpu" not in device_types:
-            return super().cast_data(data)
+            return super().cast_data(data)  # nothing has to be copied from the host to a GPU
         replacements = {}
         copies = upload(tensors, device=self.device)
         for tensor, copy in zip(tensors, copies, strict=True):

@@ -134,7 +134,7 @@ class ElementMasks:
 
 def _pad_lines(lines: Tensor, length: int) -> Tensor:
     """Pad lines to a length with their last points. (K, M, 2 or 3) -> (K, length, 2 or 3)"""
-    if not len(lines):
+    if not len(lines):  # such lines may have M = 0, without a last point
         return lines.new_zeros(0, length, lines.shape[2])
     num_missing = length - lines.shape[1]
     if num_missing == 0:

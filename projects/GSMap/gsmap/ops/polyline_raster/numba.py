@@ -211,11 +211,12 @@ def _scatter(ring, edge_index, x, y, weight, out):
     t = min(max(along, 0.0), 1.0)
     dx = fx - t * ex
     dy = fy - t * ey
-    # The squared distance is D = d d with d = f - t e, the offset of the pixel from the point at t.
-    # LENGTH_EPS moves t off the nearest point: dD/dt = -2 d e = -2 t LENGTH_EPS is not 0 between
-    # the ends. With dt/de = (f - 2 t e) / length2 and dt/df = e / length2, the derivatives are
-    # dD/de = -2 t d - slip (f - 2 t e) and dD/df = 2 d - slip e. As e = end - start and
-    # f = pixel - start, the gradient is dD/de for the end and -dD/df - dD/de for the start.
+    # The squared distance is D = d . d with d = f - t e, the offset of the pixel from the point at
+    # t of the edge. Because of LENGTH_EPS, this point is not exactly the nearest one: between the
+    # ends, dD/dt = -2 d . e = -2 t LENGTH_EPS is not 0. With dt/de = (f - 2 t e) / length2 and
+    # dt/df = e / length2, the derivatives are dD/de = -2 t d - slip (f - 2 t e) and
+    # dD/df = 2 d - slip e. As e = end - start and f = pixel - start, the gradient is dD/de for the
+    # end and -dD/df - dD/de for the start.
     slip = 2 * t * LENGTH_EPS / length2 if 0.0 <= along <= 1.0 else 0.0
     end_x = -2 * t * dx - slip * (fx - 2 * t * ex)
     end_y = -2 * t * dy - slip * (fy - 2 * t * ey)
