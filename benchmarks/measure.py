@@ -27,7 +27,7 @@ class Cost:
 
     Attributes:
         wall_s: Shortest wall-clock time of a call in seconds.
-        cpu_s: Shortest processor time of a call in seconds, all threads together.
+        cpu_s: Shortest processor time of a call in seconds, summed over all threads.
         peak_bytes: Highest memory in use during a call, beyond the memory in use before it.
     """
 

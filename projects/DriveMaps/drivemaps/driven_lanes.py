@@ -20,7 +20,7 @@ from gsmap.structures.elements import FloatArray, IntArray
 
 _WIDTH_M = (2.0, 5.0)  # smallest and largest width of a lane whose middle is known
 _MOST_APART_M = 8.0  # largest distance of the borders, if cars are parked in the lane, for example
-_MOST_GAP_M = 30.0  # between the positions of successive frames of one track
+_MOST_GAP_M = 30.0  # largest distance of the positions of successive frames of one track
 _LEAST_STEP_M = 0.5  # a vehicle that moves less stands still
 _MOST_CROSSING_M = 50.0  # longest stretch without borders, such as a junction, between two lanes
 _LANE_CHANGE_M = 1.0  # jump of the middle of the lane between two points
@@ -30,7 +30,7 @@ _FILTER = 5  # points of the median filter along the track
 _REPEAT_M = 1.5
 _MOST_POINTS = 25  # number of points after which a centre line is cut, as the width of lanes varies
 _LEAST_POINTS = 3  # smallest number of points between two cuts of a centre line
-_MIN_PARALLEL_COSINE = 0.7  # between the directions of two passes through one lane
+_MIN_PARALLEL_COSINE = 0.7  # smallest cosine between the directions of two passes through one lane
 # Kinds of lanes between two points.
 _OUTSIDE = 0
 _BORDERED = 1

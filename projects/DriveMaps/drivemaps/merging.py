@@ -14,7 +14,7 @@ from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import IntArray, MapElements
 
 _RADIUS_M = 1.0  # a polyline within this distance of another one runs along it
-_MOST_VERTICES = 1000  # of a line that is compared with others of its frame
+_MOST_VERTICES = 1000  # largest number of vertices of a line that is compared with other lines
 _MOST_SHARE = 0.5  # share of a polyline's length that may run along another one
 
 

@@ -9,12 +9,13 @@ from minicity.curves import Array, arc_lengths, hermite, resample, subline, unit
 from minicity.roads import CrossSection, Road, RoadStyle
 
 PITCH_M = 115.0  # distance of neighbouring grid nodes before their random offsets
-MARGIN_M = 130.0  # from the border of the canvas to the grid
+MARGIN_M = 130.0  # distance of the grid from the border of the canvas
 STATION_M = 3.0  # distance of the points of a centre line
 MIN_ROAD_M = 40.0  # shorter roads have no crossings and no stop lines
 CORNER_M = (4.0, 8.0)  # smallest and largest space for the rounded corners of a junction
 BEND_CUT_M = 40.0  # length of a street that the curve of a bend replaces, on each side
-STEPS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])  # to the neighbour at arm 0, 1, 2 and 3
+# Steps in the grid to the neighbours at the arms 0, 1, 2 and 3.
+STEPS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
 
 
 @dataclass

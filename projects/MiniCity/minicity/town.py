@@ -17,7 +17,7 @@ LaneKey = tuple[int, bool, int]
 """Identity of a lane within its town: road, direction and index."""
 MAX_SIDE = 8  # largest number of grid nodes along an edge of a town
 LARGEST_HOUSE_M = 22.0  # houses whose centres are farther apart, in x or y, cannot touch
-END_STOP_M = 0.6  # between a stop line without a crossing and the end of its road
+END_STOP_M = 0.6  # distance of a stop line without a crossing from the end of its road
 BAY_WIDTH_M = 2.6
 BAY_LENGTH_M = 5.0
 CARPARK_DEPTH_M = 15.0
@@ -289,7 +289,7 @@ def _make_carpark(road: Road, sign: int, middle_m: float, bays: int) -> Carpark:
 def _add_buildings(town: Town, blocked: Polygon, rng: np.random.Generator) -> None:
     """Add houses along both sides of every road, clear of surfaces and of one another, in place."""
     shapely.prepare(blocked)
-    centers = np.zeros((0, 2))  # of the houses so far
+    centers = np.zeros((0, 2))  # centres of the houses that have been added
     for road in town.roads:
         dense = rng.random() < 0.75
         # Side of the road, 1 for left and -1 for right, and distance of its kerb.

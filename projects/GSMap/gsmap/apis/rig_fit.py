@@ -279,7 +279,7 @@ def _fit_classes(
             f"classes were {', '.join(trained)}, are {', '.join(names)}: this head's weights of "
             "classes are loaded without a change of their order, where their sizes fit."
         ]
-    old_rows: dict[str, int] = {}  # by class
+    old_rows: dict[str, int] = {}  # index among the classes of the checkpoint, by class
     new_classes: list[str] = []
     for name in names:
         if name in trained:

@@ -91,7 +91,7 @@ class LateHistory(HistoryBuffer):
 
 
 def _waiting_values(scalars: Mapping[str, HistoryBuffer]) -> _Waiting:
-    """Return the queue that the histories of a message hub share, a new one if there is none."""
+    """Return the queue that the histories of a message hub share, or a new one at first."""
     for history in scalars.values():
         if isinstance(history, LateHistory):
             return history._waiting
@@ -101,7 +101,8 @@ def _waiting_values(scalars: Mapping[str, HistoryBuffer]) -> _Waiting:
 def keep_figures(hub: MessageHub, figures: Mapping[str, Any]) -> None:
     """Append the scalars of one iteration to the histories of a message hub.
 
-    Scalars on a GPU are not waited for. They are copied together on the next access to a history.
+    Scalars on a GPU are not waited for. All of them are copied at once, on the next access to a
+    history.
 
     Args:
         hub: Message hub of mmengine.

@@ -270,9 +270,9 @@ class PLD(Metric):
         gains = sums[..., 0]
         errors = sums[..., 1]
         # D = M - gains, so M + D = 2 M - gains.
-        whole = np.maximum(2 * masses - gains, np.finfo(float).tiny)
-        pld = 2 * (masses - gains) / whole
-        localisation = 2 * errors / whole
+        denominator = np.maximum(2 * masses - gains, np.finfo(float).tiny)
+        pld = 2 * (masses - gains) / denominator
+        localisation = 2 * errors / denominator
         figures: dict[str, float] = {}
         for part, values in zip(_PARTS, (pld, localisation, pld - localisation), strict=True):
             for name, row in zip(self.classes, values, strict=True):

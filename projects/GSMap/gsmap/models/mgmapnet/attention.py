@@ -28,8 +28,9 @@ class Samples(NamedTuple):
     """Locations and weights of K BEV samples per point, level and head."""
 
     locations: Tensor  # (x, y) in [0, 1] over the map (B, N, P, levels, heads, K, 2)
-    point_weights: Tensor  # for point queries, sum to 1 over K (B, N, P, levels, heads, K)
-    weights: Tensor  # for instances, sum to 1 over P, levels, K (B, N, P, levels, heads, K)
+    point_weights: Tensor  # weights for points, with sum 1 over K (B, N, P, levels, heads, K)
+    # Weights for instances, with sum 1 over P, levels and K (B, N, P, levels, heads, K)
+    weights: Tensor
 
 
 class PerPointSampling(SamplingAttention):
@@ -134,7 +135,7 @@ class PerPointSampling(SamplingAttention):
         logits = at_least_float32(self.attention_weights(query))
         logits = logits.unflatten(-1, (self.num_heads, *self.sample_shape))
         point_weights = logits.softmax(dim=-1)
-        weights = logits.flatten(-3).softmax(dim=-1)  # over levels, P and K together
+        weights = logits.flatten(-3).softmax(dim=-1)  # one softmax over levels, P and K
         weights = weights.unflatten(-1, self.sample_shape)
         order = (0, 1, 4, 3, 2, 5)  # (B, N, heads, levels, P, K) -> (B, N, P, levels, heads, K)
         return Samples(
