@@ -72,6 +72,7 @@ def prediction(index: int) -> NDArray[np.float32]:
         columns = np.round((line_m + shifts_m - GRID.x_range[0]) / GRID.pixel_size_m[0])
         for offset in (-1, 0, 1):  # each line is three pixels wide
             column = columns.astype(np.int64) + offset
+            # One cell of each row, in class 0 or 1: the classes of the lines alternate.
             values[number % 2, np.arange(GRID.height), column] = rng.uniform(0.4, 1)
     if index % 20 == 0:
         values[2, 90:105, 20:80] = 0.9  # a crossing every 100 m

@@ -87,6 +87,7 @@ class Replay:
             Each frame, in the order of time.
         """
         frames = self.drive.frames
+        # The tilt of the sensor in a frame determines the ground plane in the annotation frame.
         views = [self.view.with_mounting(frame.sample.ego_from_frame) for frame in frames]
         frame_tree = cKDTree([frame.origin for frame in frames])
         labels = self.elements.labels.tolist()
@@ -132,7 +133,7 @@ def _raise_to_ground(
     for index in np.unique(nearest):
         frame = frames[index]
         rows = nearest == index
-        local = views[index].lift(frame.to_frame(points[rows]))
+        local = views[index].lift(frame.to_frame(points[rows]))  # on the ground, in the frame
         pose = frame.sample.global_from_frame
         height = local @ pose[2, :3] + pose[2, 3]  # the third row of the pose gives z
         raised[rows] = np.column_stack([points[rows], height])

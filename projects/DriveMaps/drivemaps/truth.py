@@ -40,7 +40,7 @@ def true_map(drive: Drive) -> MapElements:
                     pieces.append(line)
         unite = _unite_areas if name in AREA_CLASSES else _unite_lines
         for line in unite(pieces):
-            rows.append((label, line, 1.0))
+            rows.append((label, line, 1.0))  # `drive_map` needs a score, and leaves it out below
     return drive_map(rows, scored=False)
 
 

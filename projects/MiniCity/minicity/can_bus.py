@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from minicity.curves import Array
 
 RATE_HZ = 50  # messages per second
-STEP_S = 0.02  # time before and after a message at which the poses of its differences are taken
+STEP_S = 0.02  # the differences of a message use the poses this long before and after it
 GRAVITY = 9.81
 
 

@@ -127,7 +127,8 @@ class SceneMaker:
         xmax, ymax = (track.max(axis=0) + GROUND_MARGIN_M).tolist()
         bounds = (xmin, ymin, xmax, ymax)
         mesh, shadows = _make_surroundings(self.town, track, lighting=self.lighting)
-        # Small pictures need no fine ground: 6.25 cm for 800 columns.
+        # Pixel size of the texture of the ground. It is 6.25 cm for pictures of 800 columns, and
+        # coarser for smaller pictures, which need no fine texture.
         resolution_m = np.clip(0.0625 * 800 / self.config.image_width, 0.05, 0.09)
         return SceneRenderer(
             make_scene_map(self.town, bounds),
@@ -213,7 +214,7 @@ class SceneMaker:
         )
 
     def _add_data(self, channel: str, time_s: float, **data: Any) -> None:
-        """Add a ``sample_data`` record, and an ``ego_pose`` record with this token and time."""
+        """Add a ``sample_data`` record, and an ``ego_pose`` record with equal token and time."""
         pose = self.ego_pose(time_s)
         token = data["token"]
         timestamp = self.timestamp_us(time_s)
@@ -334,7 +335,7 @@ class SceneMaker:
                 token=self._token("annotation", vehicle.identity, k),
                 sample_token=self.samples[k],
                 instance_token=self._token("instance", vehicle.identity),
-                visibility_token="4",
+                visibility_token="4",  # fully visible, in the terms of nuScenes
                 attribute_tokens=[make_token("attribute", _attribute(vehicle))],
                 translation=vehicle.center.tolist(),
                 size=[width, length, height],  # the order of nuScenes

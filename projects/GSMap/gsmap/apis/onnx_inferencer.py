@@ -354,6 +354,7 @@ class OnnxInferencer:
         threshold = self.metadata["score_threshold"]
         keep = np.ones(len(outputs["scores"]), dtype=bool)  # (M,)
         if margin is not None:
+            # Corners (x, y) of the map. (2,) each
             low, high = np.array([self.metadata["x_range"], self.metadata["y_range"]]).T
             points = outputs["points"][..., :2]  # (M, P, 2)
             keep = ((points >= low - margin) & (points <= high + margin)).all((1, 2))
@@ -382,7 +383,8 @@ class OnnxInferencer:
         rows = np.arange(len(orders))[:, None]  # (n, 1)
         for name in fields.keys() - {"scores", "labels", "num_pts"}:
             of_points = fields[name][unfolded]  # (n, P, ...)
-            fields[name][unfolded] = of_points[rows, orders]  # point j becomes ``orders[:, j]``
+            # Point j of line i is its former point ``orders[i, j]``.
+            fields[name][unfolded] = of_points[rows, orders]
 
     def write(self, path: str | Path, samples: Iterable[tuple[str, MapElements]]) -> None:
         """Write predictions in the format of ``tools/test.py --out``.

@@ -43,7 +43,8 @@ _DAMAGE = (
     RuntimeError, EOFError, LookupError, TypeError, AttributeError, AssertionError, ValueError,
     ArithmeticError, OSError, zipfile.BadZipFile,
 )  # fmt: skip
-_SCALE_OPTIONS = ("image_scale", "test_dataloader.dataset.pipeline")  # prefixes of overrides
+# Beginnings of the overrides that set the scale of test images.
+_SCALE_OPTIONS = ("image_scale", "test_dataloader.dataset.pipeline")
 _WIDEST_PX = 100_000
 _REMEDY = "if you trust its origin, save its state_dict alone and give that file."
 
@@ -93,7 +94,7 @@ def refusing(path: object) -> Iterator[None]:
     except UnfitError as error:
         raise InputError(f"{path} {error}.") from error
     except pickle.UnpicklingError as error:
-        reason = str(error).split(". ")[0]
+        reason = str(error).split(". ")[0]  # the first sentence of a long message of torch
         default = f"it is broken, or holds more than tensors and plain data ({reason}); {_REMEDY}"
         raise InputError(f"{path} was not loaded: {_remedy_for(path, default=default)}.") from error
     except _DAMAGE as error:

@@ -51,8 +51,8 @@ def _check_agreement(cfg: Config, steps: list[Any]) -> None:
 
 def _target_settings(head: dict[str, Any]) -> dict[str, Any]:
     """Return the settings of transforms that follow from the config of a head."""
-    # Any, because `_defaults` is cached: mypy requires a hashable argument, and takes protocols for
-    # not hashable.
+    # Typed as Any: `_defaults` is cached and so needs a hashable argument, and mypy does not know
+    # that the class of a protocol is hashable.
     head_class: Any = _class_with_targets(head.get("type"))
     try:
         return head_class.target_settings({**_defaults(head_class), **head})

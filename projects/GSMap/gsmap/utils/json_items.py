@@ -41,7 +41,7 @@ def items_of(
             yield from _Parser(file).items(key=key, other_entries=other_entries or {})
         except _FormError as error:
             raise InputError(f"{path} holds {error} and no list{under}: {advice}.") from error
-        except (ValueError, RecursionError) as error:
+        except (ValueError, RecursionError) as error:  # RecursionError: nested too deeply
             file.seek(0)
             advice = fetch_advice(start=file.read(100), otherwise=advice)
             raise InputError(

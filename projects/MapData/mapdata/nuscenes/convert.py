@@ -328,8 +328,8 @@ def convert_nuscenes(options: NuScenesOptions) -> ConversionSummary:
         ValueError: If splits or classes do not fit the data set.
     """
     check_classes(options.classes)
-    for each in options.versions:
-        _check_root(options.root, each)
+    for version_name in options.versions:
+        _check_root(options.root, version_name)
     conversion = _Conversion(options)
     source_fingerprint = _source_fingerprint(options)
     versions = {name: version(name) for name in ("nuscenes-devkit", "shapely", "pyarrow")}
@@ -377,14 +377,14 @@ def _source_fingerprint(options: NuScenesOptions) -> str:
     """Digest of the sizes of all tables and the content of the scene tables and maps."""
     sizes = {}
     contents = []
-    for each in options.versions:
-        folder = options.root / each
+    for version_name in options.versions:
+        folder = options.root / version_name
         contents.append(folder / "scene.json")
         for path in sorted(folder.glob("*.json")):
             if not is_hidden(path):
                 # Several versions have tables of equal names. Those of the first version have no
                 # prefix, so that the digest of a single version does not depend on its folder.
-                is_first = each == options.versions[0]
+                is_first = version_name == options.versions[0]
                 name = path.name if is_first else f"{folder.name}/{path.name}"
                 sizes[name] = path.stat().st_size
     contents += [expansion(options.root, name) for name in maps_in(options.root)]

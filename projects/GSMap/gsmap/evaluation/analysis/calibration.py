@@ -210,7 +210,7 @@ def uncertainty_figures(vertices: Vertices, law: str = "normal") -> dict[str, fl
         sigmas = vertices.sigmas[:, axis]
         gaps = sparsification(errors, order=sigmas) - sparsification(errors, order=errors)
         # The law has variance 1, so it gives the density of errors / sigmas. The density of the
-        # errors is this density divided by sigma, which adds log(sigma) to the likelihood below.
+        # errors is this density divided by sigma. So log(sigma) is added in the figure "nll".
         log_densities = LAWS[law].logpdf(errors / sigmas)
         values = {
             "nll": (np.log(sigmas) - log_densities).mean(),

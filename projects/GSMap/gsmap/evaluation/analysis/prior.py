@@ -164,8 +164,8 @@ def fit_prior(
 
     Each step adds the element that increases the area under the precision-recall curve of its class
     the most. The increase is precision times recall, both of the element's new matches alone. Its
-    score increases with its precision, the number of new matches per sample. An element is a ground
-    truth of the training set, moved to the mean of its matches where this adds matches.
+    score increases with its precision, the share of samples in which it has a new match. An element
+    is a ground truth of the training set, moved to the mean of its matches where this adds matches.
 
     Args:
         truth: Ground truth of each training sample.
@@ -192,9 +192,8 @@ def fit_prior(
         line, refined_precision = fits[label].take(index)
         lines.append(line)
         labels.append(label)
-        # AP_raster drops scores below MIN_SCORE; otherwise only the order of scores matters. An
-        # element may match several ground truths of a sample, which gives a precision above 1.
-        scores.append(MIN_SCORE + (1.0 - MIN_SCORE) * min(refined_precision, 1.0))
+        # AP_raster drops scores below MIN_SCORE; otherwise only the order of scores matters.
+        scores.append(MIN_SCORE + (1.0 - MIN_SCORE) * refined_precision)
     return MapElements.from_polylines(lines, labels=labels, scores=scores)
 
 

@@ -54,7 +54,7 @@ def fused_resnet(backbone: ResNet, images: Tensor, convolve: Convolve) -> tuple[
         for block in getattr(backbone, name):
             identity = x
             if block.downsample is not None:
-                *pooling, conv, norm = block.downsample
+                *pooling, conv, norm = block.downsample  # variants of ResNet pool first
                 for layer in pooling:
                     identity = layer(identity)
                 identity = convolve(conv, norm, identity, relu=False)

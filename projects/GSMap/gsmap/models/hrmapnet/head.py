@@ -1,4 +1,4 @@
-"""Head of HRMapNet: queries that are all content, without a positional half as in MapTR."""
+"""Head of HRMapNet: queries without the positional half that the queries of MapTR have."""
 
 from collections.abc import Callable
 from typing import Any

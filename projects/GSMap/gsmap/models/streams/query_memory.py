@@ -189,7 +189,7 @@ class Propagation(FlowHook):
         """
         if layer == len(head.decoder.layers) - 1:
             self.last = queries
-        elif layer == 0 and self.past.memory:
+        elif layer == 0 and self.past.memory:  # the memory is empty if all streams start
             return self.insert(head, queries)
         return queries
 

@@ -117,7 +117,7 @@ def _blur_row(images, channels, row, span, window, line, out):
     # Because of the margin, these are not the row and column of the first pixel, but of the top
     # left of its window.
     first = row * pitch + span[0] * channels
-    # The blur along the row reads a window of pixels from the left edge of the last window on.
+    # The blur along the row reads the whole windows of the first to the last pixel of the span.
     size = (pixels + len(window)) * channels
     _convolve(images.reshape(images.size), first, stride=pitch, window=window, out=line, size=size)
     _convolve(line, 0, stride=channels, window=window, out=out, size=pixels * channels)
