@@ -187,8 +187,8 @@ def plan(entries: Sequence[Entry], protocol: Protocol) -> list[Run]:
     """Plan all runs and check them, before anything trains.
 
     On a GPU a run has one process. On a CPU it has as many processes as earlier runs of the
-    comparison, or else at most one per core. The number divides the batch. It affects the results,
-    as batch normalization uses the samples of one process.
+    comparison, or else at most one per core. The number of processes divides the batch. It affects
+    the results, as batch normalization uses the samples of one process.
 
     Args:
         entries: The configs with their overrides.
@@ -206,7 +206,7 @@ def plan(entries: Sequence[Entry], protocol: Protocol) -> list[Run]:
     if len(set(names)) < len(names):
         raise InputError(f"two configs have one name: {names}; write NAME=CONFIG.")
     if protocol.init is not None:
-        read_weights(protocol.init)
+        read_weights(protocol.init)  # raises an error if the weights cannot be used
     processes = _processes(protocol)
     runs = []
     for seed in range(protocol.seeds):
@@ -257,6 +257,7 @@ def _plan_run(entry: Entry, seed: int, protocol: Protocol, processes: int) -> Ru
         initial_weights = find_checkpoint(protocol.init).resolve()
         own_options.append(f"load_from={initial_weights}")
     user_options = (*entry.options, *protocol.options)
+    # The config is read twice: the overrides added below depend on the data set and the schedule.
     cfg = read_config(entry.config, parse_options([*own_options, *user_options]))
     epochs = _count_epochs(entry, cfg, protocol=protocol, processes=processes)
     own_options.append(f"train_cfg.max_epochs={epochs}")

@@ -20,8 +20,8 @@ class _LateNorm(OptimWrapper):
     """Optimizer wrapper that keeps the gradient norm on its device until it is logged.
 
     Attributes:
-        members: Indices of each group's parameters in the order of the model; empty if the
-            parameters have not been regrouped.
+        members: For each group, the positions of its parameters in the order of the model; empty
+            if the parameters have not been regrouped.
     """
 
     members: Sequence[Sequence[int]] = ()

@@ -91,7 +91,7 @@ def _rows(text: str) -> Iterator[tuple[int, dict[str, str]]]:
             values = [value.strip() for value in row]
             if not any(values):
                 continue
-            number = start + table.line_num
+            number = start + table.line_num  # the table counts its lines from 1
             if len(values) < len(names):
                 raise InputError(f"line {number}: it has {len(values)} of {len(names)} columns")
             if separator != ",":

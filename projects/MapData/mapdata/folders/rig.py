@@ -40,9 +40,9 @@ class RigCamera:
         size_px: Width and height of the images.
         distortion: Distortion coefficients in OpenCV's order; empty for a pinhole camera. (n,)
         model: Distortion model, as ROS names it.
-        trained: Width, height, fx, fy, cx and cy of the camera that a model was trained on. Images
-            of a distorted camera are rectified to it, at the size of the images; None keeps
-            ``intrinsics``.
+        trained: Width, height, fx, fy, cx and cy of the camera that a model was trained on. If
+            this camera is distorted, its images are rectified to that camera, scaled to their size.
+            None rectifies them to ``intrinsics``.
 
     Raises:
         ValueError: If the size is not positive, or images cannot be rectified with such
@@ -81,7 +81,7 @@ class RigCamera:
             raise InputError(
                 f"{where} has the distortion model {self.model!r}; known are "
                 f"{list(filter(None, _COUNTS))}: rectify its images first."
-            )
+            )  # `filter` leaves the empty name of plumb_bob out
         if self.model in FISHEYE_MODELS and not np.any(self.distortion[4:]):
             self.distortion = self.distortion[:4]  # some drivers append zeros
         numbers = self.distortion

@@ -21,8 +21,12 @@ _CROSSWALK = 3
 _ROAD_EDGE = 8
 _ROAD_LINE = 9
 _NO_PAINT = 0  # number of a kind of road line
-_LAYERS = {"divider": _ROAD_LINE, "ped_crossing": _CROSSWALK, "boundary": _ROAD_EDGE}
-_LAYERS["centerline"] = _LANE
+_LAYERS = {
+    "divider": _ROAD_LINE,
+    "ped_crossing": _CROSSWALK,
+    "boundary": _ROAD_EDGE,
+    "centerline": _LANE,
+}
 
 
 class Map:

@@ -78,7 +78,7 @@ class BEVMaskHead(nn.Sequential, NeedsTargets):
         name: str = "seg",
     ) -> None:
         network = self.layers(embed_dims, num_masks)
-        super().__init__(*network)
+        super().__init__(*network)  # the layers are children of the head, with the keys 0 to 2
         self.loss_weight = loss_weight
         self.pos_weight = pos_weight
         self.dice_weight = dice_weight

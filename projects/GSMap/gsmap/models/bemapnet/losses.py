@@ -32,7 +32,7 @@ class BezierLines(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """Matched lines of a case."""
+    """Matched lines of a case, which is one class in one sample."""
 
     rows: Tensor  # indices of the predicted lines (M,)
     cols: Tensor  # indices of the annotated lines (M,)

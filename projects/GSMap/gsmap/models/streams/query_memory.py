@@ -35,7 +35,7 @@ class QueryMemory(BaseModule, AddsWeights):
         beta: Distance below which smooth L1 is quadratic, as a fraction of the map.
     """
 
-    neutral_keys = ("fc.",)
+    neutral_keys = ("fc.",)  # a checkpoint without the network can be loaded, see `init_weights`
 
     def __init__(
         self, embed_dims: int, num: int = 33, loss_weight: float = 5.0, beta: float = 0.01
@@ -132,7 +132,8 @@ def leaf_names(count: int) -> list[str]:
 
 def pick(values: Tensor, order: Tensor) -> Tensor:
     """Select instances by indices (B, M). (B, N, ...) -> (B, M, ...)"""
-    return values[torch.arange(len(order), device=order.device)[:, None], order]
+    samples = torch.arange(len(order), device=order.device)[:, None]  # (B, 1), beside (B, M)
+    return values[samples, order]
 
 
 class Propagation(FlowHook):
@@ -296,6 +297,7 @@ class Propagation(FlowHook):
         """
         previous = self.past.memory.get("targets")  # (B, K, P, 2 or 3)
         if self.propagated is None or previous is None:
+            # Distributed training requires a gradient of every parameter in every step.
             parameters = [parameter.sum() for parameter in self.memory.parameters()]
             return 0.0 * torch.stack(parameters).sum()
         # The references of the propagated queries, refined by the branch of the first layer.
