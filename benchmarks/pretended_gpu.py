@@ -105,7 +105,7 @@ class PretendedTensor(Tensor):
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "PretendedTensor":
         copy: Any = PretendedTensor(self.host.detach().clone()).requires_grad_(self.requires_grad)
-        if getattr(self, "_is_param", False):
+        if getattr(self, "_is_param", False):  # torch marks a parameter that is a subclass by it
             copy._is_param = True  # type: ignore[attr-defined]
         memo[id(self)] = copy
         return copy
@@ -145,7 +145,8 @@ class PretendedGPU(TorchDispatchMode):
         self.launches: Counter[tuple[str, str]] = Counter()
         self.waits: Counter[tuple[str, str, str]] = Counter()
         self._part = ""
-        # Starts of parts: number of the first autograd node that belongs to it, and its name.
+        # Starts of parts. Each has the number of the first autograd node of the part, and the name
+        # of the part.
         self._marks: list[tuple[int, str]] = []
         self._in_backward = False
         self._undo = contextlib.ExitStack()
@@ -275,6 +276,7 @@ class PretendedGPU(TorchDispatchMode):
         Returns:
             Result of the operation, with its tensors on the device.
         """
+        # Pinned memory needs a real GPU.
         kwargs = {key: value for key, value in kwargs.items() if key != "pin_memory"}
         if "device" in kwargs:
             kwargs["device"] = torch.device("cpu")
@@ -436,7 +438,10 @@ def _short_name(file: str) -> str | None:
 
 
 def _num_launches(name: str, args: Any) -> int:
-    """Number of kernels of an operation; on lists, one for each group of so many tensors."""
+    """Number of kernels of an operation.
+
+    Operations on lists need one kernel for each group of ``_TENSORS_PER_LAUNCH`` tensors.
+    """
     if not name.startswith(("_foreach", "_fused_adam", "_fused_sgd")):
         return 1
     num_lists = 0

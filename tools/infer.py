@@ -74,6 +74,27 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument("--token", nargs="+", help="tokens of the samples to run; all by default")
     parser.add_argument("--max-samples", type=int, help="run this many samples, evenly spread")
+    _add_input_options(parser)
+    _add_prior_options(parser)
+    _add_running_options(parser)
+    _add_picture_options(parser)
+    add_shard_options(parser)
+    args = parser.parse_args(argv)
+    if not args.model and not args.check_calibration:
+        parser.error("the following arguments are required: --model")
+    if args.out and args.out.suffix == _SAMPLES:
+        parser.error(f"--out names a JSON file, the samples go to a {_SAMPLES}: got {args.out}")
+    if args.ground_z is not None and not args.show_dir:
+        parser.error("--ground-z is for pictures: give --show-dir, too, or leave it out")
+    if args.update_prior and not args.prior:
+        parser.error("--update-prior changes the file of --prior: give it, too")
+    if args.model and len(args.model) > 2:
+        parser.error(f"--model takes a name, or a config and a checkpoint, got {args.model}")
+    return args
+
+
+def _add_input_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the recording."""
     group = parser.add_argument_group("input")
     group.add_argument("--version", help="version folder of a nuScenes-format root")
     group.add_argument(
@@ -102,6 +123,10 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     group.add_argument(
         "--allow-missing-cameras", action="store_true", help="leave absent cameras blank"
     )
+
+
+def _add_prior_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the priors."""
     group = parser.add_argument_group("map of earlier drives, for a model that reads it")
     group.add_argument(
         "--prior", nargs="+", type=Path, default=[], metavar="FILE", help="maps, one for each place"
@@ -111,6 +136,10 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         action="store_true",
         help="write the predictions to it; a FILE that does not exist is created",
     )
+
+
+def _add_running_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the device and of the model."""
     group = parser.add_argument_group("running")
     group.add_argument(
         "--device",
@@ -126,6 +155,10 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         help="on a GPU, record the launches of a frame once and replay them",
     )
     add_config_options(group)
+
+
+def _add_picture_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the pictures."""
     group = parser.add_argument_group("pictures")
     group.add_argument("--format", default="png", choices=FORMATS)
     group.add_argument("--order", action="store_true", help="mark start and direction of elements")
@@ -135,19 +168,6 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     )
     group.add_argument("--width", type=int, help="width of the pictures in pixels")
     group.add_argument("--lidar", action="store_true", help="draw the LiDAR sweep faintly")
-    add_shard_options(parser)
-    args = parser.parse_args(argv)
-    if not args.model and not args.check_calibration:
-        parser.error("the following arguments are required: --model")
-    if args.out and args.out.suffix == _SAMPLES:
-        parser.error(f"--out names a JSON file, the samples go to a {_SAMPLES}: got {args.out}")
-    if args.ground_z is not None and not args.show_dir:
-        parser.error("--ground-z is for pictures: give --show-dir, too, or leave it out")
-    if args.update_prior and not args.prior:
-        parser.error("--update-prior changes the file of --prior: give it, too")
-    if args.model and len(args.model) > 2:
-        parser.error(f"--model takes a name, or a config and a checkpoint, got {args.model}")
-    return args
 
 
 def _trained_cameras(args: argparse.Namespace) -> dict[str, tuple[float, ...]]:
@@ -306,8 +326,8 @@ def open_log(
 
     Args:
         args: The options of the command.
-        settings: Settings that determine the predictions. If an earlier run had equal settings, its
-            predictions are used.
+        settings: Settings and input that determine the predictions. If an earlier run had equal
+            ones, its predictions are used.
         tokens: Tokens of the samples to predict, in their order.
         classes: Names of the classes.
     """
@@ -498,14 +518,15 @@ def main(argv: list[str] | None = None) -> str | None:
     chosen = args.shard.part(select_samples(tokens, args.token, args.max_samples))
     settings = run_settings(args)
     samples_digest = digest(dataset.annotations.path)
-    # Settings that also identify the input. The name of the folder of images depends on their
-    # content and on the calibration.
-    run = {**settings, "input": str(args.input.resolve()), "samples": samples_digest}
-    run["images"] = str(source.data_root)
+    # The log of an earlier run is used only if the settings and the input are equal. The name of
+    # the folder of images depends on their content and on the calibration.
+    log_settings = {**settings, "input": str(args.input.resolve()), "samples": samples_digest}
+    log_settings["images"] = str(source.data_root)
     chosen_tokens = [tokens[index] for index in chosen]
     classes = dataset.metainfo["classes"]
     with ExitStack() as stack:
-        results = stack.enter_context(open_log(args, run, tokens=chosen_tokens, classes=classes))
+        log = open_log(args, log_settings, tokens=chosen_tokens, classes=classes)
+        results = stack.enter_context(log)
         priors = read_priors(args, inferencer, dataset, chosen, stack)
         broken = predict(args, inferencer, dataset, chosen, results, priors)
         if chosen and len(broken) == len(chosen):

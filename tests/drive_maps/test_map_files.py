@@ -125,7 +125,7 @@ HOSTILE_GEOJSON = {
     "cut": (geojson([divider(LINE)])[:-9], "is empty or holds no complete list"),
     "nested too deep": ('{"features": [' + deep(100_000) + "]}", "is empty or holds no complete"),
     "deep coordinates": (
-        geojson([divider([[0, 0]])]).replace("[[0, 0]]", deep(500)), "has no two coordinates",
+        geojson([divider([[0, 0]])]).replace("[[0, 0]]", deep(500)), "fewer than two coordinates",
     ),
     "NaN": (geojson([divider([[0, 0], [math.nan, 1]])]), "feature 0: nan is no finite number"),
     "infinity": (geojson([divider([[0, 0], [1, math.inf]])]), "feature 0: inf is no finite"),
@@ -140,7 +140,7 @@ HOSTILE_GEOJSON = {
     "truth": (geojson([divider([[True, 0], [1, 1]])]), "feature 0: True is no number"),
     "an object for a line": (geojson([divider({"0": [0, 0]})]), "nested differently"),
     "a flat line": (geojson([divider([0, 0, 1, 1])]), "nested differently"),
-    "one coordinate": (geojson([divider([[0], [1]])]), "a position has no two coordinates"),
+    "one coordinate": (geojson([divider([[0], [1]])]), "a position has fewer than two coordinates"),
     "no feature": (geojson([3]), "feature 0: it is no object of type Feature"),
     "a geometry without type": (
         geojson([{"type": "Feature", "geometry": {}, "properties": {}}]), "no object with a type",

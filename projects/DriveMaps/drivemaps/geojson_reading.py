@@ -156,7 +156,7 @@ def _line_of(positions: Any) -> FloatArray:
     for position in _list_of(positions):
         coordinates = _list_of(position)
         if len(coordinates) < 2:
-            raise InputError("a position has no two coordinates")
+            raise InputError("a position has fewer than two coordinates")
         x = finite_number(coordinates[0])
         y = finite_number(coordinates[1])
         points.append((x, y))

@@ -116,7 +116,7 @@ class _OSMFile:
     def add_way(self, nodes: Sequence[str], tags: dict[str, str]) -> str:
         """Add a line through nodes, given by their ids, and return its id."""
         way = self._add("way", tags)
-        for index, node in enumerate(nodes):
+        for index, node in enumerate(nodes):  # nodes are written before the tags
             way.insert(index, ElementTree.Element("nd", ref=node))
         return way.get("id", "")
 

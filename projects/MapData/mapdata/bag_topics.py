@@ -71,7 +71,7 @@ def check_topics(
             if topic and kinds.get(topic) not in valid_kinds:
                 raise InputError(
                     f"--topics: {topic} is {kinds.get(topic, 'not there')}, and must be "
-                    f"{' or '.join(valid_kinds)}; it holds: {listing}"
+                    f"{' or '.join(valid_kinds)}; the bag holds: {listing}"
                 )
 
 
@@ -83,7 +83,7 @@ def image_topics(kinds: Mapping[str, str]) -> dict[str, str]:
     Raises:
         ValueError: If two cameras would get one name.
     """
-    topic_of: dict[str, str] = {}
+    topic_of: dict[str, str] = {}  # by the topic without generic last parts
     for image_kind in IMAGES:
         for topic in sorted(kinds):
             parts = topic.split("/")
@@ -96,7 +96,7 @@ def image_topics(kinds: Mapping[str, str]) -> dict[str, str]:
     if len(set(names)) < len(names):
         names = [base.strip("/").replace("/", "_") for base in topic_of]
     if len(set(names)) < len(names):
-        raise InputError(f"the cameras {sorted(topic_of)} get one name: {_REMEDY}")
+        raise InputError(f"some of the cameras {sorted(topic_of)} get one name: {_REMEDY}")
     return dict(zip(names, topic_of.values(), strict=True))
 
 
@@ -130,17 +130,20 @@ def camera_topics(kinds: Mapping[str, str], listing: str) -> dict[str, tuple[str
     claims = defaultdict(list)  # cameras by the topic of their camera info
     for name, topic in cameras.items():
         if len(candidates[topic]) > 1:
-            raise InputError(f"which CameraInfo is that of {topic}, {candidates[topic]}? {_REMEDY}")
+            raise InputError(
+                f"which CameraInfo belongs to {topic}: {' or '.join(candidates[topic])}? {_REMEDY}"
+            )
         claims[candidates[topic][0]].append(name)
     topics = {}
     for info, names in claims.items():
         matching_names = [name for name in names if _words(cameras[name]) == _words(info)]
-        # A camera info in the root could belong to any camera.
-        is_shared_namespace = info.count("/") == 1 and len(claims) > 1
+        # A camera info in the root namespace could belong to any camera.
+        is_in_root = info.count("/") == 1
+        has_other_infos = len(claims) > 1
         if len(matching_names) == 1:
             name = matching_names[0]
-        elif len(names) > 1 or is_shared_namespace:
-            raise InputError(f"is {info} that of {' or '.join(names)}? {_REMEDY}")
+        elif len(names) > 1 or (is_in_root and has_other_infos):
+            raise InputError(f"does {info} belong to {' or '.join(names)}? {_REMEDY}")
         else:
             name = names[0]
         topics[name] = (cameras[name], info)

@@ -22,8 +22,10 @@ from gsmap.utils.files import write_text
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-OVERLAP_DISTANCE_M = 5.0  # a validation sample within this distance of training overlaps it
-# Distances of the report. Patches of 60 x 30 m can overlap up to a distance of 30 m or 60 m.
+# A validation sample overlaps with training if a training sample is within this distance.
+OVERLAP_DISTANCE_M = 5.0
+# Distances of the report. The maps of two samples, patches of 60 x 30 m, overlap up to a distance
+# of 30 m if they lie side by side, and of 60 m if they lie one behind the other.
 _DISTANCES_M = (5.0, 15.0, 30.0, 60.0)
 # Positions (x, y) of samples in metres, by split and by map name.
 Positions = Mapping[str, Mapping[str, list[np.ndarray]]]
@@ -82,7 +84,7 @@ def read_places(paths: Sequence[Path]) -> Places:
         file = AnnotationFile(path)
         file_scenes = file.column("scene")
         file_maps = file.column("map_name")
-        # Without the names of maps, a conversion writes each scene as a map that has its name.
+        # A conversion that does not know the names of the maps writes the scene as map name.
         has_common_maps = file_scenes != file_maps
         if not file.meta.options.get("poses", True) or not has_common_maps:
             raise InputError(

@@ -39,8 +39,8 @@ def _select_scenes(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Select scenes of a map for validation, one after another.
 
-    The first scene is random. Each further one is the scene with which training loses the fewest
-    scenes, as scenes near validation are not used for training.
+    Scenes near a selected scene are lost for training. The first scene is random. Each further
+    scene is the one by which training loses the fewest additional scenes.
 
     Args:
         near: Whether two scenes are near each other. (S, S)
@@ -123,9 +123,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     text = "share of each map's scenes for validation (default: %(default)s)"
     add("--val-share", type=float, default=0.15, help=text)
-    add(
-        "--seed", type=int, default=0, help="another one makes another split (default: %(default)s)"
-    )
+    add("--seed", type=int, default=0, help="seed of the random choice (default: %(default)s)")
 
 
 def run(arguments: argparse.Namespace) -> str:

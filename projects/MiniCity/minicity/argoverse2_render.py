@@ -31,8 +31,9 @@ from minicity.camera import Camera
 from minicity.lighting import random_lighting
 from minicity.renderer import SceneRenderer
 
-VIEW_M = 50.0
-# Edge of a ground pixel in metres, times the width of the image in pixels: 6.25 cm for 800 columns.
+VIEW_M = 50.0  # distance from the track of the vehicle to the edges of the ground
+# Edge of a ground pixel in metres, times the width of the image in pixels. Wider images get a finer
+# ground: ground pixels have an edge of 6.25 cm for images of 800 columns.
 GROUND_PIXELS_PER_IMAGE_PIXEL = 0.0625 * 800
 JPEG_QUALITY = 90
 
@@ -111,7 +112,7 @@ def _make_photographer(
     static_map = ArgoverseStaticMap.from_json(find_map(log.log_dir))
     try:
         heights = GroundHeightLayer.from_file(log.log_dir / "map")
-    except RuntimeError as error:
+    except RuntimeError as error:  # the devkit found no file of ground heights
         raise InputError(f"{error} in {log.log_dir / 'map'}") from error
     scaled_cameras = {name: scaled_camera(camera, scale) for name, camera in cameras.items()}
     widest = max(width for _, width, _ in scaled_cameras.values())

@@ -24,7 +24,7 @@ VEILED_ELEVATION_RAD = 0.3  # elevation of a sun behind clouds
 SKY_CURVE = 0.6  # an exponent below 1 lets the colour change fastest just above the horizon
 WET_SLOPE = 0.12  # slope of the line of sight at which the mirroring drops to 1 / e
 LEAST_VEIL = 0.02  # weaker haze is left out
-NEAREST_GROUND_M = 0.1
+NEAREST_GROUND_M = 0.1  # lower limit of the distances by which the slope is computed
 
 NOISE_PX = 1024  # edge of the noise tile
 NOISE_SEED = 7
@@ -81,6 +81,7 @@ _LOOKS: dict[str, tuple[Any, ...]] = {
     "wet": (0.0, 0.0, 0.0, 0.55),
     "noise": (2.0, 2.5, 4.5, 4.0),
 }
+# Exposure factor (blue, green, red) of each weather, before the random brightness and warmth.
 _GAINS = ((1.08, 1.1, 1.12), (1.02, 1.0, 0.98), (0.52, 0.5, 0.62), (0.74, 0.72, 0.7))
 
 
@@ -99,12 +100,13 @@ def random_lighting(rng: np.random.Generator) -> Lighting:
     streaks = 0
     if weather == "rain":
         streaks = int(rng.integers(RAIN_STREAKS[0], RAIN_STREAKS[1]))
-    level = np.cos(elevation)  # horizontal part of the direction towards the sun
+    horizontal = np.cos(elevation)  # length of the horizontal part of the direction to the sun
+    sun = [horizontal * np.cos(azimuth), horizontal * np.sin(azimuth), np.sin(elevation)]
     blue, green, red = _GAINS[column]
     look = {name: values[column] for name, values in _LOOKS.items()}
     return Lighting(
         weather=weather,
-        sun=np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]),
+        sun=np.array(sun),
         gain=(bright * (blue - warm), bright * green, bright * (red + warm)),
         streaks=streaks,
         **look,
@@ -125,10 +127,11 @@ def render_sky(camera: Camera, lighting: Lighting) -> Image:
     pixels = np.stack([np.full(rows.shape, camera.width / 2), rows, np.ones(rows.shape)])
     directions = camera.world_from_pixel @ pixels
     # Sine of the elevation of each row, which is 0 at the horizon and 1 overhead.
-    rise = np.clip(directions[2] / np.linalg.norm(directions, axis=0), 0, 1) ** SKY_CURVE
+    sines = np.clip(directions[2] / np.linalg.norm(directions, axis=0), 0, 1)
+    top_share = sines**SKY_CURVE
     top = np.array(lighting.sky_top)
     low = np.array(lighting.haze)
-    column = (low + rise[:, None] * (top - low)).astype(np.uint8)
+    column = (low + top_share[:, None] * (top - low)).astype(np.uint8)
     size = (camera.width, camera.height)
     return cv2.resize(column[:, None], size, interpolation=cv2.INTER_NEAREST)
 
@@ -142,16 +145,18 @@ def haze_ground(image: Image, distance_m: Array, eye_m: float, lighting: Lightin
         eye_m: Height of the camera above the ground in metres.
         lighting: Haze and wetness.
     """
-    veil = 1 - np.exp(-distance_m / lighting.haze_m)
+    # Share of the sky's colour in each row: by haze or by the mirroring, whichever is stronger.
+    haze_share = 1 - np.exp(-distance_m / lighting.haze_m)
     slope = eye_m / np.maximum(distance_m, NEAREST_GROUND_M)
-    veil = np.maximum(veil, lighting.wet * np.exp(-slope / WET_SLOPE))
+    mirror_share = lighting.wet * np.exp(-slope / WET_SLOPE)
+    veil = np.maximum(haze_share, mirror_share)
     hazy_rows = np.flatnonzero((veil > LEAST_VEIL) & np.isfinite(distance_m))
     if not len(hazy_rows):
         return
     window = slice(int(hazy_rows[0]), int(hazy_rows[-1]) + 1)
-    share = (1 - veil[window]).astype(np.float32)[:, None, None]
-    haze = np.asarray(lighting.haze, dtype=np.float32) * (1 - share)
-    image[window] = (image[window] * share + haze).astype(np.uint8)
+    ground_share = (1 - veil[window]).astype(np.float32)[:, None, None]
+    haze = np.asarray(lighting.haze, dtype=np.float32) * (1 - ground_share)
+    image[window] = (image[window] * ground_share + haze).astype(np.uint8)
 
 
 def finish(image: Image, lighting: Lighting, rng: np.random.Generator) -> Image:

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from minicity.camera import Camera
 from minicity.curves import Array
 
-BASE_WIDTH, BASE_HEIGHT = 1600, 900
-LIDAR_POSITION = (0.94, 0.0, 1.84)
+BASE_WIDTH, BASE_HEIGHT = 1600, 900  # size of a full-size image in pixels
+LIDAR_POSITION = (0.94, 0.0, 1.84)  # in the ego frame (x forward, y left, z up), in metres
 # Camera axes (z forward, x right, y down) in the ego frame (x forward, y left, z up).
 _CAMERA_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 

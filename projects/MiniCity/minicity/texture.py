@@ -13,7 +13,7 @@ from minicity.scene_map import MATERIALS, PAINTS, SceneMap
 
 SHIFT = 4  # fractional bits of OpenCV's fixed-point coordinates
 TILE_PX = 1024  # edge of the noise tiles
-LEVELS = 6
+LEVELS = 6  # resolutions of the colour image
 BLOTCH_WEIGHT = 0.16  # weight of the large noise in the brightness of the ground
 GRAIN_WEIGHT = 0.75  # weight of the fine noise in the brightness of the ground
 Image = MatLike
@@ -82,7 +82,8 @@ def _tile_noise(tile: Image, shape: tuple[int, int], start: list[int]) -> Image:
 
 def _fixed_point_pixels(points: Array, origin: Array, resolution_m: float) -> NDArray[np.int32]:
     """Pixels of world points in OpenCV's fixed-point format. (n, 2) or (n, 3) -> (n, 2)"""
-    px = (np.asarray(points)[:, :2] - origin) / resolution_m - 0.5  # 0 at a pixel's centre
+    # In OpenCV's coordinates the centre of a pixel, not its corner, is at a whole number.
+    px = (np.asarray(points)[:, :2] - origin) / resolution_m - 0.5
     return np.round(px * (1 << SHIFT)).astype(np.int32)
 
 
@@ -115,10 +116,10 @@ def paint_ground(
     color[:] = MATERIALS["grass"]
     _paint_surfaces(color, scene, origin=origin, resolution_m=resolution_m)
     _paint_kerbs(color, scene, origin=origin, resolution_m=resolution_m)
-    # The noise has a mean of 128, by which the brightness is divided. Blotches have a mean of
-    # 127.5, and grain has 128.
-    mean = 128 - BLOTCH_WEIGHT * 127.5 - GRAIN_WEIGHT * 128
-    noise = cv2.addWeighted(blotches, BLOTCH_WEIGHT, grain, beta=GRAIN_WEIGHT, gamma=mean)
+    # The colours are multiplied by noise / 128. The offset gives the noise a mean of 128, which
+    # keeps the mean brightness. Blotches have a mean of 127.5, and grain has a mean of 128.
+    offset = 128 - BLOTCH_WEIGHT * 127.5 - GRAIN_WEIGHT * 128
+    noise = cv2.addWeighted(blotches, BLOTCH_WEIGHT, grain, beta=GRAIN_WEIGHT, gamma=offset)
     color = cv2.multiply(color, cv2.merge([noise] * 3), scale=1 / 128)
     opacity = np.zeros((rows, columns), dtype=np.uint8)
     for marking in scene.markings:
@@ -138,6 +139,7 @@ def paint_ground(
         origin=origin,
         resolution_m=resolution_m,
         levels=_halve_repeatedly(color),
+        # Paint reflects laser pulses more strongly than the ground.
         reflectivity=cv2.addWeighted(gray, 0.12, opacity, beta=0.45, gamma=0),
     )
 
@@ -201,7 +203,9 @@ def _paint_coat(
     # OpenCV rounds edges along the axes to whole pixels, so the paint is drawn at twice the
     # resolution and averaged.
     px = [_fixed_point_pixels(outline, origin, resolution_m / 2) for outline in outlines]
-    all_px = np.concatenate(px) >> (SHIFT + 1)  # whole pixels of the texture, without half pixels
+    # Whole pixels of the texture: SHIFT bits are the fraction, and one bit the doubled resolution.
+    all_px = np.concatenate(px) >> (SHIFT + 1)
+    # The window has a margin of two pixels, for smoothed edges; `high` is exclusive.
     low = np.maximum(all_px.min(axis=0) - 2, 0)
     high = np.minimum(all_px.max(axis=0) + 3, blotches.shape[::-1])  # columns, rows
     if (high <= low).any():
@@ -228,7 +232,7 @@ def _blend(target: Image, paint: tuple[int, int, int], alpha: Image) -> None:
     rows, columns = np.nonzero(alpha)
     opacity = alpha[rows, columns, None].astype(np.float32) / 255
     under = target[rows, columns].astype(np.float32)
-    # The grain of the surface modulates the paint.
+    # The grain of the surface modulates the paint. Grey level 90 leaves its colour unchanged.
     brightness = np.clip(under.mean(axis=1, keepdims=True) / 90, 0.5, 1.4)
     coat = np.asarray(paint, dtype=np.float32) * (0.86 + 0.14 * brightness)
     target[rows, columns] = np.clip(under + opacity * (coat - under), 0, 255).astype(np.uint8)
@@ -253,8 +257,9 @@ def darken(texture: GroundTexture, outlines: list[Array], strength: float) -> Gr
     for outline in outlines:
         px = _fixed_point_pixels(outline, texture.origin, texture.resolution_m)
         cv2.fillPoly(light, [px], color=(shade,), lineType=cv2.LINE_AA, shift=SHIFT)
-    size = 2 * max(1, round(0.15 / texture.resolution_m)) + 1
-    light = cv2.blur(light, (size, size))
+    radius_px = max(1, round(0.15 / texture.resolution_m))
+    size_px = 2 * radius_px + 1
+    light = cv2.blur(light, (size_px, size_px))
     levels = []
     for level in texture.levels:
         level_size = level.shape[1::-1]  # (columns, rows)

@@ -64,7 +64,10 @@ def _add_lights(mesh: Mesh, face: Array, color: Color) -> None:
 
 
 def _add_motor_vehicle(mesh: Mesh, size: Size, color: Color, tall: bool) -> None:
-    """Add a car with a cabin on its body, or a tall box with windows along its sides."""
+    """Add a car with a cabin on its body, or a tall box with windows along its sides.
+
+    Faces of a higher ``layer`` are drawn over the faces of lower ones.
+    """
     height = size[2]
     shoulder_share = 0.9 if tall else 0.55
     shoulder_m = height * shoulder_share  # top of the body
@@ -135,7 +138,7 @@ def vehicle_mesh(vehicles: list[Vehicle]) -> FrozenMesh:
     floor = centers - half_heights  # centres of the bottoms
     quads = np.concatenate([t.quads for t in templates])
     discs = np.concatenate([t.discs for t in templates])
-    discs[:, :3] += floor[disc_groups]
+    discs[:, :3] += floor[disc_groups]  # no rotation: the disc of a head lies on the vertical axis
     # Rotation of each of the four corners of a quad. (F, 4, 3)
     turned_quads = np.einsum("fij,fkj->fki", turn[quad_groups], quads)
     world_quads = turned_quads + floor[quad_groups][:, None]
@@ -149,5 +152,5 @@ def vehicle_mesh(vehicles: list[Vehicle]) -> FrozenMesh:
         disc_colors=np.concatenate([t.disc_colors for t in templates]),
         disc_groups=disc_groups,
         anchors=centers,
-        backdrop=np.zeros(len(vehicles), dtype=bool),
+        backdrop=np.zeros(len(vehicles), dtype=bool),  # no object is a building
     )

@@ -134,7 +134,7 @@ def test_topics_can_be_paired_by_hand(drive, minicity_root, tmp_path):
     recorder = Recorder(tmp_path / "odd", "sqlite")
     recorder.info_topic, recorder.image_topic = "/lens_of_{}_x", "/{}"
     record(recorder, [sample], minicity_root)
-    with pytest.raises(ValueError, match=r"which CameraInfo is that of /CAM_.*--topics NAME="):
+    with pytest.raises(ValueError, match=r"which CameraInfo belongs to /CAM_.*--topics NAME="):
         open_input(recorder.path, options(tmp_path))
     names = [camera.name for camera in sample.cameras]
     words = [f"my_{n}=/{n}/compressed,/lens_of_{n}_x" for n in names]
@@ -169,10 +169,10 @@ OF_FLAT = "cam_front=/cam_front_info cam_rear=/cam_rear_info"
         ("/v/front_image", "/v/front_info /v/rear_info", "front_image=/v/front_info"),
         ("/front/image /debug", "/front/camera_info", "front=/front/camera_info"),
         ("/front/image /front/seen/image", "/front/camera_info", "front=/front/camera_info"),
-        ("/left/image /right/image", "/camera_info", "is /camera_info that of left or right?"),
-        ("/s/left /s/right", "/s/camera_info", "is /s/camera_info that of left or right?"),
-        ("/left/image /right/image", "/right/camera_info /x_info", "is /x_info that of left?"),
-        ("/front", "/one_info /two_info", "which CameraInfo is that of /front"),
+        ("/left/image /right/image", "/camera_info", "does /camera_info belong to left or right?"),
+        ("/s/left /s/right", "/s/camera_info", "does /s/camera_info belong to left or right?"),
+        ("/left/image /right/image", "/right/camera_info /x_info", "does /x_info belong to left?"),
+        ("/front", "/one_info /two_info", "which CameraInfo belongs to /front"),
         ("/debug", "/front/camera_info", "no camera with images"),
     ],
 )

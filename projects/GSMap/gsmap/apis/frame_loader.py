@@ -1,4 +1,4 @@
-"""Frames for inference, with blank images for absent cameras, and separate broken frames."""
+"""Frames for inference. Absent cameras get blank images, and broken frames are set apart."""
 
 import copy
 import errno
@@ -39,7 +39,8 @@ class FrameDataset(Dataset):
     """Frames of a test data set; errors of a frame become a `BrokenFrame`.
 
     Args:
-        dataset: The data set; the model expects its ``cameras``.
+        dataset: The data set. Its ``cameras`` are the names of the cameras that the model expects;
+            without names, frames are loaded as they are.
         blank_cameras: Whether absent cameras of a frame get black images, as long as the frame has
             another camera. Otherwise such a frame is broken.
     """

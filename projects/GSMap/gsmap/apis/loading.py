@@ -22,9 +22,10 @@ from gsmap.utils.model_facts import MOUNT, RIG
 
 _LOGGER = logging.getLogger(__name__)
 _USUAL_DATASETS = ("nuscenes", "minicity", "av2")  # data sets with the usual mount of a frame
-_FARTHEST_M = 100.0
-_HIGHEST_M = 10.0
-_LARGEST_PX = 1e5
+# Limits of the values that a checkpoint may contain.
+_FARTHEST_M = 100.0  # of the entries of a mount
+_HIGHEST_M = 10.0  # of the height of the ground
+_LARGEST_PX = 1e5  # of the sizes and intrinsics of cameras
 
 
 def load_model(
@@ -139,14 +140,17 @@ def _training_mount(cfg: Config, contents: Checkpoint | None, path: object) -> M
     options = cfg.test_dataloader.dataset
     frame = options.get("frame") or "lidar"
     meta = contents.dataset_meta if contents else {}
-    if meta.get("frame", frame) != frame or frame not in RANGES:
+    # A mount in the checkpoint is the pose of the frame that the checkpoint names.
+    names_other_frame = meta.get("frame", frame) != frame
+    if names_other_frame or frame not in RANGES:
         return Mount(frame)
     height = meta.get("ground_z_m")
     if height is None:
         height = options.get("ground_z_m")
     matrix = meta.get(MOUNT)
     if height is None and matrix is None:
-        if meta.get("dataset", _USUAL_DATASETS[0]) not in _USUAL_DATASETS:
+        dataset = meta.get("dataset", _USUAL_DATASETS[0])  # older files do not record it
+        if dataset not in _USUAL_DATASETS:
             _LOGGER.warning(
                 "%s does not say how high its frame %r lies above the road (train it on files with "
                 "ground_z_m or ego_from_frame): the usual %.2f m are taken.",
@@ -167,7 +171,7 @@ def _check_height(value: Any) -> float:
     """Convert a height of the ground in a file to metres; ValueError if it is not possible."""
     height = float(value)
     if not abs(height) <= _HIGHEST_M:  # refuses NaN as well
-        raise InputError("no place on a vehicle")
+        raise InputError(f"the ground is not within {_HIGHEST_M:g} m of it")
     return height
 
 
@@ -176,5 +180,5 @@ def _check_mount(value: Any) -> np.ndarray:
     matrix = np.array(value, dtype=np.float64)
     is_near = matrix.shape == (4, 4) and abs(matrix).max() < _FARTHEST_M
     if not is_near or not is_rigid(matrix):
-        raise InputError("no place on a vehicle")
+        raise InputError(f"it is not a rigid transform with values below {_FARTHEST_M:g} m")
     return matrix

@@ -166,8 +166,8 @@ class StepGraphs:
                 around the model.
         """
         if torch.is_autocast_enabled(images.device.type):
-            # The cache of autocast holds cast weights: all later steps would use those of the
-            # recorded step.
+            # Autocast caches weights cast to half precision: all later steps would use the cached
+            # weights of the recorded step.
             raise InputError(
                 f"{SWITCH}=True does not go with --amp: leave it out, and set "
                 "model.autocast=bfloat16."
@@ -183,6 +183,7 @@ class StepGraphs:
                 "the previous step: set optim_wrapper.accumulative_counts=1, or leave out the "
                 "switch."
             )
+        # The number of parameters changes if some of them are frozen during the training.
         key = (len(params), *((tensor.shape, tensor.dtype) for tensor in inputs))
         recording = self._recordings.get(key)
         if recording is None:
@@ -272,7 +273,7 @@ def _record(model: Any, inputs: Sequence[Tensor], params: Sequence[Tensor]) -> _
             for _ in range(_WARM_UP):  # errors of the input are raised here
                 outputs = step(*buffers)
                 run_backward(outputs, _empty_grads(outputs))
-            del outputs
+            del outputs  # frees the tensors of the last step before the recording
         torch.cuda.current_stream().wait_stream(stream)
         try:
             with capture(forward):

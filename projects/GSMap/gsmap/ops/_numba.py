@@ -16,8 +16,9 @@ import gsmap.utils.compilation  # noqa: F401 - logs that kernels are compiled
 
 SERIAL_BELOW = 1 << 16  # pixels; starting a thread costs about as much as filling this many
 
-# Associative sums may be split into vector lanes, always in one order, so that results repeat.
-# NaN and infinity keep their meaning.
+# Options of the compiler. A sum may be reordered, so that it is computed in vector lanes. The order
+# is fixed when a kernel is compiled, so that results are repeatable. Options under which NaN and
+# infinity lose their meaning are left out.
 FASTMATH = {"reassoc", "contract", "nsz", "arcp"}
 
 
@@ -72,6 +73,7 @@ def pixel_range(low, high, origin, step, size):  # type: ignore[no-untyped-def]
     """
     first = (low - origin) / step - 0.5
     last = (high - origin) / step - 0.5
+    # The limits lie in [0, size] and [-1, size - 1]: the range is empty beside the raster.
     start = math.ceil(min(max(first, 0.0), size))
     end = math.floor(max(min(last, size - 1.0), -1.0)) + 1
     return start, end

@@ -103,14 +103,14 @@ class GaussianPrior:
         content = path.read_bytes()
         if not content:
             raise InputError(f"{path} is empty: copy or build it again.")
-        found, rule, places = read_header(content, path, magic=GAUSSIAN_MAGIC)
+        file_settings, rule, places = read_header(content, path, magic=GAUSSIAN_MAGIC)
         if settings is not None:
-            settings.require_equal(found, str(path))
-        prior = cls(found, rule)
+            settings.require_equal(file_settings, str(path))
+        prior = cls(file_settings, rule)
         for key, (offset, length, crc) in places.items():
             packed = content[offset : offset + length]
             stored = _unpack(packed, crc=crc, path=path)
-            _check_stored(stored, settings=found, path=path)
+            _check_stored(stored, settings=file_settings, path=path)
             prior._tiles[key] = stored
         return prior
 
@@ -169,9 +169,9 @@ class GaussianPrior:
         """Update the prior with the prediction of a frame.
 
         A Gaussian is measured by the nearest line of its class that crosses its normal within
-        1.5 m. Gaussians in view without such a line count a miss. Points of lines without a
-        Gaussian of their class, within 1.5 m across and three quarters of the spacing along the
-        line, become Gaussians.
+        1.5 m. Gaussians in view without such a line count a miss. A new Gaussian is added at each
+        point of a line that no Gaussian of its class is near: none within 1.5 m across the line and
+        three quarters of the spacing along it.
 
         Args:
             pose: Transform from the frame to the global frame, in metres. Far from the origin it
@@ -204,8 +204,8 @@ class GaussianPrior:
                 is_of_class = active.labels == label
                 of_class = active.select(is_of_class)
                 lines = sample_lines(elements, label, frame, rule=self.rule)
-                found = measure(of_class.means, of_class.angles, lines)
-                of_class.update(found, is_in_view[is_of_class], self.rule)
+                measurements = measure(of_class.means, of_class.angles, lines)
+                of_class.update(measurements, is_in_view[is_of_class], self.rule)
                 kept = of_class.select(~of_class.are_forgotten(self.rule))
                 parts.append(kept)
                 parts.append(_new_gaussians(kept, lines, label=label, rule=self.rule))
@@ -377,31 +377,35 @@ class _Active:
         return is_inside
 
     def update(
-        self, found: Measurements, is_in_view: NDArray[np.bool_], rule: GaussianRule
+        self, measurements: Measurements, is_in_view: NDArray[np.bool_], rule: GaussianRule
     ) -> None:
         """Update Gaussians by their measurements, and count hits and misses.
 
         Args:
-            found: Measurements. (N,) each
+            measurements: Measurements. (N,) each
             is_in_view: Whether a Gaussian is in view. (N,)
             rule: Settings.
         """
-        seen = is_in_view | found.is_found
+        # A line at the edge of the view may measure a Gaussian that is just outside.
+        is_observed = is_in_view | measurements.is_found
         variances, gains = fuse_across(
-            self.variances, found, rule.decay, least_variance=rule.least_sigma_m**2
+            self.variances, measurements, rule.decay, least_variance=rule.least_sigma_m**2
         )
         normals = np.stack([-np.sin(self.angles), np.cos(self.angles)], axis=1)
-        self.means = self.means + (gains * found.distances)[:, None] * normals
-        self.angles = self.angles + gains * found.turns
+        self.means = self.means + (gains * measurements.distances)[:, None] * normals
+        self.angles = self.angles + gains * measurements.turns
         self.variances = variances
-        decay = np.where(seen, rule.decay, 1.0)
-        self.hits = decay * self.hits + found.scores
-        self.misses = decay * self.misses + np.where(seen, 1.0 - found.scores, 0.0)
+        scores = measurements.scores
+        decay = np.where(is_observed, rule.decay, 1.0)
+        self.hits = decay * self.hits + scores
+        self.misses = decay * self.misses + np.where(is_observed, 1.0 - scores, 0.0)
 
     def scatter(self, tiles: dict[TileKey, Stored], tile_m: float) -> None:
         """Distribute the Gaussians to tiles, to whose content they are added."""
         places = np.floor(self.means / tile_m).astype(np.int64)
-        keys, rows = np.unique(places, axis=0, return_inverse=True)
+        # Versions of NumPy differ in the shape of the inverse, (N,) or (N, 1).
+        keys, key_indices = np.unique(places, axis=0, return_inverse=True)
+        key_indices = key_indices.ravel()
         stored = np.zeros(len(self.labels), _STORED)
         stored["label"] = self.labels
         stored["position"] = self.means - tile_m * places
@@ -410,7 +414,7 @@ class _Active:
         stored["hits"] = self.hits
         stored["misses"] = self.misses
         for number, (column, row) in enumerate(keys.tolist()):
-            added = stored[rows.ravel() == number]
+            added = stored[key_indices == number]
             present = tiles.get((column, row), np.zeros(0, _STORED))
             tiles[column, row] = np.concatenate([present, added])
 
@@ -448,8 +452,10 @@ def _unpack(content: bytes, crc: int, path: Path) -> Stored:
     count = int.from_bytes(content[:_COUNT_BYTES], "little")
     if zlib.crc32(content) != crc or len(content) < _COUNT_BYTES or count > _MOST_PER_TILE:
         raise InputError(f"{path} is damaged: a tile cannot be read; copy or build it again.")
-    packed = content[_COUNT_BYTES:]  # its checksum was checked with the count
+    packed = content[_COUNT_BYTES:]
     num_bytes = count * _STORED.itemsize
+    # `unpack_tile` needs a checksum of the compressed bytes alone. The stored checksum includes the
+    # count, and is checked above.
     states = unpack_tile(packed, crc=zlib.crc32(packed), num_bytes=num_bytes, path=path)
     return np.frombuffer(states, dtype=_STORED)
 

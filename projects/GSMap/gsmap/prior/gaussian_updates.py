@@ -158,7 +158,7 @@ def measure(means: FloatArray, angles: FloatArray, lines: LineSamples) -> Measur
     # Ends of each segment, along and across the Gaussian of its pair.
     starts = _offsets(start_points[segments], means[rows], angles=angles[rows])
     ends = _offsets(end_points[segments], means[rows], angles=angles[rows])
-    extent, rise = (ends - starts).T
+    extent, rise = (ends - starts).T  # of each segment along and across the Gaussian
     start_along, start_across = starts.T
     end_along = ends[:, 0]
     # The segment crosses the normal, where `along` is 0, at this share of its length. A segment
@@ -249,9 +249,10 @@ def fuse_across(
     Returns:
         New variances in square metres (N,), and gains in [0, 1], 0 without a measurement (N,).
     """
-    information = decay / variances
-    measured = found.is_found / found.variances
-    fused = 1.0 / (information + measured)
-    gains = fused * measured
-    new_variances = np.where(found.is_found, np.maximum(fused, least_variance), variances)
+    stored_information = decay / variances
+    measured_information = found.is_found / found.variances
+    fused_variances = 1.0 / (stored_information + measured_information)
+    gains = fused_variances * measured_information
+    limited_variances = np.maximum(fused_variances, least_variance)
+    new_variances = np.where(found.is_found, limited_variances, variances)
     return new_variances, gains

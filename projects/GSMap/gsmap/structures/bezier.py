@@ -16,7 +16,9 @@ from gsmap.utils.errors import InputError
 
 MAX_DEGREE = 5
 SAMPLES = 100  # points of a line and of a piece that a fit compares, both ends included
-_WORK = 2000  # limit of the search for joints, in points to compare per vertex of the line
+# Limit of the work of a search for joints, per vertex of the line. The work of a fit is the number
+# of points that it compares.
+_WORK = 2000
 
 Float = NDArray[np.float64]
 Deviation = Callable[[Float, Float], float]
@@ -130,6 +132,7 @@ def largest_deviation(line: Float, curve: Float) -> float:
     # Imported here: result files are read without numba.
     from gsmap.structures.curve_kernels import largest_deviation as compiled
 
+    # The search for the largest distance ends at ``enough``, here never.
     return compiled(_in_plane(line), _in_plane(curve), num_points=SAMPLES, enough=np.inf)
 
 
@@ -153,6 +156,7 @@ def _fit_test(degree: int, max_error_m: float, deviation: Deviation) -> Callable
     weights = bernstein(degree)
 
     def fits_compiled(part: Float) -> bool:
+        # The computation ends early when the error reaches ``enough``, as the piece does not fit.
         error_m = deviation_of_fit(_in_plane(part), inverse, weights=weights, enough=max_error_m)
         return bool(error_m < max_error_m)
 

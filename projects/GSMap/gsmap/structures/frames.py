@@ -84,9 +84,10 @@ def viewing_azimuth(img_from_frame: FloatArray, view: FrameView) -> float:
     return float(np.arctan2(-right, ahead))
 
 
-# Heights: the roof LiDAR of nuScenes is 1.84 m above the road, and the origin of the vehicle frame
-# on the road. The origin of the ego frame of Argoverse 2 is on the rear axle, 0.31 m above the road
-# (median z of map vertices within 8 m). Vehicles: Renault Zoe, Ford Fusion.
+# "lidar" is the frame of the roof LiDAR of nuScenes, 1.84 m above the road; the origin of the
+# vehicle frame of nuScenes is on the road, hence the default of `ego_ground_z_m`. "ego" is the
+# vehicle frame of Argoverse 2; its origin is on the rear axle, 0.31 m above the road (median z of
+# map vertices within 8 m). The vehicles are a Renault Zoe (nuScenes) and a Ford Fusion.
 FRAME_VIEWS: dict[str, FrameView] = {
     "lidar": FrameView(forward="y", ground=(0.0, 0.0, -1.84), vehicle_m=(-1.59, 2.49, 1.73)),
     "ego": FrameView(

@@ -187,7 +187,11 @@ def in_float32(layer: nn.Module, values: Tensor) -> Tensor:
 
 
 def check_same_shape(**both: Tensor) -> None:
-    """Raise ValueError if two tensors, given by their names in the message, differ in shape."""
+    """Raise ValueError if two tensors differ in shape.
+
+    Args:
+        both: The two tensors. Their keywords are their names in the message.
+    """
     (first_name, first), (name, second) = both.items()
     if first.shape != second.shape:
         raise InputError(
@@ -214,7 +218,10 @@ def num_depth_bins(depth_range: tuple[float, float, float]) -> int:
 
 
 def tensor_versions(module: nn.Module) -> list[tuple[int, int]]:
-    """Address and version of each tensor of a module, which change with its values."""
+    """Address and version of each tensor of a module, which change with its values.
+
+    Tensors that were made in inference mode have no version, and get 0.
+    """
     tensors = [*module.parameters(), *module.buffers()]
     return [(t.data_ptr(), 0 if t.is_inference() else t._version) for t in tensors]
 

@@ -138,9 +138,9 @@ def run_command(command: Callable[[], str | None], clean_up_on_kill: bool = True
     * After ``kill``: exit code 143. After the end of its terminal: exit code 129.
     * After any other error: a traceback.
 
-    Half-written files are removed in all cases. If the caller has blocked these signals, they are
-    unblocked for the command and its workers. Forked workers die with the command. With the
-    environment variable ``GSMAP_TRACEBACK`` every error has a traceback.
+    Half-written files are removed in all cases. Signals that end a command (``END_SIGNALS``) are
+    unblocked for the command and its workers, if the caller has blocked them. Forked workers die
+    with the command. With the environment variable ``GSMAP_TRACEBACK`` every error has a traceback.
 
     Args:
         command: Function that returns the text to print, or None.
@@ -163,11 +163,12 @@ def _is_rank() -> bool:
 
 
 def end_process(code: int) -> NoReturn:
-    """End the process after its exit functions, without the end of the interpreter.
+    """Run the exit functions of the process and end it, without the shutdown of the interpreter.
 
-    The threads of gloo take the lock of the interpreter in C++ destructors. At the end of the
-    interpreter, Python stops a thread that waits for this lock. In a destructor this aborts the
-    process, and the main thread may wait forever for such a thread if it deletes a process group.
+    The threads of gloo take the lock of the interpreter (GIL) in C++ destructors. During the
+    shutdown, Python stops every thread that waits for this lock. Stopping a thread inside a
+    destructor aborts the process. If the main thread is deleting a process group, it may also wait
+    forever for the stopped thread.
 
     Args:
         code: Exit code.
@@ -220,7 +221,7 @@ def _run(command: Callable[[], str | None], clean_up_on_kill: bool) -> None:
             if handler.received == signal.SIGINT:
                 raise KeyboardInterrupt
             raise SystemExit(128 + handler.received)
-    except KeyboardInterrupt:  # including a rank that met an error of its peers before
+    except KeyboardInterrupt:  # also a signal that was found behind another error above
         handler.has_ended = True
         if is_first_rank():
             sys.stderr.write(INTERRUPTED_TEXT)
@@ -237,7 +238,8 @@ def _install(handler: "_SignalHandler", clean_up_on_kill: bool) -> None:
     """Install the handlers of signals and of errors in threads, and unblock the signals."""
     logging.raiseExceptions = False  # no traceback for a log file on a full disk
     threading.excepthook = _report_thread_error
-    if getattr(sys.unraisablehook, "func", None) is not _hide_signal:
+    is_installed = getattr(sys.unraisablehook, "func", None) is _hide_signal
+    if not is_installed:  # the first command of the process
         sys.unraisablehook = partial(_hide_signal, sys.unraisablehook)
     kill_forks_with_parent()
     report_lost_batches()
@@ -355,7 +357,12 @@ def _signal_behind(error: BaseException | None) -> _SignalError | None:
 
 
 def _hide_signal(default_hook: Callable[[Any], object], args: Any) -> None:
-    """Hide signal exceptions that Python drops, as they are sent again; ``sys.unraisablehook``."""
+    """Hook for ``sys.unraisablehook`` that hides signal exceptions, as the signals are sent again.
+
+    Args:
+        default_hook: Hook for all other exceptions that Python drops.
+        args: Argument of the hook, with the exception in ``exc_value``.
+    """
     if not isinstance(args.exc_value, _SignalError):
         default_hook(args)
 

@@ -81,6 +81,7 @@ def file_names(foreign: Iterable[str], endings: Sequence[str] = ("",)) -> dict[s
         The safe name of each name.
     """
     names = {name: file_name(name) for name in foreign}
+    # A changed name may coincide with another file, so names are changed until no name changes.
     while True:
         uses: Counter[str] = Counter()
         for name in names.values():
@@ -180,7 +181,7 @@ def atomic_write(path: str | Path, mode: Literal["w", "wb"] = "w") -> Iterator[I
             file.flush()
             if not special:
                 os.fsync(file.fileno())
-                forget_output(path)
+                forget_output(path)  # the command may read the new file
                 os.replace(partial_file, path)
     except Exception as raised:
         # A system error about the temporary file, or without a path, gets the path that the caller
@@ -210,7 +211,8 @@ class _RawFile(io.FileIO):
 
 def _open_unlinked(path: str, flags: int) -> int:
     """Open a file for writing; links are followed for devices and pipes only."""
-    if not _is_special(Path(path)):  # such as /dev/stdout
+    may_be_link = _is_special(Path(path))  # such as /dev/stdout
+    if not may_be_link:
         flags |= os.O_NOFOLLOW
     return os.open(path, flags=flags, mode=0o666)
 
@@ -483,8 +485,8 @@ def _remove_leftovers(folder: Path) -> None:
             handle = _open(folder / name)
             try:
                 age_s = time.time() - os.fstat(handle).st_mtime
-                has_reliable_lock = match[1] == _MACHINE or age_s > _DAY_S
-                if has_reliable_lock and try_lock(handle):
+                is_of_this_machine = match[1] == _MACHINE
+                if (is_of_this_machine or age_s > _DAY_S) and try_lock(handle):
                     _remove(folder / name)
             finally:
                 os.close(handle)
@@ -513,5 +515,6 @@ def _is_special(path: Path) -> bool:
         mode = path.stat(follow_symlinks=follow).st_mode
     except OSError:
         return False
-    is_plain = stat.S_ISREG(mode) and path.parent != _DEVICES
-    return not (is_plain or stat.S_ISDIR(mode) or stat.S_ISLNK(mode))
+    # A regular file behind a link in /dev, such as /dev/stdout, is not replaced either.
+    is_replaceable = stat.S_ISREG(mode) and path.parent != _DEVICES
+    return not (is_replaceable or stat.S_ISDIR(mode) or stat.S_ISLNK(mode))

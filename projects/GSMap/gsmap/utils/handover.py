@@ -27,18 +27,20 @@ def report_lost_batches() -> None:
 
 def _send_error(queue: "queues.Queue[Any]", error: Exception, item: Any) -> None:
     """Send an error with the index of a batch in place of the batch."""
-    from torch._utils import ExceptionWrapper  # torch is loaded in a worker of a data loader
+    # Imported here, so that importing this module does not load torch. A worker has loaded it.
+    from torch._utils import ExceptionWrapper
 
     index: Any = None
     batch: Any = None
     if isinstance(item, tuple) and len(item) == 2:
         index, batch = item
-    if not isinstance(index, int) or isinstance(batch, ExceptionWrapper):
+    is_batch = isinstance(index, int) and not isinstance(batch, ExceptionWrapper)
+    if not is_batch:  # an item of another queue, or an error that cannot be sent
         _default_handler(error, item)
         return
     try:
         raise InputError(
             f"a worker could not hand over what it read ({error}): {_REMEDY}."
         ) from error
-    except ValueError:  # ExceptionWrapper stores the exception that is being handled
+    except InputError:  # ExceptionWrapper stores the exception that is being handled
         queue.put((index, ExceptionWrapper(where="in a data loader's worker")))

@@ -9,7 +9,9 @@ from types import MappingProxyType, ModuleType
 
 _MAPTR = "gsmap.models.maptr"
 _BASE = "gsmap.models.base"
+# Modules that moved from `gsmap.models.maptr` to `gsmap.models.base`.
 _BASE_MODULES = ("coder", "decoder", "head", "layers", "masks", "pairs", "parts")
+# Modules that moved from `gsmap.evaluation` to a subpackage, by the name of the subpackage.
 _EVALUATION = {
     "core": (
         "average_precision",

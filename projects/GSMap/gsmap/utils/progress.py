@@ -13,7 +13,10 @@ _UNKNOWN_TOTAL = "{desc}{n_fmt} {unit}, {elapsed}"
 
 
 class Progress(tqdm):
-    """tqdm's progress bar; without a terminal, a plain line per minute, at the start and the end.
+    """tqdm's progress bar on a terminal.
+
+    In a file or a pipe, plain lines are written instead: one at the start, one per minute, and one
+    at the end.
 
     Args:
         *args: Positional arguments of ``tqdm``.
@@ -26,7 +29,7 @@ class Progress(tqdm):
             kwargs |= _EVERY_MINUTE
             kwargs |= {"desc": title, "bar_format": _FORMAT, "file": _Lines(sys.stderr)}
         else:
-            # the bar moves the cursor, which `PrintableStream` would suppress
+            # The bar moves the cursor by control characters, which `PrintableStream` would escape.
             kwargs.setdefault("file", unescaped_stream(sys.stderr))
         super().__init__(*args, **kwargs)
 

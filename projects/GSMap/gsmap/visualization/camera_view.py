@@ -120,7 +120,7 @@ def arrange_cameras(cameras: Sequence[Camera], view: FrameView) -> list[list[Cam
     for camera in cameras:
         azimuth = viewing_azimuth(camera.img_from_frame, view)
         if abs(azimuth) > np.pi / 2 + 1e-3:
-            # From pi / 2, to the left, over pi, to the back, to 3 pi / 2, to the right.
+            # The angle runs from pi / 2 (left) over pi (back) to 3 pi / 2 (right).
             looking_back.append((azimuth % (2 * np.pi), camera))
         else:
             looking_ahead.append((-azimuth, camera))

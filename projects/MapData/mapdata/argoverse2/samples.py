@@ -47,7 +47,8 @@ class Argoverse2Options(FileOptions):
             for ``train`` and 2.5 Hz (every fourth sweep) for the other splits.
         thin_over: Samples that are thinned out together: the samples of one ``log``, or of the
             whole ``split`` sorted by time (`thin_out_split`).
-        compat: Rules of the ground truth, out of ``COMPAT_MODES``.
+        compat: Rules of the ground truth: ``maptrv2`` or ``maptr``, the published systems whose
+            elements the conversion reproduces.
         dim: Coordinates per point, 2 or 3.
         logs: Ids, or first characters of ids, of the logs to convert; empty converts all.
         keep_map_changes: Whether to keep the logs whose map was changed on purpose.
@@ -193,7 +194,7 @@ def thin_out_split(times_ns: Mapping[str, Sequence[int]], rate_hz: float) -> dic
     Returns:
         Times in nanoseconds of the samples to leave out, by name of the log.
     """
-    gaps_ns = [np.zeros(0)]
+    gaps_ns = [np.zeros(0)]  # concatenate needs an array, also if there is no log
     samples = []
     for name, log_times in times_ns.items():
         gaps_ns.append(np.diff(log_times))
@@ -346,8 +347,10 @@ def _cameras(
 ) -> list[CameraRecord]:
     """List the image of each calibrated camera that is closest in time.
 
-    The transforms to the cameras include the motion of the vehicle between the two times.
+    The transforms to the cameras include the motion of the vehicle from the time of the sample to
+    the time of the image. Only samples at rows of the pose table may lack an image of a camera.
     """
+    needs_all_images = options.pose_stride is None
     folder = (log.log_dir / "sensors/cameras").relative_to(options.root).as_posix()
     records = []
     for name, camera in log.calibration.items():
@@ -355,18 +358,19 @@ def _cameras(
         image_ns = closest_ns(camera_times_ns, timestamp_ns, tolerance_ns=MAX_CAMERA_OFFSET_NS)
         city_from_ego_at_image = None if image_ns is None else log.poses.get(image_ns)
         if city_from_ego_at_image is None:
-            if options.pose_stride is None:
+            if needs_all_images:
                 limit_ms = MAX_CAMERA_OFFSET_NS / 1e6
                 raise _UnusableSample(f"no image of {name} with a pose within {limit_ms:.0f} ms")
             continue
-        motion = np.linalg.inv(city_from_ego_at_image) @ city_from_ego
+        ego_at_image_from_ego = np.linalg.inv(city_from_ego_at_image) @ city_from_ego
+        cam_from_ego_at_image = camera.ego_SE3_cam.inverse().transform_matrix
         record = CameraRecord(
             name=name,
             path=f"{folder}/{name}/{image_ns}.jpg",
             width=camera.width_px,
             height=camera.height_px,
             intrinsics=camera.intrinsics.K,
-            cam_from_frame=camera.ego_SE3_cam.inverse().transform_matrix @ motion,
+            cam_from_frame=cam_from_ego_at_image @ ego_at_image_from_ego,
         )
         records.append(record)
     return records
@@ -391,5 +395,5 @@ def _lidar(
         if time in log.poses:
             path = f"{folder}/sensors/lidar/{time}.feather"
             sweeps.append(SweepRecord(path, time, frame_from_lidar=ego_from_city @ log.poses[time]))
-    closest = sweeps[0]  # the latest one, for which there is a pose
+    closest = sweeps[0]  # the sweep at `sweep_ns`: it has a pose, and it is the latest one
     return LidarRecord(closest.path, closest.frame_from_lidar, sweeps=sweeps[1:])

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 LINE_LAYERS = ("road_divider", "lane_divider")
 SURFACE_LAYERS = ("road_segment", "lane")
-# All areas of nuScenes belong to it; the first of them, ped_crossing, is already listed.
+# The slice of AREA_CLASSES is stop_line, intersection and carpark_area.
 MAP_CLASSES = ("divider", "ped_crossing", "boundary", *AREA_CLASSES[1:4], "centerline")
 CROSSING = "ped_crossing"
 OUTLINE_MARGIN_M = 0.2  # distance from the edge of the patch at which outlines are cut
@@ -207,7 +207,9 @@ class NuScenesLocalMap:
         x_range: Smallest and largest x of the patch in metres, annotation frame.
         y_range: Smallest and largest y of the patch in metres, annotation frame.
         crossings: Rule of the crossings, one of ``CROSSINGS``: ``united`` (closed rings, see
-            above), ``edges`` (`long_edges`) or ``parallel`` (`open_outlines`).
+            above), ``edges`` (the two longest edges of each crossing, see `long_edges`) or
+            ``parallel`` (outlines that are open where the patch cuts them, with parallel
+            neighbours united, see `open_outlines`).
 
     Raises:
         ValueError: If a class or the rule is unknown.
@@ -270,7 +272,7 @@ class NuScenesLocalMap:
             return vertices_of(rings_of(polygons), dim=2)
         if name == "divider":
             lines = self._lines.near(patch)
-        else:
+        else:  # "centerline"
             near = np.sort(self._lane_tree.query(patch.polygon, predicate="intersects"))
             lines = shapely.force_2d(self._lane_paths.simplify_paths(near.tolist()))
         return vertices_of(patch.to_local(patch.lines_inside(lines)), dim=2)

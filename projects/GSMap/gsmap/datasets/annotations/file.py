@@ -51,7 +51,8 @@ class AnnotationWriter:
     Args:
         path: File to write; parent folders are created.
         meta: Metadata of the file.
-        shard: Part of the file to write, which gets a manifest; by default the whole file.
+        shard: Part of the file to write; by default the whole file. A part gets a manifest, a file
+            by which the parts are merged.
         source: Digest of the source data of the whole file, for the manifest; by default
             ``source_fingerprint`` of ``meta``.
     """
@@ -60,6 +61,7 @@ class AnnotationWriter:
         self, path: str | Path, meta: AnnotationMeta, shard: Shard = WHOLE, source: str = ""
     ):
         self.path = shard.path_of(Path(path))
+        # Refuses to replace another program's file that has the name of a shard.
         shard.require_own(Path(path), mark=META_KEY)
         self.meta = meta
         self._write_manifest = partial(
@@ -112,6 +114,9 @@ class AnnotationWriter:
 
     def finish(self) -> None:
         """Write all remaining samples and the seal to the disk, under the temporary name.
+
+        The seal is the metadata of an empty last batch: the number of samples, and the size and
+        the checksum of all bytes before this batch.
 
         To make several files appear together, finish all of them before any of their ``with``
         blocks ends.
@@ -383,6 +388,7 @@ class AnnotationFile(Sequence[MapSample]):
         _, scenes = np.unique(names, return_inverse=True)
         seconds = np.asarray(self.seconds_into_scene)
         order = np.lexsort((seconds, scenes))
+        # Seconds between successive samples of one scene.
         is_within_scene = np.diff(scenes[order]) == 0
         steps = np.diff(seconds[order])[is_within_scene]
         if not len(steps):

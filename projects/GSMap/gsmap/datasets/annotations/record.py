@@ -182,7 +182,7 @@ class AnnotationMeta:
                 raise InputError(f"{name} must be a text, got {getattr(self, name)!r}.")
         if not isinstance(self.options, dict):
             raise InputError(f"options must be a dictionary, got {self.options!r:.60}.")
-        checked_identity(self.split_list)
+        checked_identity(self.split_list)  # raises an error if it is not a name with a digest
         if self.ground_z_m is not None and not abs(float(self.ground_z_m)) < _MAX_GROUND_Z_M:
             raise InputError(
                 f"ground_z_m must be metres, between -{_MAX_GROUND_Z_M:g} and "
@@ -190,7 +190,8 @@ class AnnotationMeta:
             )
         if self.frame not in RANGES:
             raise InputError(f"frame must be one of {tuple(RANGES)}, got {self.frame!r}.")
-        if type(self.dim) is not int or self.dim not in (2, 3):
+        is_integer = type(self.dim) is int  # not a bool or a float
+        if not is_integer or self.dim not in (2, 3):
             raise InputError(f"dim must be 2 or 3, got {self.dim!r}.")
         object.__setattr__(self, "classes", _check_classes(self.classes))
         for name, usual_range in zip(("x_range", "y_range"), RANGES[self.frame], strict=True):

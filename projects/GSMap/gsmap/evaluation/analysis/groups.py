@@ -107,7 +107,8 @@ def read_groups(annotations: str | Path, by: str) -> Groups:
 def _read_group_file(path: str) -> dict[str, str]:
     """Read the group of each scene or sample from a JSON file."""
     content = read_json(path)
-    if isinstance(content, list) and all(isinstance(row, dict) for row in content):
+    is_scene_table = isinstance(content, list) and all(isinstance(row, dict) for row in content)
+    if is_scene_table:  # scene.json of nuScenes
         scenes = {}
         for row in content:
             scenes[row.get("name")] = _conditions(row.get("description"))

@@ -57,7 +57,8 @@ class AnnotatedTruth:
                 self._labels[label] = classes.index(name)
         self._rows = shard.part(range(len(self._file)))
         has_heights = self._file.meta.dim == 3
-        # Under this key, `SampleFile` counts samples with heights, too.
+        # `SampleFile` counts its samples with heights under the key THREE_D. Here all samples of a
+        # file have heights, or none has.
         self.ignored = Counter({THREE_D: len(self._file) if has_heights else 0})
 
     def __iter__(self) -> Iterator[tuple[str, MapElements, int]]:
@@ -77,7 +78,7 @@ class AnnotatedTruth:
 
     @property
     def split_list(self) -> str:
-        """Name of the list of scenes that the file was made from; empty if unknown."""
+        """Name and digest of the list of scenes that defines the splits; empty if unknown."""
         return self._file.meta.split_list
 
     def tokens(self) -> list[str]:
@@ -223,14 +224,15 @@ class SamplePairs:
             FileNotFoundError: If a file does not exist.
             ValueError: If a file is malformed or the samples differ.
         """
-        # Samples whose partner is missing so far: their elements, or their places in the file.
+        # Samples whose partner is missing so far, on each side. The first CHUNK samples are stored
+        # with their elements, and further ones with their places in the file.
         pending_results: dict[str, Any] = {}
         pending_truth: dict[str, Any] = {}
         results = self._items_of_shard(self._results)
         truth = self._items_of_shard(self._truth)
         for result_item, truth_item in zip_longest(results, truth):
             has_both = bool(result_item) and bool(truth_item)
-            if has_both and result_item[0] == truth_item[0]:  # one token
+            if has_both and result_item[0] == truth_item[0]:  # the tokens
                 token, predictions, _ = result_item
                 yield self._pair(token, predictions, truth=truth_item[1])
                 continue

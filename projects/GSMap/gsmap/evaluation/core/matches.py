@@ -150,7 +150,7 @@ def ranked_predictions(
     Predictions of one point, or of an unknown class, are left out.
 
     Args:
-        predictions: Elements with scores. N in number.
+        predictions: N elements with scores.
         num_classes: Number of classes C; labels in [0, C) are known.
         min_score: Smallest score that counts, in [0, 1].
         max_num: Largest number of predictions of each class; all by default.
@@ -162,11 +162,11 @@ def ranked_predictions(
     rows = np.flatnonzero((predictions.num_points >= 2) & (scores >= min_score))
     rows = rows[np.argsort(-scores[rows], kind="stable")]
     labels = predictions.labels[rows]
-    ranks_of_classes = []
+    places = []  # indices into `rows`, which are in descending order of score
     for label in range(num_classes):
-        ranks_of_class = np.flatnonzero(labels == label)
-        ranks_of_classes.append(ranks_of_class[:max_num])
-    return rows[np.sort(np.concatenate(ranks_of_classes))]
+        places_of_class = np.flatnonzero(labels == label)
+        places.append(places_of_class[:max_num])
+    return rows[np.sort(np.concatenate(places))]
 
 
 class MatchTable:

@@ -126,7 +126,8 @@ def count_pieces(covered: BoolArray, step_m: float, min_piece_m: float) -> int:
     while len(covered):
         gains = (covered & is_free).sum(axis=1)
         best = int(gains.argmax())
-        # `not >=` also holds for NaN: no points times the infinite step of a malformed line.
+        # `not >=` also ends the loop for NaN, the product of no points and an infinite step (of a
+        # line with huge coordinates).
         if not gains[best] * step_m >= min_piece_m:
             break
         is_free &= ~covered[best]
@@ -137,7 +138,10 @@ def count_pieces(covered: BoolArray, step_m: float, min_piece_m: float) -> int:
 def _count_excess_pieces(
     elements: Sequence[FloatArray], lines: Sequence[FloatArray], config: Topology
 ) -> int:
-    """Sum n - 1 over the elements, for n pieces of an element that different lines cover."""
+    """Count the excess pieces of elements.
+
+    An element of which different lines cover n pieces has n - 1 excess pieces.
+    """
     if not lines:
         return 0
     curves = shapely.linestrings([_resample_flat(line) for line in lines])
@@ -179,7 +183,8 @@ def count_folds(line: FloatArray, is_area: bool) -> int:
     after = chords[span:]
     lengths = np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
     is_fold = (before * after).sum(axis=1) < _FOLD_COS * lengths
-    starts_fold = is_fold[1:] & ~is_fold[:-1]  # neighbouring points with a fold count once
+    # Successive points with a fold count once, at the first of them.
+    starts_fold = is_fold[1:] & ~is_fold[:-1]
     return int(is_fold[:1].sum() + starts_fold.sum())
 
 

@@ -25,7 +25,8 @@ class LossHead(DetectionHead):
     """Base class of heads with losses of matched pairs.
 
     Attributes:
-        query_groups: Groups of queries that are matched together. The first one predicts.
+        query_groups: Groups of queries. Each group is matched with the ground truth on its own;
+            only the first group is used at inference.
         instance_embedding: Embeddings of the instance queries.
         masks: Rasters for losses and costs of masks.
         loss_cls: Classification loss.
@@ -117,6 +118,7 @@ class LossHead(DetectionHead):
         Returns:
             Scalars by name.
         """
+        # The slice selects all queries; `of_queries` converts their scores to float32.
         predictions = Predictions.join([layer.of_queries(slice(None)) for layer in layers])
         with torch.autocast(predictions.scores.device.type, enabled=False):
             known_matches = self.assigner.assign_known(predictions, truths, pairs=matches)
@@ -206,11 +208,11 @@ class LossHead(DetectionHead):
 
     @staticmethod
     def _values_by_layer(loss: MapLoss, pairs: MatchedPairs) -> dict[int, Tensor]:
-        """Values of a loss, by the index of each layer that has the loss."""
+        """Values of a loss, by the index of each layer that has the inputs of the loss."""
         first = pairs.num_layers - 1 if loss.last_layer_only else 0
         layers = range(first, pairs.num_layers)
         layers_with_loss = [index for index in layers if loss.reads(pairs.layer(index))]
-        if len(layers_with_loss) == pairs.num_layers:
+        if len(layers_with_loss) == pairs.num_layers:  # all layers are computed in one call
             return dict(enumerate(loss.by_layer(pairs)))
         return {index: loss(pairs.layer(index)) for index in layers_with_loss}
 

@@ -21,7 +21,8 @@ class GeMapHead(MapHead):
     Args:
         decoder: Config of the decoder; its self-attention is replaced if ``decoupled``.
         losses: Configs of the other losses.
-        query_groups: Settings of each `QueryGroup`, only the first of them unless ``one_to_many``.
+        query_groups: Settings of each `QueryGroup`. Without ``one_to_many``, only the first group
+            is used.
         loss_euclidean: Settings of `EuclideanLoss`, or None to train without it.
         decoupled: Use the self-attention of GeMap in the layers instead of the configured one.
         one_to_many: Keep the further query groups, which GeMap does not have. The Euclidean loss of

@@ -55,6 +55,6 @@ def add_guidance(decoder: PartConfig) -> PartConfig:
     if not has_own_layers:
         return {**decoder, "layer": with_defaults(layer, type=GaussianDecoderLayer)}
     guidance = layer.get("guidance", {})
-    if guidance is not None:
+    if guidance is not None:  # None switches the guidance off
         guidance = with_defaults(guidance, type=GaussianGuidance)
     return {**decoder, "layer": {**layer, "guidance": guidance}}

@@ -37,6 +37,7 @@ class ErrorQuality(Quality):
     def forward(self, pairs: MatchedPairs) -> Tensor:
         """Quality of each matched pair. (M,)"""
         reference = cast(GaussianReference, pairs.predictions.reference)
+        # Gaussians of the point errors: their sigmas are the predicted uncertainty of the points.
         gaussians = reference.errors(pairs.pred_references.detach())
         sigmas = extents_along_line(gaussians)  # along, across (M, P, 2)
         errors = line_errors(gaussians.means, pairs.gt_pts_m[..., :2])  # along, across (M, P, 2)

@@ -75,12 +75,14 @@ class HDMapNetHead(DetectionHead):
         self.losses = LineMapLosses(**(losses or {}))
         self.num_directions = num_directions
         degrees = 360 // num_directions
-        self.vectorizing = VectorizeConfig(**{"degrees": degrees, **(vectorizing or {})})
+        vectorize_settings = {"degrees": degrees}
+        vectorize_settings.update(vectorizing or {})
+        self.vectorizing = VectorizeConfig(**vectorize_settings)
         if self.vectorizing.degrees != degrees:
             raise InputError(
                 f"vectorizing.degrees is {self.vectorizing.degrees}, but {num_directions} "
-                f"directions are {degrees} degrees apart: leave it out, as it follows from "
-                "num_directions."
+                f"directions are {degrees} degrees apart: leave vectorizing.degrees out, because "
+                "it follows from num_directions."
             )
         self.decoder = LineMapDecoder(
             embed_dims=embed_dims,
@@ -119,12 +121,12 @@ class HDMapNetHead(DetectionHead):
         """
         maps = self(bev_outputs)
         device = maps.semantic.device
-        numbers = [self.target(sample, "gt_lines") for sample in batch_data_samples]
+        line_numbers = [self.target(sample, "gt_lines") for sample in batch_data_samples]
         directions = [self.target(sample, "gt_directions") for sample in batch_data_samples]
         with torch.autocast(device.type, enabled=False):
             return self.losses(
                 maps,
-                numbers=torch.stack(numbers).to(device),
+                numbers=torch.stack(line_numbers).to(device),
                 directions=torch.stack(directions).to(device),
             )
 
@@ -133,7 +135,9 @@ class HDMapNetHead(DetectionHead):
 
         Args:
             sample: Training sample.
-            name: ``gt_lines`` (classes, rows, columns) or ``gt_directions`` (2, rows, columns).
+            name: ``gt_lines`` (classes, rows, columns) with the number of the line at each pixel,
+                or ``gt_directions`` (2, rows, columns) with the forward and the backward direction
+                of that line, 1 to ``num_directions``. Both are 0 at pixels without a line.
 
         Raises:
             ValueError: If the sample has no such target, or if it does not fit the head.
@@ -149,7 +153,7 @@ class HDMapNetHead(DetectionHead):
         if tuple(target.shape) != shape:
             raise InputError(
                 f"{name} is {tuple(target.shape)}, the head's maps are {shape}: give MakeLineMaps "
-                "the head's pixel_m and number of classes, and the grid's forward."
+                "the head's pixel_m and number of classes, and the setting forward of its grid."
             )
         if name == "gt_directions" and target.max() > self.num_directions:
             raise InputError(
@@ -166,8 +170,8 @@ class HDMapNetHead(DetectionHead):
             batch_data_samples: Samples of the batch.
 
         Returns:
-            For each sample ``pts`` in metres (M, P, 2), filled with the last point of a line,
-            ``num_pts`` (M,), ``labels_3d`` (M,) and ``scores_3d`` (M,).
+            For each sample ``pts`` (M, P, 2), the points of the lines in metres, padded with the
+            last point of each line, ``num_pts`` (M,), ``labels_3d`` (M,) and ``scores_3d`` (M,).
         """
         maps = self(bev_outputs)
         results = []

@@ -59,7 +59,7 @@ class LineMapLosses:
         semantic = F.binary_cross_entropy_with_logits(
             maps.semantic, classes.to(maps.semantic), pos_weight=weight
         )
-        instances = numbers.amax(dim=1)  # (B, H, W)
+        instances = numbers.amax(dim=1)  # a pixel has at most one line over all classes (B, H, W)
         pull_terms = []
         push_terms = []
         for i, embedding in enumerate(maps.embedding):
@@ -76,8 +76,8 @@ class LineMapLosses:
     def embedding_losses(self, embedding: Tensor, numbers: Tensor) -> tuple[Tensor, Tensor]:
         """Compute the pull loss and the push loss of one sample.
 
-        De Brabandere et al., 2017, Eqs. 1 and 2, where the push loss is half the mean over
-        unordered pairs. Both are 0 without an instance.
+        The losses follow De Brabandere et al., 2017, Eqs. 1 and 2, but the push loss is half of the
+        mean over unordered pairs of instances. Both losses are 0 without an instance.
 
         Args:
             embedding: Instance embeddings. (E, H, W)
@@ -115,8 +115,8 @@ def direction_loss(logits: Tensor, directions: Tensor) -> Tensor:
         Unweighted scalar.
     """
     num_classes = logits.shape[1]
-    # The forward and the backward direction have the probability 1/2 each. Both are 0 beside lines,
-    # so the channel of no direction has the probability 1 there and 0 on lines.
+    # On lines, the forward and the backward direction have a target probability of 1/2 each. Beside
+    # lines, both indices are 0, which gives channel 0 ("no direction") a target of 2 * 1/2 = 1.
     counts = F.one_hot(directions, num_classes).sum(dim=1).movedim(-1, 1)  # (B, 1 + K, H, W)
     target = counts.to(logits) / 2
     is_line = 1 - target[:, :1]

@@ -26,9 +26,10 @@ Pixels = NDArray[np.int32]
 class MakeLineMaps(BaseTransform):
     """Add rasters of the elements, ``gt_lines`` and ``gt_directions``, from ``map_instances``.
 
-    ``gt_lines`` (classes, H, W) holds the number of each pixel's line, from 1 on over all classes,
-    and 0 for none. ``gt_directions`` (2, H, W) holds the forward and the backward direction of the
-    line, 1 to K, and 0 for none. Rows lie from right to left, columns from rear to front.
+    ``gt_lines`` (classes, H, W) holds the number of the line at each pixel, or 0 without a line.
+    The lines of a sample are numbered from 1, through all classes. ``gt_directions`` (2, H, W)
+    holds the forward and the backward direction of the line, 1 to K, or 0 without a line. Rows lie
+    from right to left, columns from rear to front.
 
     Args:
         num_classes: Number of classes.
@@ -133,7 +134,8 @@ class MakeLineMaps(BaseTransform):
                     f"label {element.label} of an element, but num_classes={self.num_classes} in "
                     "MakeLineMaps."
                 )
-            # As in the released code, sampling drops the end of a line, and lines below one step.
+            # As in the released code, sampling drops the last point of each line, and lines that
+            # are shorter than one step.
             points = points_at_steps(element.points[:, :2].astype(np.float64), self.step_m)
             for part in parts_inside(points, grid.x_range, y_range=grid.y_range):
                 yield element.label, pixels_from_metres(part, grid).astype(np.int32)

@@ -27,8 +27,9 @@ class LinePredictions(NamedTuple):
 
     Attributes:
         scores: Logits of the classes, -inf except for the class of the query. (B, N, classes)
-        references: Points of each line, for `Reference.decode`: coordinates (B, N, P, 2), or
-            coordinates and a logit. (B, N, P, 3)
+        references: Points of each line, for `Reference.decode` of the head: coordinates
+            (B, N, P, 2), or coordinates and the logit by which `decode` selects points.
+            (B, N, P, 3)
         lines: Lines of every class, a NamedTuple of tensors (B, n, ...) with ``logits`` and
             ``masks``.
     """
@@ -48,8 +49,9 @@ def class_scores(logits: Sequence[Tensor]) -> Tensor:
         Differences of the two logits at the class of each query, -inf elsewhere. (B, N, classes)
     """
     scores = []
+    no_line = 1 - LINE  # index of the other logit
     for label, class_logits in enumerate(logits):
-        score = class_logits[..., LINE, None] - class_logits[..., 1 - LINE, None]
+        score = class_logits[..., LINE, None] - class_logits[..., no_line, None]
         padding = (label, len(logits) - 1 - label)  # classes before and after this one
         scores.append(F.pad(score, padding, value=-torch.inf))
     return torch.cat(scores, dim=1)
@@ -64,7 +66,8 @@ class LineHead(DetectionHead):
         numbers: Number of lines of each class.
         decoder: Settings of `PointLineDecoder`.
         losses: Losses of one class.
-        mask_pixel_m: Side of a pixel of the training masks in metres, also of the targets.
+        mask_pixel_m: Side of a pixel in metres, of the masks of lines and classes in training and
+            of their targets.
         score_threshold: Detections need a higher score. With 0.5, a line must be more likely than
             no line.
         embed_dims: Channels C.
@@ -283,7 +286,10 @@ class LineHead(DetectionHead):
         truths: Sequence[Sequence[Any]],
         tokens: Sequence[str],
     ) -> tuple[Tensors, list[list[Any]]]:
-        """Match all lines, and sum the weighted losses of all layers and classes.
+        """Match all lines, and compute the losses of all layers and classes.
+
+        Losses are summed with the weights of the layers and divided by the number of layers times
+        the number of classes.
 
         Args:
             outputs: Predictions of each layer.

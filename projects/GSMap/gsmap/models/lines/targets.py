@@ -67,11 +67,13 @@ def draw_lines(
     """
     masks = []
     for line in lines:
+        # (u, v) times (H, W) gives (row, column), and OpenCV expects (column, row).
         cells = (line * size)[:, ::-1].astype(np.int32)
         canvas = np.zeros(size, dtype=np.uint8)
         mask = cv2.polylines(canvas, [cells], isClosed=False, color=(1,), thickness=thickness_px)
         masks.append(mask.astype(bool))
     rows, columns = size
+    # Without lines, NumPy makes a float array (0,), which becomes (0, H, W) and boolean.
     return np.array(masks).reshape(-1, rows, columns).astype(bool)
 
 
@@ -85,8 +87,8 @@ class FormatLineTargets(BaseTransform):
     - ``pts``: Key points in metres, padded with the last one. (K, P, 2)
     - ``num_pts``: Number of key points. (K,)
     - ``masks``: Masks with rows from the front and columns from the left. (K, H, W)
-    - ``redrawn``: True if the mask was drawn from the key points, because other lines of the class
-      cover a line completely. (K,)
+    - ``redrawn``: True if the mask was drawn from the key points. This is done for all lines of a
+      class if one of them is completely covered by others of the class. (K,)
 
     Args:
         edge_classes: Indices of classes whose rings are replaced by their two longest edges.

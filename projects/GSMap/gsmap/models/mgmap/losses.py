@@ -75,7 +75,7 @@ class ForegroundLoss(MapLoss):
 
     Args:
         loss_weight: Weight of the cross-entropy.
-        dice_weight: Weight of the dice loss of both masks together.
+        dice_weight: Weight of the dice loss of the two masks, elements and background.
         pos_weight: Weight of the positive cells of a mask in its cross-entropy.
     """
 

@@ -91,8 +91,9 @@ class EnhancedNeck(nn.Module):
             bev_feats: BEV features. (B, C, H, W)
 
         Returns:
-            Fusion of all stages (B, C, H, W), and maps of four levels (B, C, h, w): of the stages,
-            and of their fusion at the size of the stem, which is half of (H, W).
+            Fusion of all stages (B, C, H, W), and maps of four levels (B, C, h, w). The first three
+            levels are the outputs of the stages, each with its size. The fourth level is the
+            fusion, resized to the output of the stem, half of (H, W).
         """
         stem = self.stem(bev_feats)
         feats = stem

@@ -179,6 +179,8 @@ class PivotBEVEncoder(CameraEncoder):
         uv, visible = self.project(calibration["img_from_ground"], img_shape)
         learned_reference = self.unseen_reference(position).sigmoid()
         source_reference = torch.where(visible[..., None], uv, learned_reference)  # (B, H * W, 2)
+        # In this method, the BEV cells are in rows from the front to the rear of the map.
+        # `turn_raster` brings the results into the layout of `grid`.
         shapes = [front_size(self.grid)]
         cell_reference = centres(shapes, position.device).expand_as(source_reference)
         cells = self.bev_embedding.weight.expand(len(uv), -1, -1)  # (B, H * W, C)
@@ -202,6 +204,7 @@ class PivotBEVEncoder(CameraEncoder):
         Raises:
             ValueError: If the sizes of the features differ from the settings.
         """
+        # (B, V, C', h, w) -> (B, C', h, V, w) -> (B, C', h, V * w)
         levels = [level.permute(0, 2, 3, 1, 4).flatten(3) for level in feats]
         shapes = [tuple(level.shape[-2:]) for level in levels]
         if shapes != self.shapes:
@@ -233,6 +236,7 @@ class PivotBEVEncoder(CameraEncoder):
             inside the image of their camera. (B, H * W)
         """
         matrices = img_from_ground.float()
+        # From (x from the left, y from the front) to (from the front, from the left).
         cell_centres = centres([front_size(self.grid)], matrices.device).flip(-1)
         points = F.pad(self.grid.metres_from_front(cell_centres), (0, 1))  # z = 0
         points = F.pad(points, (0, 1), value=1.0)  # (Q, 4)

@@ -96,6 +96,7 @@ class PivotLosses(LineLosses):
         points = np.arange(num_points)
         for pair, (row, col) in enumerate(zip(rows.tolist(), cols.tolist(), strict=True)):
             line = pivots[col, : counts[col]]
+            # Index of the point for each pivot, ascending.
             path = match_pivots(differences[row, col, : len(line)])
             is_pivot[pair, path] = True
             # The targets of the points between two pivots are spaced evenly between them.
@@ -135,7 +136,7 @@ class PivotLosses(LineLosses):
         is_pivot = torch.cat(pivot_masks)
         offsets = (torch.cat(line_points) - torch.cat(expected_points)).abs().sum(dim=-1)  # (M, p)
         weight = is_pivot.float()
-        weight[:, [0, -1]] += self.end_weight
+        weight[:, [0, -1]] += self.end_weight  # the ends of a line, which are always pivots
         is_between = (~is_pivot).float()
         pivots = (offsets * weight).sum(dim=1) / weight.sum(dim=1)
         collinear = (offsets * is_between).sum(dim=1) / is_between.sum(dim=1).clamp(min=1)

@@ -32,11 +32,13 @@ class StreamMapNetDecoderLayer(MapDecoderLayer):
         cross_attn: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
+        # Self-attention is between instances: each of them has one query instead of P.
+        self_attn_defaults = {"num_points": 1}
         cross_attn_defaults = {"type": "LinePointAttention", "num_points": num_points}
         super().__init__(
             embed_dims,
             ffn_dims=ffn_dims,
-            self_attn={"num_points": 1, **(self_attn or {})},
+            self_attn={**self_attn_defaults, **(self_attn or {})},
             cross_attn={**cross_attn_defaults, **(cross_attn or {})},
             **kwargs,
         )
@@ -98,7 +100,8 @@ class StreamMapNetDecoder(MapDecoder):
             features with the sine encoding (B, C, H, W).
         """
         cells = bev_feats.new_zeros((1, *bev_feats.shape[-2:]), dtype=torch.bool)
-        code = self.code(cells).flip(2)  # rows are counted from the largest y
+        # StreamMapNet counts rows from the largest y, and the BEV features from the smallest y.
+        code = self.code(cells).flip(2)
         points = reference.unflatten(-1, (self.num_points, -1)).flatten(1, 2)
         return query, points, self.input_proj(bev_feats) + code
 

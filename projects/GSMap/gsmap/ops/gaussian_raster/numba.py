@@ -69,7 +69,7 @@ def _row_geometry(gaussian, frame, size, spans, parabolas):
         frame: Smallest x and y of the raster, and the size of a pixel along x and y, in metres.
         size: Height H and width of the raster in pixels.
         spans: Output for the first column and one past the last column in each row. (2, H)
-        parabolas: Output for the exponent along each row: its constant in powers of two, t at the
+        parabolas: Output for the exponent, to the base 2, along each row: its constant, t at the
             first column, and its vertex (u, v) in the frame of the Gaussian. (4, H)
 
     Returns:
@@ -139,7 +139,7 @@ def _accumulate(gaussian, frame, steps, mask, spans, parabolas, through):
 
 @njit(inline="always")
 def _row_sums(grad, steps, start, curvature, base):
-    """Sums of w, w t and w t^2 over pixels of a row, where ``grad`` is dL/dR T."""
+    """Sums of w, w t and w t^2 over pixels of a row, where ``grad`` is the product dL/dR * T."""
     sum_0 = ZERO
     sum_1 = ZERO
     sum_2 = ZERO
@@ -158,7 +158,7 @@ def _row_sums(grad, steps, start, curvature, base):
 # in the last bit.
 @njit(nogil=True, cache=True, fastmath=FASTMATH, error_model="numpy", forceinline=True)
 def _gaussian_gradient(gaussian, frame, steps, grad, spans, parabolas, out):
-    """Compute the gradient of one Gaussian (5,) from ``grad``, dL/dR T of its instance.
+    """Compute the gradient of one Gaussian (5,) from ``grad``, the product dL/dR * T.
 
     The other arguments are described in `_accumulate`.
     """
@@ -275,7 +275,7 @@ def render_backward(gaussians, frame, grads, out, first, last):
                 parabolas=parabolas,
                 through=True,
             )
-        # From here on, the buffer contains dL/dR T, which is 0 in the margin.
+        # From here on, the buffer contains the product dL/dR * T, which is 0 in the margin.
         for row in range(grads.shape[1]):
             for col in range(grads.shape[2]):
                 trans[row, col] *= grads[n, row, col]

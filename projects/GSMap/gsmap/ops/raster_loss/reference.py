@@ -4,12 +4,15 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+# The usual constants of SSIM for values in [0, 1].
 SSIM_C1 = 0.01**2
-SSIM_C2 = 0.03**2  # the usual constants for values in [0, 1]
-# A window covers part of either mask if the weighted mean of a mask in the window is larger than
-# this. If a prediction misses its element, D-SSIM is then 0.94 to 1.03 for elements of 4 to 60 m
-# and rasters of 128 x 64 to 256 x 128. With 0 it would be 0.59 to 0.93, because the mean would
-# include windows that cover almost nothing of the mask. With 1e-2 it would be 1.09 to 1.38.
+SSIM_C2 = 0.03**2
+# Threshold of the weighted mean of a mask in a window, above which the window covers part of the
+# mask. D-SSIM is the mean of 1 - SSIM over the windows that cover part of the prediction or of the
+# target. For a prediction that misses its element, it should be near 1: with this threshold it is
+# 0.94 to 1.03 for elements of 4 to 60 m and rasters of 128 x 64 to 256 x 128. With a threshold of 0
+# it would be 0.59 to 0.93, because the mean would include windows that cover almost nothing of the
+# masks. With 1e-2 it would be 1.09 to 1.38.
 MIN_COVERAGE = 1e-3
 
 
@@ -72,7 +75,8 @@ def raster_loss_sums_reference(
     Returns:
         Seven values of each mask, with w = 1 + (weight - 1) t: sum w |p - t|, sum w p,
         sum (1 - SSIM), sum w t, sum (w - 1), the number of pixels whose window covers part of the
-        target, and the number of pixels whose window covers part of either mask. (n, 7)
+        target, and the number of pixels whose window covers part of the target or of the
+        prediction (`MIN_COVERAGE`). (n, 7)
     """
     excess = (weight - 1) * targets
     weights = 1 + excess
