@@ -554,7 +554,7 @@ def no_usable_frame(broken: dict[str, str], notes: Sequence[str]) -> InputError:
     """
     reason = next(iter(broken.values()))
     if notes:
-        reason = f"{reason}; as said: {notes[-1]}"
+        reason = f"{reason}; note on the input: {notes[-1]}"
     return InputError(f"no frame can be used: {reason}")
 
 

@@ -73,6 +73,7 @@ def _add_lanelets(file: "_OSMFile", lanes: LaneGraph, speed_limit_kmh: float) ->
         "one_way": "yes",
         "speed_limit": f"{speed_limit_kmh:g} km/h",
     }
+    # `entry` and `exit` of a lanelet are indices into these end nodes.
     left_ends = file.add_nodes(lanes.left)
     right_ends = file.add_nodes(lanes.right)
     for lane in lanes.lanelets:

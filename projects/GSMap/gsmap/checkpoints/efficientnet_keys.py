@@ -18,6 +18,7 @@ def efficientnet_rules(theirs: str, ours: str) -> Rules:
     Returns:
         Pairs of key prefixes: upstream's and the one of this project.
     """
+    # Each entry of `names` is the upstream name, "=", and the name in this project.
     rules = rules_of(upstream=theirs, ours=f"{ours}layers.0.", names="_conv_stem.=conv. _bn0.=bn.")
     upstream_block = 0
     for stage, num_blocks in enumerate(_BLOCKS_PER_STAGE, start=1):

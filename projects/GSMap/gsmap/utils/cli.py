@@ -289,10 +289,10 @@ class _KillError(_SignalError, SystemExit):
 class _SignalHandler:
     """Handler of Ctrl-C and ``kill`` that raises one exception, so that clean-ups run once.
 
-    Further signals during the clean-up are ignored. Some code drops the exception: Python, in a
-    finalizer or at the end of a fork, C code, and libraries, above all during imports. If the
-    exception is garbage collected before `run_command` catches it, the signal is sent again. Forked
-    workers inherit the handler, and ignore Ctrl-C.
+    Further signals during the clean-up are ignored. Some code drops the exception: Python does so
+    in a finalizer and at the end of a fork, and C code and libraries do so mostly during imports.
+    If the exception is garbage collected before `run_command` catches it, the signal is sent again.
+    Forked workers inherit the handler, and ignore Ctrl-C.
     """
 
     def __init__(self) -> None:
@@ -329,7 +329,10 @@ class _SignalHandler:
             self._send_again(number)
 
     def _send_again(self, number: int) -> None:
-        """Send a signal after a delay; `threading` is not used, whose locks may be taken here."""
+        """Send a signal after a delay.
+
+        `threading` is not used, because its locks may be held when a signal arrives.
+        """
         _thread.start_new_thread(_send_later, (number,))
 
 

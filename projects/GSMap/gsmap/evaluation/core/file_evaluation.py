@@ -26,7 +26,9 @@ from gsmap.utils.split_lists import require_results_of
 from gsmap.utils.words import format_count
 
 _CANVAS_TOLERANCE_M = 0.5  # by which ground truth may leave a canvas without a note
-CHUNK = 64  # samples per task: few tasks to hand over, and evenly distributed
+# Samples per task: enough that few tasks are handed to the processes, and few enough that the work
+# of the processes is balanced.
+CHUNK = 64
 Evaluation = tuple[list[MetricReport], list[str]]
 """Reports of all metrics, and notes on ignored elements, heights and samples."""
 

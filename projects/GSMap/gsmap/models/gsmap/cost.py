@@ -41,8 +41,9 @@ class IoUCost(MapCost):
         """Weighted cost of each prediction with each ground truth.
 
         Args:
-            pred_instances: Predictions of a sample, with ``cost_masks`` (N, h, w).
-            gt_instances: Ground truth of the sample, with ``cost_masks`` (K, h, w).
+            pred_instances: Predictions of a sample, with ``cost_masks``, their masks at the lower
+                resolution of matching. (N, h, w)
+            gt_instances: Ground truth of the sample, with ``cost_masks``. (K, h, w)
             img_meta: Meta dict of the sample, not used.
 
         Returns:

@@ -8,10 +8,11 @@ computed, rounded up to whole blocks of ``LANES`` pixels. The neglected densitie
 change a pixel by less than P * 1e-8. The geometry of all rows of an ellipse is computed before
 their pixels.
 
-Along a row the exponent is a parabola. With the inverse covariance [[a, b], [b, c]], whose
-determinant is det, it is a t^2 + dy^2 det / a. Here t = x - x_0 is the distance of a pixel from the
-vertex x_0 = mu_x - dy b / a of the parabola. The vertex and the constant dy^2 det / a are computed
-once per row in float64. Both terms are positive and cannot cancel, so float32 is precise enough for
+A density is G = exp(-e / 2). Along a row at the distance dy = y - mu_y from the centre, e is a
+parabola. With the inverse covariance [[a, b], [b, c]], whose determinant is det, it is
+e = a t^2 + dy^2 det / a. Here t = x - x_0 is the distance of a pixel from the vertex
+x_0 = mu_x - dy b / a of the parabola. The vertex and the constant dy^2 det / a are computed once
+per row in float64. Both terms of e are positive and cannot cancel, so float32 is precise enough for
 the inner loop R <- R + G (1 - R), which equals 1 - prod (1 - G) and is exact for small G.
 
 The backward pass computes the transmittance T = prod (1 - G) of an instance again. As
@@ -69,8 +70,9 @@ def _row_geometry(gaussian, frame, size, spans, parabolas):
         frame: Smallest x and y of the raster, and the size of a pixel along x and y, in metres.
         size: Height H and width of the raster in pixels.
         spans: Output for the first column and one past the last column in each row. (2, H)
-        parabolas: Output for the exponent, to the base 2, along each row: its constant, t at the
-            first column, and its vertex (u, v) in the frame of the Gaussian. (4, H)
+        parabolas: Output for the parabola of each row: its constant times ``HALF_LOG2E``, as G is
+            computed as a power of 2; t at the first column; and its vertex (u, v) in the frame of
+            the Gaussian. (4, H)
 
     Returns:
         First row, one past the last row, curvature of the parabolas, cosine and sine of the

@@ -89,8 +89,8 @@ def score_result(
         allow_mismatch: Whether samples may differ from the ground truth. A sample without results
             then counts as without predictions, and results without ground truth are ignored.
         allow_other_split: Whether the model may be of another split than the ground truth.
-        law: Distribution of the errors; by default the one of the calibration of the model, or
-            the normal one.
+        law: Distribution of the errors, ``normal`` or ``laplace``; by default the distribution of
+            the model's calibration in the file, or ``normal`` without a calibration.
 
     Returns:
         Predictions, matches and reports.
