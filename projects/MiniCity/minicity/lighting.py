@@ -123,6 +123,7 @@ def render_sky(camera: Camera, lighting: Lighting) -> Image:
     Returns:
         The picture, BGR. (H, W, 3)
     """
+    # The sky is computed along the middle column, and repeated for all columns.
     rows = np.arange(camera.height)
     pixels = np.stack([np.full(rows.shape, camera.width / 2), rows, np.ones(rows.shape)])
     directions = camera.world_from_pixel @ pixels

@@ -160,7 +160,7 @@ def _training_mount(cfg: Config, contents: Checkpoint | None, path: object) -> M
     try:
         height = None if height is None else _check_height(height)
         matrix = None if matrix is None else _check_mount(matrix)
-    except (TypeError, ValueError, OverflowError) as error:
+    except (TypeError, ValueError, OverflowError) as error:  # also of values that are no numbers
         raise InputError(
             f"{path} was not loaded: the place of its frame in the vehicle is impossible ({error})."
         ) from error

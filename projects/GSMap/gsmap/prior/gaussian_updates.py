@@ -85,7 +85,7 @@ def sample_lines(
     vertex_variances = _vertex_variances(chosen, rule)
     for index, (line, _, score) in enumerate(chosen.rows):
         along = arc_lengths(line) if len(line) > 1 else np.zeros(1)
-        if along[-1] <= 0.0:
+        if along[-1] <= 0.0:  # a line without length has no direction
             continue
         count = max(2, int(np.ceil(along[-1] / rule.spacing_m)) + 1)
         positions = np.linspace(0.0, along[-1], count)

@@ -106,14 +106,17 @@ def _folded_names(name: str, endings: Sequence[str]) -> list[str]:
 
 
 def _plain_name(foreign: str) -> str:
-    # some file systems do not distinguish the normal forms of Unicode
+    """Make a name safe, without a digest (see `file_name`)."""
+    # Some file systems do not distinguish the normal forms of Unicode.
     composed = unicodedata.normalize("NFC", foreign)
     safe = re.sub(r"[^\w.+=-]", repl="_", string=composed)
     start = safe.lstrip(".-").encode()[:_LONGEST_NAME]
+    # The limit may cut a character of several bytes, which "ignore" drops.
     return start.decode(errors="ignore").rstrip(".") or "unnamed"
 
 
 def _changed_name(foreign: str) -> str:
+    """Make a name safe, with a digest of the original at its end."""
     content = foreign.encode(errors="surrogatepass")
     digest = hashlib.sha256(content).hexdigest()
     return f"{_plain_name(foreign)}-{digest[:16]}"

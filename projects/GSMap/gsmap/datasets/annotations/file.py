@@ -252,6 +252,7 @@ class AnnotationFile(Sequence[MapSample]):
             schema, self._batches, seal, ends = read_messages(self._content)
             self.meta = _meta_of(schema)
         except (pa.ArrowException, OSError, ValueError, TypeError) as error:
+            # A TypeError is raised for metadata with fields that `AnnotationMeta` does not have.
             if is_machine_error(error):
                 raise
             raise InputError(
@@ -269,6 +270,7 @@ class AnnotationFile(Sequence[MapSample]):
             elif [end for end, _ in sums] != ends:
                 raise InputError("it was replaced after this run had opened it")
         except (pa.ArrowException, ValueError, TypeError, KeyError) as error:
+            # A TypeError or KeyError is raised for a seal that is not an object with all entries.
             if is_machine_error(error):
                 raise
             reason = str(error).rstrip(".")

@@ -27,6 +27,12 @@ def precision_recall(hits: BoolArray, num_gts: int) -> tuple[FloatArray, FloatAr
     return recall, precision
 
 
+def _envelope(precision: FloatArray) -> FloatArray:
+    """Precision envelope: the largest precision after this or a later prediction. (N,)"""
+    envelope: FloatArray = np.maximum.accumulate(precision[::-1])[::-1]
+    return envelope
+
+
 def area_ap(hits: BoolArray, num_gts: int) -> float:
     """Compute the area under the monotone precision envelope (VOC 2010), as MapTR does.
 
@@ -40,8 +46,8 @@ def area_ap(hits: BoolArray, num_gts: int) -> float:
     if num_gts == 0:
         return 0.0
     recall, precision = precision_recall(hits, num_gts)
-    envelope = np.maximum.accumulate(precision[::-1])[::-1]
-    return float(np.sum(np.diff(recall, prepend=0.0) * envelope))
+    recall_steps = np.diff(recall, prepend=0.0)
+    return float(np.sum(recall_steps * _envelope(precision)))
 
 
 def interpolated_ap(hits: BoolArray, num_gts: int) -> float:
@@ -57,12 +63,12 @@ def interpolated_ap(hits: BoolArray, num_gts: int) -> float:
     if num_gts == 0:
         return -1.0
     true_positives = np.cumsum(hits, dtype=np.float64)
-    # COCO adds the spacing of 1 to the denominator, so a perfect class gives 1 - 2e-16
+    # COCO adds the spacing of 1 to the denominator, so a perfect class gives 1 - 2e-16.
     precision = true_positives / (np.arange(1, len(true_positives) + 1) + np.spacing(1.0))
-    envelope = np.maximum.accumulate(precision[::-1])[::-1]
-    # First prediction that reaches each recall; beyond all of them, the precision is 0.
+    # Index of the first prediction that reaches each recall. Where no prediction does, it is the
+    # number of predictions, at which the appended precision of 0 is.
     ranks = np.searchsorted(true_positives / num_gts, _RECALL_POINTS, side="left")
-    return float(np.append(envelope, 0.0)[ranks].mean())
+    return float(np.append(_envelope(precision), 0.0)[ranks].mean())
 
 
 def ten_point_ap(hits: BoolArray, num_gts: int) -> float:
@@ -79,11 +85,10 @@ def ten_point_ap(hits: BoolArray, num_gts: int) -> float:
         AP in [0, 1].
     """
     _, precision = precision_recall(hits, num_gts)
-    envelope = np.maximum.accumulate(precision[::-1])[::-1]
     min_true_positives = -(-np.arange(1, 11) * num_gts // 10)  # rounded up
-    # First prediction that reaches each recall; beyond all of them, the precision is 0.
+    # As in `interpolated_ap`: the precision is 0 at recalls that no prediction reaches.
     ranks = np.searchsorted(np.cumsum(hits), min_true_positives, side="left")
-    return float(np.append(envelope, 0.0)[ranks].mean())
+    return float(np.append(_envelope(precision), 0.0)[ranks].mean())
 
 
 def reliability(scores: FloatArray, hits: BoolArray) -> tuple[FloatArray, FloatArray, IntArray]:
