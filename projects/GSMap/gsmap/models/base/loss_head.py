@@ -25,7 +25,7 @@ class LossHead(DetectionHead):
     """Base class of heads with losses of matched pairs.
 
     Attributes:
-        query_groups: Groups of queries. Each group is matched with the ground truth on its own;
+        query_groups: Groups of queries. Each group is matched with the ground truth separately;
             only the first group is used at inference.
         instance_embedding: Embeddings of the instance queries.
         masks: Rasters for losses and costs of masks.
