@@ -51,11 +51,13 @@ COMMON = {
     "base": set(),
     "encoders": {"base"},
     "streams": {"base"},
+    "priors": {"base"},
     "lines": {"base"},
     "": {"base", "encoders", "streams"},
 }
 MODELS = COMMON | {
-    method.name: {*method.built_on, "base", "encoders", "lines", "streams"} for method in METHODS
+    method.name: {*method.built_on, "base", "encoders", "lines", "priors", "streams"}
+    for method in METHODS
 }
 FREE_OF_OPENMMLAB = ("structures", "ops", "utils", "minicity", "evaluation")
 

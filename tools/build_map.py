@@ -140,6 +140,11 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         help="write a GaussianPrior of the predictions of all frames in place of a MapPrior",
     )
     group.add_argument(
+        "--elements",
+        action="store_true",
+        help="write an ElementPrior of the merged elements in place of a MapPrior",
+    )
+    group.add_argument(
         "--map", type=Path, metavar="FILE", help="add this map (GeoJSON, Lanelet2) to the --prior"
     )
     group.add_argument(
@@ -159,15 +164,24 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         parser.error("--changes goes to the folder --out: give it, too")
     if args.changes and args.join:
         parser.error("--changes compares each drive with the old map: leave --join out")
+    check_prior_options(parser, args)
+    if args.map_classes and not (args.map or args.changes):
+        parser.error("--map-classes is for --map and --changes")
+    return args
+
+
+def check_prior_options(parser: CommandParser, args: argparse.Namespace) -> None:
+    """Refuse options that do not fit ``--prior``."""
     if args.gaussians and not (args.prior and args.results):
         parser.error("--gaussians is for a --prior of results: give both, too")
     if args.gaussians and args.map:
         parser.error("a map of --map has no Gaussians: leave --gaussians out, or --map")
+    if args.elements and not args.prior:
+        parser.error("--elements is for a --prior: give it, too")
+    if args.elements and args.gaussians:
+        parser.error("a prior has --gaussians or --elements: give one of them")
     if args.map and not args.prior:
         parser.error("--map is for a prior: give --prior, too")
-    if args.map_classes and not (args.map or args.changes):
-        parser.error("--map-classes is for --map and --changes")
-    return args
 
 
 def check_options(args: argparse.Namespace, ann: AnnotationFile) -> None:
@@ -461,6 +475,32 @@ def write_prior(path: Path, place: str, classes: Sequence[str], maps: list[MapEl
         print(f"prior of {place}, {format_count(prior.num_tiles, 'tile')}: {path}")
 
 
+def write_element_prior(
+    path: Path, place: str, classes: Sequence[str], maps: Sequence[MapElements]
+) -> None:
+    """Write the elements of a map of a place as a prior.
+
+    Args:
+        path: File to create or replace.
+        place: Name of the map.
+        classes: Class names in label order.
+        maps: Maps in the global frame.
+
+    Raises:
+        ValueError: If there are several maps, whose elements may lie upon each other.
+    """
+    from gsmap.prior import ElementPrior, PriorSettings
+
+    if len(maps) != 1:
+        raise InputError(
+            f"--elements needs one map, and there are {len(maps)}: --join makes one of all drives, "
+            "and a --map is written without results."
+        )
+    prior = ElementPrior(PriorSettings(tuple(classes), place), maps[0])
+    prior.save(path)
+    print(f"prior of {place}, {format_count(len(prior.elements), 'element')}: {path}")
+
+
 def write_gaussian_prior(
     path: Path, place: str, passes: Sequence[Pass], results: Mapping[str, MapElements], thr: float
 ) -> None:
@@ -607,6 +647,8 @@ def main(argv: list[str] | None = None) -> str:
         compare(args, ann, old, passes)
     if args.gaussians:
         write_gaussian_prior(args.prior, place, passes, results, args.score_thr)
+    elif args.elements:
+        write_element_prior(args.prior, place, ann.meta.classes, maps)
     elif args.prior:
         write_prior(args.prior, place, ann.meta.classes, maps)
     if args.out and has_truth(ann):

@@ -9,9 +9,8 @@ from drivemaps.drive import Drive, DriveFrame
 from gsmap.evaluation.core.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
 from gsmap.evaluation.core.evaluator import MapEvaluator
 from gsmap.evaluation.core.report import flat_metrics
-from gsmap.structures.classes import AREA_CLASSES
+from gsmap.structures.cutting import cut_to_range
 from gsmap.structures.elements import FloatArray, MapElements
-from gsmap.structures.polylines import clip_to_box
 from gsmap.utils.words import markdown_table
 
 NUM_POINTS = 1000
@@ -88,26 +87,14 @@ def cut_to_frame(elements: MapElements, drive: Drive, frame: DriveFrame) -> MapE
     Returns:
         Elements inside the range, in the annotation frame.
     """
-    x0, x1 = drive.x_range
-    y0, y1 = drive.y_range
-    box = shapely.box(x0, y0, x1, y1)
-    lines: list[FloatArray] = []
-    labels: list[int] = []
-    scores: list[float] = []
-    for line, label, score in drive.nearby(frame, elements).rows:
-        local = frame.to_frame(line)
-        if drive.classes[label] in AREA_CLASSES and len(local) > 3:
-            area_in_range = shapely.make_valid(shapely.Polygon(local)) & box
-            pieces = []
-            for area in shapely.get_parts(area_in_range):
-                if area.area > 0.0:
-                    pieces.append(shapely.get_coordinates(area.exterior))
-        else:
-            pieces = clip_to_box(local, drive.x_range, drive.y_range)
-        lines += pieces
-        labels += [label] * len(pieces)
-        scores += [score] * len(pieces)
-    return MapElements.from_polylines(lines, labels=labels, scores=scores)
+    nearby = drive.nearby(frame, elements)
+    local = MapElements(
+        points=frame.to_frame(nearby.points),
+        offsets=nearby.offsets,
+        labels=nearby.labels,
+        scores=nearby.scores,
+    )
+    return cut_to_range(local, drive.classes, x_range=drive.x_range, y_range=drive.y_range)
 
 
 def map_figures(

@@ -29,6 +29,7 @@ FOLDERS = (  # all modules of these folders are imported
     "gsmap.models.encoders",
     "gsmap.models.base",
     "gsmap.models.streams",
+    "gsmap.models.priors",
     "gsmap.models.lines",
     *(f"gsmap.models.{method.name}" for method in METHODS),
 )

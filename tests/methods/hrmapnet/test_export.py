@@ -10,8 +10,8 @@ from model_cases import IMAGE_SHAPE, NUM_CAMS
 from gsmap.apis.export import export_onnx, largest_differences
 from gsmap.apis.onnx_inferencer import OnnxInferencer
 from gsmap.datasets.elements import elements_of_predictions
-from gsmap.models.hrmapnet.maps import Place
 from gsmap.prior import KeepMaximum, MapPrior, PriorSettings
+from gsmap.prior.places import Place
 
 for _package in ("onnx", "onnxscript", "onnxruntime"):
     pytest.importorskip(_package, reason=f"{_package} is not installed: pip install -e .[onnx]")

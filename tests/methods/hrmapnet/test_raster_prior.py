@@ -9,9 +9,9 @@ from methods.hrmapnet.prior_cases import CLASSES, PRIOR, frames, pose_at, prior_
 from model_cases import build_small, make_images
 
 from gsmap.models.hrmapnet import raster_prior
-from gsmap.models.hrmapnet.maps import Place
 from gsmap.models.hrmapnet.raster_prior import CELLS, KEYS, VALID
 from gsmap.prior import KeepMaximum, LastSeen, MapPrior, PriorSettings
+from gsmap.prior.places import Place
 
 TOWN = PriorSettings(CLASSES, "town", cell_m=1.25)
 

@@ -68,6 +68,11 @@ class ExportedDetector(nn.Module):
                 "temporal.elements works behind the network and has no ONNX operators: set "
                 "model.temporal.elements=None (temporal=None without other memory)."
             )
+        if model.prior is not None and not model.prior.reads_window:
+            raise InputError(
+                f"{type(model.prior).__name__} works behind the network and has no ONNX operators: "
+                "set model.prior=None."
+            )
         self.model = model
         stream_inputs = () if model.temporal is None else STREAM_INPUTS
         calibration = [*model.bev_encoder.calibration]

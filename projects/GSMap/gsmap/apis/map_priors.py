@@ -18,7 +18,10 @@ if TYPE_CHECKING:  # slow to import
 def require_prior(model: Any) -> None:
     """Raise ValueError if a model takes no prior."""
     if model.prior is None:
-        raise InputError("the model takes no prior (model.prior): leave the prior out.")
+        raise InputError(
+            "the model takes no prior: leave the prior out, or set model.prior.type=ElementFusion "
+            "to fuse the detections with a prior of elements."
+        )
 
 
 def maps_for(model: Any, priors: "Sequence[AnyPrior]", update: bool = False) -> Any:
@@ -80,8 +83,7 @@ def open_priors(
     priors: list[AnyPrior] = []
     for path in paths:
         if update and not path.exists():
-            settings = model.prior.maps.settings_of(new_place)
-            with MapPrior(settings, rule=model.prior.test_rule) as empty:
+            with model.prior.new_prior(new_place) as empty:
                 empty.save(path)
         prior = open_prior(path, update=update)
         if isinstance(prior, MapPrior):  # a `GaussianPrior` keeps no file open

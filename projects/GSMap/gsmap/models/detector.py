@@ -50,8 +50,8 @@ class MapDetector(Base3DDetector):
         lidar_encoder: BEV encoder of the LiDAR.
         bev_fuser: Fusion of the BEV features of cameras and LiDAR.
         temporal: Settings of `StreamMemory`, for a model with memory of earlier frames.
-        prior: Config of a module that reads a map of earlier frames and writes the predictions to
-            it (`RasterPrior`).
+        prior: Config of a module that reads maps of earlier frames (`RasterPrior`,
+            `ElementFusion`).
         fold_batch_norms: Run the image backbone without gradients as a copy whose batch norms are
             folded into its convolutions. It is faster and needs a second copy of the weights.
         allow_untrained: Accept checkpoints without the weights of modules that start without
@@ -229,7 +229,7 @@ class MapDetector(Base3DDetector):
             if self.bev_fuser is not None:
                 feats = self.bev_fuser(outputs["bev_feats"], feats)
             outputs = {**outputs, "bev_feats": feats}
-        if self.prior is not None:  # only models with cameras can have a prior
+        if self.prior is not None and self.bev_encoder is not None:
             outputs = self.prior.fuse(outputs, metas, img_shape=tuple(imgs.shape[-2:]))
         return outputs
 
@@ -322,6 +322,9 @@ class MapDetector(Base3DDetector):
             results = self.map_head.predict(batch.outputs, batch_data_samples, **batch.hooks)
             if self.temporal is not None:
                 results = self.temporal.update_detections(batch, results)
+            if self.prior is not None:
+                metas = [sample.metainfo for sample in batch_data_samples]
+                results = self.prior.update_detections(results, metas)
         return self.add_pred_to_datasample(batch_data_samples, results)
 
     def _forward(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:

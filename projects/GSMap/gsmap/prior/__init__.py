@@ -1,10 +1,12 @@
-"""Map priors: rasters or Gaussians of the map at places that a vehicle has passed before."""
+"""Map priors: cells, Gaussians or elements at places that a vehicle has passed before."""
 
 from gsmap.utils.lazy import lazy_names
 
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
+        "ElementPrior": "element_prior",
+        "ElementRule": "element_rule",
         "GaussianPrior": "gaussian_prior",
         "GaussianRule": "gaussian_rule",
         "HitMissCounts": "rules",

@@ -1,4 +1,4 @@
-"""File of a map prior or a Gaussian prior: a header, compressed tiles and an index.
+"""File of a prior of any kind: a header, compressed tiles and an index.
 
 The file begins with the magic number, the version and the length of the header, all little-endian.
 The header is JSON in UTF-8. Compressed tiles (zlib) follow, then the index with the place, offset,
@@ -12,10 +12,11 @@ import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 
+from gsmap.prior.element_rule import ELEMENT_RULES
 from gsmap.prior.gaussian_rule import GAUSSIAN_RULES
 from gsmap.prior.rules import RULES, rule_from_settings, rule_settings
 from gsmap.prior.settings import PriorSettings
@@ -33,6 +34,8 @@ RASTER_MAGIC = b"\x89GSPRIOR"
 """First bytes of a file of `MapPrior`."""
 GAUSSIAN_MAGIC = b"\x89GSGAUSS"
 """First bytes of a file of `GaussianPrior`."""
+ELEMENT_MAGIC = b"\x89GSELEMS"
+"""First bytes of a file of `ElementPrior`."""
 _START = struct.Struct("<8sII")  # magic, version, length of the header
 # Offset, number of rows and checksum of the index; checksum of the header; magic.
 _FOOTER = struct.Struct("<QIII8s")
@@ -40,6 +43,27 @@ _INDEX = np.dtype(
     [("column", "<i4"), ("row", "<i4"), ("offset", "<u8"), ("length", "<u4"), ("crc", "<u4")]
 )
 _LONGEST_HEADER = 1 << 16
+
+
+class _Kind(NamedTuple):
+    """Kind of a prior in a file.
+
+    Attributes:
+        title: Name of the kind, for messages.
+        writer: Name of the class that writes such files.
+        rules: Classes of the settings of such a prior, by their names in files.
+    """
+
+    title: str
+    writer: str
+    rules: Mapping[str, type]
+
+
+_KINDS = {
+    RASTER_MAGIC: _Kind("map prior", "MapPrior", rules=RULES),
+    GAUSSIAN_MAGIC: _Kind("Gaussian prior", "GaussianPrior", rules=GAUSSIAN_RULES),
+    ELEMENT_MAGIC: _Kind("prior of elements", "ElementPrior", rules=ELEMENT_RULES),
+}
 
 
 def write_tiles(
@@ -58,8 +82,7 @@ def write_tiles(
         tiles: Place and compressed states of each tile.
         magic: First bytes of the kind of file.
     """
-    rules: Mapping[str, type] = RULES if magic == RASTER_MAGIC else GAUSSIAN_RULES
-    entry = rule_settings(rule, rules)
+    entry = rule_settings(rule, _KINDS[magic].rules)
     header = json.dumps(asdict(settings) | {"rule": entry}).encode()
     file.write(_START.pack(magic, VERSION, len(header)))
     file.write(header)
@@ -90,13 +113,12 @@ def read_header(
     Raises:
         ValueError: If the file is no valid prior.
     """
+    kind = _KINDS[magic]
     size = len(content)
     start = bytes(content[: max(_START.size, 200)])
     if not start.startswith(magic):
-        kind = "map prior" if magic == RASTER_MAGIC else "Gaussian prior"
-        writer = "MapPrior" if magic == RASTER_MAGIC else "GaussianPrior"
-        advice = fetch_advice(start, otherwise=f"give a file that {writer}.save has written")
-        raise InputError(f"{path} is no {kind}: {advice}.")
+        advice = fetch_advice(start, otherwise=f"give a file that {kind.writer}.save has written")
+        raise InputError(f"{path} is no {kind.title}: {advice}.")
     if size < _START.size + _FOOTER.size:
         raise _cut(path)
     _, version, length = _START.unpack_from(start)
@@ -117,8 +139,7 @@ def read_header(
     index = bytes(content[offset : offset + index_size])
     if zlib.crc32(header) != header_crc or zlib.crc32(index) != index_crc:
         raise InputError(f"{path} is damaged: a checksum is wrong; copy or build it again.")
-    rules: Mapping[str, type] = RULES if magic == RASTER_MAGIC else GAUSSIAN_RULES
-    settings, rule = _parse_header(header, path=path, rules=rules)
+    settings, rule = _parse_header(header, path=path, rules=kind.rules)
     places = _parse_index(index, path=path, start=header_end, end=offset)
     return settings, rule, places
 

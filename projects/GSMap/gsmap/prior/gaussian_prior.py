@@ -3,7 +3,7 @@
 import threading
 import zlib
 from pathlib import Path
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -80,7 +80,12 @@ class GaussianPrior:
     Args:
         settings: Classes, place and tiles; the size of cells is not used.
         rule: Settings of the Gaussians; ``GaussianRule()`` by default.
+
+    Attributes:
+        content: Name of the stored things, for messages.
     """
+
+    content: ClassVar[str] = "Gaussians"
 
     def __init__(self, settings: PriorSettings, rule: GaussianRule | None = None) -> None:
         self.settings = settings

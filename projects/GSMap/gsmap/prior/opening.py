@@ -1,12 +1,13 @@
-"""Files of priors of both kinds."""
+"""Files of priors of all kinds."""
 
 from pathlib import Path
 
-from gsmap.prior.file_format import GAUSSIAN_MAGIC
+from gsmap.prior.element_prior import ElementPrior
+from gsmap.prior.file_format import ELEMENT_MAGIC, GAUSSIAN_MAGIC
 from gsmap.prior.gaussian_prior import GaussianPrior
 from gsmap.prior.map_prior import MapPrior
 
-AnyPrior = MapPrior | GaussianPrior
+AnyPrior = MapPrior | GaussianPrior | ElementPrior
 """Priors that a model reads."""
 
 
@@ -14,11 +15,12 @@ def open_prior(path: str | Path, update: bool = False) -> AnyPrior:
     """Open the file of a prior, whose first bytes tell its kind.
 
     Args:
-        path: File that `MapPrior.save` or `GaussianPrior.save` has written. It may be untrusted.
+        path: File that `MapPrior.save`, `GaussianPrior.save` or `ElementPrior.save` has written. It
+            may be untrusted.
         update: Reserve the file of a `MapPrior` for this process, to save it later.
 
     Returns:
-        The prior. `MapPrior.close` releases its file; a `GaussianPrior` holds none.
+        The prior. `MapPrior.close` releases its file; the other kinds hold none.
 
     Raises:
         ValueError: If the file is no valid prior.
@@ -26,7 +28,9 @@ def open_prior(path: str | Path, update: bool = False) -> AnyPrior:
     """
     path = Path(path)
     with path.open("rb") as file:
-        is_gaussian = file.read(len(GAUSSIAN_MAGIC)) == GAUSSIAN_MAGIC
-    if is_gaussian:
+        magic = file.read(len(GAUSSIAN_MAGIC))
+    if magic == GAUSSIAN_MAGIC:
         return GaussianPrior.load(path)
+    if magic == ELEMENT_MAGIC:
+        return ElementPrior.load(path)
     return MapPrior.load(path, update=update)

@@ -1,9 +1,8 @@
 """Raster prior of a detector: reads the map of earlier frames, and writes its predictions."""
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -11,18 +10,17 @@ from mmdet.models.layers import LearnedPositionalEncoding
 from mmdet3d.registry import MODELS
 from mmengine.dist import get_world_size
 from mmengine.logging import print_log
-from mmengine.model import BaseModule
 from torch import Tensor
 
 from gsmap.checkpoints.strict import AddsWeights
-from gsmap.models.base.head import MapHead
 from gsmap.models.base.parts import DEFAULTS, build_part
 from gsmap.models.encoders.camera_encoder import stack_calibration
 from gsmap.models.hrmapnet.bev_fusion import PriorBEVFusion
 from gsmap.models.hrmapnet.drawing import draw_elements
-from gsmap.models.hrmapnet.maps import GivenMaps, Place, PlaceMaps
 from gsmap.models.hrmapnet.query_start import MapKeys, PriorHook, PriorQueries
-from gsmap.prior.opening import AnyPrior
+from gsmap.models.priors.prior_module import PriorModule
+from gsmap.prior.map_prior import MapPrior
+from gsmap.prior.places import Place, PlaceMaps
 from gsmap.prior.rules import RULES, WriteRule
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.grid import BEVGrid
@@ -52,7 +50,7 @@ class _Pending(NamedTuple):
 
 
 @MODELS.register_module()
-class RasterPrior(BaseModule, AddsWeights):
+class RasterPrior(PriorModule, AddsWeights):
     """Raster of earlier predictions at a place, as an input of a `MapDetector` (HRMapNet).
 
     Before a frame, a window of the map is read at its pose. The BEV features are fused with it, and
@@ -86,6 +84,8 @@ class RasterPrior(BaseModule, AddsWeights):
         ValueError: If head, encoder or a setting does not fit.
     """
 
+    reads_window: ClassVar[bool] = True
+
     def __init__(
         self,
         head: Any,
@@ -103,9 +103,7 @@ class RasterPrior(BaseModule, AddsWeights):
         neutral_start: bool = False,
         init_cfg: dict | None = None,
     ) -> None:
-        super().__init__(init_cfg)
-        if not isinstance(head, MapHead):
-            raise InputError(f"{type(head).__name__} can have no prior, which needs a MapHead.")
+        super().__init__(head, cell_m=cell_m, init_cfg=init_cfg)
         cells = getattr(encoder, "grid", None)
         if not isinstance(cells, BEVGrid) or encoder.num_levels != 1:
             raise InputError(
@@ -117,7 +115,6 @@ class RasterPrior(BaseModule, AddsWeights):
         if not 0 <= train_drop < 1:
             raise InputError(f"prior.train_drop must be in [0, 1), got {train_drop}.")
         self.train_drop = train_drop
-        self.window = head.grid.rasterized(cell_m)
         self.scale = self.window.height // cells.height
         size = (self.scale * cells.height, self.scale * cells.width)
         if not self.scale or size != (self.window.height, self.window.width):
@@ -125,7 +122,6 @@ class RasterPrior(BaseModule, AddsWeights):
                 f"prior.cell_m is {cell_m:g}: BEV cells of {cells.pixel_size_m[0]:g} m must be a "
                 "multiple of it."
             )
-        self.classes = head.classes
         self.coder = head.coder
         self.num_channels = len(self.classes) * self.scale**2
         self.score_threshold = score_threshold
@@ -162,7 +158,6 @@ class RasterPrior(BaseModule, AddsWeights):
         queries_are_neutral = self.queries is None or self.queries.zero_init
         if bev_is_neutral and queries_are_neutral:
             self.neutral_keys = ("",)  # the prefix of all keys
-        self._given: PlaceMaps | None = None
         self._pending: list[_Pending] = []
         self._maps = self.new_maps()
 
@@ -186,40 +181,9 @@ class RasterPrior(BaseModule, AddsWeights):
         memory = "kept" if self.training else self.test_memory
         return PlaceMaps(self.classes, self.window, rule=rule, memory=memory)
 
-    def maps_of(self, priors: Sequence[AnyPrior], update: bool = False) -> GivenMaps:
-        """Maps of a user, for `use` and `using`.
-
-        Args:
-            priors: The priors, one for each place.
-            update: Write each frame to them after it is predicted.
-
-        Raises:
-            ValueError: If a prior has other classes or cells, or two are of one place.
-        """
-        return GivenMaps(priors, self.classes, grid=self.window, update=update)
-
-    def use(self, maps: PlaceMaps | None) -> None:
-        """Use these maps in tests from now on; None for the maps of the model.
-
-        Args:
-            maps: Maps of `maps_of` or `new_maps`.
-        """
-        self.flush()
-        self._given = maps
-
-    @contextmanager
-    def using(self, maps: PlaceMaps) -> Iterator[None]:
-        """Use these maps in this context, and write all predictions at its end.
-
-        Args:
-            maps: Maps of `maps_of` or `new_maps`.
-        """
-        previous = self._given
-        self.use(maps)
-        try:
-            yield
-        finally:
-            self.use(previous)
+    def new_prior(self, place: str) -> MapPrior:
+        """Create the empty prior of a place, with the rule of tests."""
+        return MapPrior(self.maps.settings_of(place), rule=self.test_rule)
 
     def train(self, mode: bool = True) -> "RasterPrior":
         """Set the mode, and empty the maps of the model."""

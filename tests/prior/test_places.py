@@ -5,8 +5,8 @@ import pytest
 import torch
 from methods.hrmapnet.prior_cases import CLASSES, frames, pose_at
 
-from gsmap.models.hrmapnet.maps import GivenMaps, Place, PlaceMaps
 from gsmap.prior import GaussianPrior, KeepMaximum, LastSeen, MapPrior, PriorSettings
+from gsmap.prior.places import GivenMaps, Place, PlaceMaps
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
 

@@ -10,7 +10,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsmap.prior.gaussian_prior import GaussianPrior
 from gsmap.prior.map_prior import MapPrior
 from gsmap.prior.opening import AnyPrior
 from gsmap.prior.rules import WriteRule
@@ -165,8 +164,8 @@ class GivenMaps(PlaceMaps):
         update: Write each frame after it is predicted.
 
     Raises:
-        ValueError: If a prior has other classes or cells, two are of one place, or a Gaussian prior
-            is to be written.
+        ValueError: If a prior has other classes or cells, two are of one place, or a prior that is
+            no `MapPrior` is to be written.
     """
 
     def __init__(
@@ -184,13 +183,13 @@ class GivenMaps(PlaceMaps):
             name = prior.settings.place
             expected = self.settings_of(name)
             found = prior.settings
-            if isinstance(prior, GaussianPrior):
+            if not isinstance(prior, MapPrior):
                 if update:
                     raise InputError(
-                        f"the prior of {name!r} has Gaussians, which a model reads only: leave the "
-                        "update out; tools/build_map.py --prior --gaussians makes it anew."
+                        f"the prior of {name!r} has {prior.content}, which a model reads only: "
+                        "leave the update out; tools/build_map.py --prior makes it anew."
                     )
-                # Gaussians have no cells: they are drawn on the cells of a window.
+                # These priors have no cells: they are drawn on the cells of a window.
                 found = replace(found, cell_m=expected.cell_m, tile_m=expected.tile_m)
             expected.require_equal(found, f"the prior of {name!r}")
             if name in self._priors:
@@ -221,15 +220,23 @@ class GivenMaps(PlaceMaps):
         """Map at a place (`find`)."""
         return self.find(place)
 
-    def read(self, place: Place | None) -> Tensor:
-        """Read the window of a frame.
+    def require_place(self, place: Place | None) -> Place:
+        """Return the place of a frame.
 
         Raises:
-            ValueError: If the place of the frame is unknown, or has no map.
+            ValueError: If it is unknown.
         """
         if place is None:
             raise InputError(
                 "a prior is read at the pose of a frame, and a sample has none: leave the prior "
                 "out, or give each sample its pose (lidar2global)."
             )
-        return super().read(place)
+        return place
+
+    def read(self, place: Place | None) -> Tensor:
+        """Read the window of a frame.
+
+        Raises:
+            ValueError: If the place of the frame is unknown, or has no map.
+        """
+        return super().read(self.require_place(place))

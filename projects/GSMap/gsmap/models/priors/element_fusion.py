@@ -1,0 +1,173 @@
+"""Fusion of detections with the elements of earlier drives."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from mmdet3d.registry import MODELS
+from mmengine.structures import InstanceData
+from torch import Tensor
+
+from gsmap.models.priors.prior_module import PriorModule
+from gsmap.prior.element_prior import ElementPrior
+from gsmap.prior.opening import AnyPrior
+from gsmap.prior.places import GivenMaps, Place
+from gsmap.structures.elements import MapElements
+from gsmap.structures.gaussians import gaussians_along
+from gsmap.structures.line_update import nearest_places
+from gsmap.structures.polylines import resample_all
+from gsmap.utils.errors import InputError
+
+_CELL_M = 0.3  # side of the cells of a `PlaceMaps`; elements need none
+
+
+@MODELS.register_module()
+class ElementFusion(PriorModule):
+    r"""Fusion of detections with the elements of an `ElementPrior` at the pose of a frame.
+
+    A detection belongs to the nearest element of its class within ``gate_m``. With s, the best
+    score of its detections, or 0 without one, an element of confidence c gets the score
+
+    .. math:: 1 - (1 - c\,(m + (1 - m)\,s))\,(1 - s)
+
+    where m is ``missed_share``. The element replaces its detections, because the mean of many
+    frames is more accurate than one frame. All other detections stay as they are. There are no
+    weights and there is no training, so any trained model with a `MapHead` can use it. Without a
+    prior, the detections do not change. It is not part of a published method.
+
+    Args:
+        head: Head of the detector, a `MapHead`.
+        encoder: BEV encoder of the detector, which is not used.
+        gate_m: Largest distance between a detection and an element that belong together, in metres:
+            the mean distance of the points of each to the other, the larger of both.
+        missed_share: Share of its confidence that is left to an element without a detection, in
+            [0, 1].
+
+    Raises:
+        ValueError: If the head is no `MapHead`, its points have heights, or a setting is out of
+            range.
+    """
+
+    def __init__(
+        self,
+        head: Any,
+        encoder: Any = None,
+        gate_m: float = 1.5,
+        missed_share: float = 0.5,
+        init_cfg: dict | None = None,
+    ) -> None:
+        super().__init__(head, cell_m=_CELL_M, init_cfg=init_cfg)
+        if not (gate_m > 0 and 0 <= missed_share <= 1):
+            raise InputError(
+                "ElementFusion needs gate_m > 0 and missed_share in [0, 1], got "
+                f"{gate_m} and {missed_share}."
+            )
+        self.num_points = head.num_points
+        self.has_gaussians = "scales" in head.reference.outputs
+        self.gate_m = gate_m
+        self.missed_share = missed_share
+
+    def maps_of(self, priors: Sequence[AnyPrior], update: bool = False) -> GivenMaps:
+        """Maps of a user (`PriorModule.maps_of`).
+
+        Raises:
+            ValueError: If a prior is no `ElementPrior`, has other classes, or is to be written.
+        """
+        for prior in priors:
+            if not isinstance(prior, ElementPrior):
+                raise InputError(
+                    f"the prior of {prior.settings.place!r} has no elements, which ElementFusion "
+                    "needs: make one by tools/build_map.py --prior FILE --elements."
+                )
+        return super().maps_of(priors, update=update)
+
+    def update_detections(
+        self, results: Sequence[InstanceData], metas: Sequence[Mapping[str, Any]]
+    ) -> list[InstanceData]:
+        """Fuse the detections of a batch with the elements at their places.
+
+        Args:
+            results: Detections of each sample, as predicted by the head.
+            metas: Metainfo of each sample.
+
+        Returns:
+            Detections of each sample, highest score first; as they are without a prior.
+
+        Raises:
+            ValueError: If the place of a sample is unknown or has no prior.
+        """
+        maps = self._given
+        if not isinstance(maps, GivenMaps):
+            return list(results)
+        updated = []
+        for detections, meta in zip(results, metas, strict=True):
+            place = maps.require_place(Place.of(meta))
+            prior = maps.find(place)
+            assert isinstance(prior, ElementPrior)  # by `maps_of`
+            elements = prior.read_elements(place.pose, self.window)
+            updated.append(self._fuse_sample(detections, elements, sigma_m=prior.rule.sigma_m))
+        return updated
+
+    def _fuse_sample(
+        self, detections: InstanceData, elements: MapElements, sigma_m: float
+    ) -> InstanceData:
+        """Fuse the detections of one sample.
+
+        Args:
+            detections: Detections of the head.
+            elements: Elements of the prior in the frame.
+            sigma_m: Standard deviation of their points across the line, in metres.
+        """
+        if not len(elements):
+            return detections
+        points = detections.pts
+        if points.shape[-1] != 2:
+            raise InputError(
+                "ElementFusion needs detections without heights, as elements have none: leave out "
+                "model.prior."
+            )
+        resampled = resample_all(elements.points, elements.offsets, num_points=self.num_points)
+        lines = torch.from_numpy(resampled).to(points)  # (E, P, 2)
+        labels = torch.from_numpy(elements.labels).to(detections.labels_3d)
+        confidences = torch.from_numpy(elements.confidence).to(detections.scores_3d)
+        distances = _distances(points, labels=detections.labels_3d, lines=lines, line_labels=labels)
+        smallest_m, element_inds = distances.min(1)  # (N,)
+        belongs = smallest_m < self.gate_m
+        scores_of_own = torch.where(belongs, detections.scores_3d, 0.0)
+        best_scores = torch.zeros_like(confidences)
+        best_scores.scatter_reduce_(0, element_inds, scores_of_own, reduce="amax")
+        shares = self.missed_share + (1 - self.missed_share) * best_scores
+        scores = 1 - (1 - shares * confidences) * (1 - best_scores)
+        fields = {"pts": lines, "labels_3d": labels, "scores_3d": scores}
+        if self.has_gaussians:
+            gaussians = gaussians_along(lines, across_m=sigma_m)
+            fields["scales"] = gaussians.scales.to(detections.scales)
+            fields["rotations"] = gaussians.rotations.to(detections.rotations)
+        others = detections[~belongs]
+        joined = {}
+        for name, values in fields.items():
+            joined[name] = torch.cat([values, others[name]])
+        order = joined["scores_3d"].argsort(descending=True)
+        fused = {name: values[order] for name, values in joined.items()}
+        return InstanceData(metainfo=dict(detections.metainfo_items()), **fused)
+
+
+def _distances(points: Tensor, labels: Tensor, lines: Tensor, line_labels: Tensor) -> Tensor:
+    """Distances between detections and elements of one class.
+
+    Args:
+        points: Points of the detections in metres. (N, P, 2)
+        labels: Classes of the detections. (N,)
+        lines: Points of the elements in metres. (E, P, 2)
+        line_labels: Classes of the elements. (E,)
+
+    Returns:
+        Mean distance of the points of each to the line of the other, the larger of both; infinite
+        between two classes. (N, E)
+    """
+    rows, columns = (labels[:, None] == line_labels).nonzero(as_tuple=True)
+    to_lines = nearest_places(points[rows], lines[columns]).distances.mean(-1)
+    to_detections = nearest_places(lines[columns], points[rows]).distances.mean(-1)
+    distances = points.new_full((len(labels), len(line_labels)), torch.inf)
+    distances[rows, columns] = torch.maximum(to_lines, to_detections)
+    return distances

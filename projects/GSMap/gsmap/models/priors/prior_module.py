@@ -1,0 +1,153 @@
+"""Base class of the parts of a detector that read maps of earlier frames."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any, ClassVar
+
+from mmengine.model import BaseModule
+from mmengine.structures import InstanceData
+
+from gsmap.models.base.head import MapHead
+from gsmap.models.base.hooks import FlowHook
+from gsmap.prior.map_prior import MapPrior
+from gsmap.prior.opening import AnyPrior
+from gsmap.prior.places import GivenMaps, PlaceMaps
+from gsmap.utils.errors import InputError
+
+
+class PriorModule(BaseModule):
+    """Part of a `MapDetector` that reads maps of earlier frames, its ``prior``.
+
+    For each batch the detector calls `fuse` with the outputs of the encoder, `hook` for the flow of
+    the head, `update_detections` with the detections and `keep` with the hook. This base class does
+    nothing there.
+
+    Args:
+        head: Head of the detector, a `MapHead`.
+        cell_m: Side in metres of the cells in which a frame reads maps.
+
+    Attributes:
+        reads_window: Whether `fuse` needs a window of a map, which then is an input of an exported
+            network.
+        window: Extent of a frame and the cells in which it reads maps.
+        classes: Names of the classes.
+
+    Raises:
+        ValueError: If the head is no `MapHead`.
+    """
+
+    reads_window: ClassVar[bool] = False
+
+    def __init__(self, head: Any, cell_m: float, init_cfg: dict | None = None) -> None:
+        super().__init__(init_cfg)
+        if not isinstance(head, MapHead):
+            raise InputError(f"{type(head).__name__} can have no prior, which needs a MapHead.")
+        self.window = head.grid.rasterized(cell_m)
+        self.classes = head.classes
+        self._given: PlaceMaps | None = None
+
+    @property
+    def calibration(self) -> tuple[str, ...]:
+        """Names of the arrays of calibration that `fuse` reads."""
+        return ()
+
+    def new_maps(self) -> PlaceMaps:
+        """Create the empty maps of a training or a test, to which nothing is written."""
+        return PlaceMaps(self.classes, self.window, memory="none")
+
+    def new_prior(self, place: str) -> MapPrior:
+        """Create the empty prior of a place, for a user who lets the model write to it.
+
+        Args:
+            place: Name of the place.
+
+        Raises:
+            ValueError: If the model writes to no prior.
+        """
+        raise InputError(
+            f"a model with {type(self).__name__} writes to no prior: leave the update out."
+        )
+
+    def maps_of(self, priors: Sequence[AnyPrior], update: bool = False) -> GivenMaps:
+        """Maps of a user, for `use` and `using`.
+
+        Args:
+            priors: The priors, one for each place.
+            update: Write each frame to them after it is predicted.
+
+        Raises:
+            ValueError: If a prior has other classes or cells, two are of one place, or this module
+                does not read or write such priors.
+        """
+        return GivenMaps(priors, self.classes, grid=self.window, update=update)
+
+    def flush(self) -> None:
+        """Write the predictions that `keep` has kept to the maps."""
+
+    def use(self, maps: PlaceMaps | None) -> None:
+        """Use these maps in tests from now on; None for the maps of the model.
+
+        Args:
+            maps: Maps of `maps_of` or `new_maps`.
+        """
+        self.flush()
+        self._given = maps
+
+    @contextmanager
+    def using(self, maps: PlaceMaps) -> Iterator[None]:
+        """Use these maps in this context, and write all predictions at its end.
+
+        Args:
+            maps: Maps of `maps_of` or `new_maps`.
+        """
+        previous = self._given
+        self.use(maps)
+        try:
+            yield
+        finally:
+            self.use(previous)
+
+    def fuse(
+        self,
+        outputs: Mapping[str, Any],
+        metas: Sequence[dict[str, Any]],
+        img_shape: tuple[int, int],
+    ) -> dict[str, Any]:
+        """Fuse the outputs of the encoder with the maps.
+
+        Args:
+            outputs: Outputs of the encoder: ``bev_feats`` (B, C, H, W), ``img_feats``.
+            metas: Metainfo of each sample.
+            img_shape: Rows and columns of the padded images.
+
+        Returns:
+            The outputs for the head.
+        """
+        return dict(outputs)
+
+    def hook(self, outputs: Mapping[str, Any]) -> FlowHook | None:
+        """Hook of a batch into the flow of the head, or None.
+
+        Args:
+            outputs: Outputs of `fuse`.
+        """
+        return None
+
+    def update_detections(
+        self, results: Sequence[InstanceData], metas: Sequence[Mapping[str, Any]]
+    ) -> list[InstanceData]:
+        """Update the detections of a batch by the maps.
+
+        Args:
+            results: Detections of each sample, as predicted by the head.
+            metas: Metainfo of each sample.
+        """
+        return list(results)
+
+    def keep(self, hook: Any, metas: Sequence[Mapping[str, Any]]) -> None:
+        """Keep the predictions of a batch, to be written by `flush`.
+
+        Args:
+            hook: Hook of the batch, after the head has run.
+            metas: Metainfo of each sample.
+        """

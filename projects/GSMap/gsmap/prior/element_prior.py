@@ -1,0 +1,281 @@
+"""Prior of elements: the merged lines and areas of earlier drives, in the global frame."""
+
+import zlib
+from collections import defaultdict
+from pathlib import Path
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gsmap.ops.polyline_raster import draw_polylines
+from gsmap.prior.element_rule import ElementRule
+from gsmap.prior.file_format import (
+    ELEMENT_MAGIC,
+    FARTHEST_TILE,
+    TileKey,
+    read_header,
+    unpack_tile,
+    write_tiles,
+)
+from gsmap.prior.inputs import Pose, planar_pose, reserve_file
+from gsmap.prior.settings import PriorSettings
+from gsmap.structures.classes import AREA_CLASSES
+from gsmap.structures.cutting import cut_to_range
+from gsmap.structures.elements import FloatArray, MapElements
+from gsmap.structures.grid import BEVGrid
+from gsmap.structures.polylines import is_closed, pad_lines
+from gsmap.utils.errors import InputError
+from gsmap.utils.files import atomic_write
+
+_MOST_ELEMENTS = 1_000_000
+_MOST_VERTICES_OF_TILE = 1_000_000
+_FARTHEST_M = 1e7  # largest coordinate of a vertex
+_COUNTS = np.dtype([("elements", "<u4"), ("vertices", "<u4")])
+_STORED = np.dtype([("label", "<u2"), ("score", "<f4"), ("num_vertices", "<u4")])
+_VERTEX = np.dtype("<f8")
+
+
+class _Bounds(NamedTuple):
+    """Bounding boxes of elements.
+
+    Attributes:
+        low: Smallest x and y in metres. (N, 2)
+        high: Largest x and y in metres. (N, 2)
+    """
+
+    low: FloatArray
+    high: FloatArray
+
+
+class ElementPrior:
+    """Elements of the map of a place, each with a class and a confidence.
+
+    The confidence of an element is its score: the share of the earlier frames that found it where
+    it was in view. The prior does not change, so all methods may be called from several threads.
+    All elements are in memory.
+
+    Args:
+        settings: Classes, place and tiles of the file; the size of cells is not used.
+        elements: Lines and areas in the global frame, in metres. Heights are dropped, and an
+            element without a score has a confidence of 1.
+        rule: Settings of the elements; ``ElementRule()`` by default.
+
+    Attributes:
+        content: Name of the stored things, for messages.
+
+    Raises:
+        ValueError: If a label or a vertex is out of range, or an element has fewer than two
+            vertices.
+    """
+
+    content: ClassVar[str] = "elements"
+
+    def __init__(
+        self, settings: PriorSettings, elements: MapElements, rule: ElementRule | None = None
+    ) -> None:
+        num_classes = len(settings.classes)
+        labels = elements.labels
+        if len(labels) and not 0 <= labels.min() <= labels.max() < num_classes:
+            raise InputError(f"labels of elements must be in [0, {num_classes}).")
+        if len(elements) > _MOST_ELEMENTS:
+            raise InputError(f"a prior has at most {_MOST_ELEMENTS} elements: split the map.")
+        if (elements.num_points < 2).any():
+            raise InputError("elements of a prior need two vertices or more.")
+        flat = elements.with_coordinates(2)
+        if np.abs(flat.points).max(initial=0.0) > _FARTHEST_M:
+            raise InputError(f"vertices must be within {_FARTHEST_M:g} m of the origin.")
+        self.settings = settings
+        self.rule = ElementRule() if rule is None else rule
+        self.elements = flat
+        self._bounds = _bounds(flat)
+
+    @classmethod
+    def load(cls, path: str | Path, settings: PriorSettings | None = None) -> "ElementPrior":
+        """Read a file that `save` has written.
+
+        Args:
+            path: File of the prior. It may be untrusted.
+            settings: Classes, place and tiles that the file must have; None to accept any.
+
+        Raises:
+            ValueError: If the file is no valid prior of elements, or has other settings.
+        """
+        path = Path(path)
+        content = path.read_bytes()
+        if not content:
+            raise InputError(f"{path} is empty: copy or build it again.")
+        found, rule, places = read_header(content, path, magic=ELEMENT_MAGIC)
+        if settings is not None:
+            settings.require_equal(found, str(path))
+        polylines: list[FloatArray] = []
+        labels: list[int] = []
+        scores: list[float] = []
+        for offset, length, crc in places.values():
+            packed = content[offset : offset + length]
+            stored, lines = _unpack(packed, crc=crc, path=path)
+            polylines += lines
+            labels += stored["label"].tolist()
+            scores += stored["score"].tolist()
+        try:
+            elements = MapElements.from_polylines(polylines, labels=labels, scores=scores)
+            return cls(found, elements, rule)
+        except ValueError as error:
+            text = str(error).rstrip(".")
+            raise InputError(f"{path} is damaged: {text}; build it again.") from error
+
+    def save(self, path: str | Path) -> None:
+        """Write the prior to a file, which replaces ``path`` when it is complete.
+
+        Args:
+            path: File to create or replace.
+
+        Raises:
+            RuntimeError: If the file is reserved by another process.
+        """
+        path = Path(path)
+        owner = reserve_file(path)
+        try:
+            tiles = self._packed_tiles()
+            with atomic_write(path, mode="wb") as file:
+                write_tiles(file, self.settings, rule=self.rule, tiles=tiles, magic=ELEMENT_MAGIC)
+        finally:
+            owner.close()
+
+    def read_elements(self, pose: Pose, grid: BEVGrid) -> MapElements:
+        """Read the elements in the range of a frame.
+
+        Args:
+            pose: Transform from the frame of ``grid`` to the global frame, in metres. Far from the
+                origin it must be float64. (4, 4)
+            grid: Extent of the frame.
+
+        Returns:
+            Parts of the elements in the range, (x, y) in metres in the frame, with confidences.
+
+        Raises:
+            ValueError: If ``pose`` is no rigid transform or too far from the origin.
+        """
+        frame = planar_pose(pose)
+        x0, x1 = grid.x_range
+        y0, y1 = grid.y_range
+        corners = frame.to_global(np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]))
+        # Whether the bounding box of an element overlaps the one of the range, by axis. (N, 2)
+        starts_before = self._bounds.low <= corners.max(axis=0)
+        ends_behind = self._bounds.high >= corners.min(axis=0)
+        is_near = (starts_before & ends_behind).all(axis=1)
+        nearby = self.elements.select(is_near)
+        local = MapElements(
+            points=frame.to_frame(nearby.points),
+            offsets=nearby.offsets,
+            labels=nearby.labels,
+            scores=nearby.scores,
+        )
+        return cut_to_range(
+            local, self.settings.classes, x_range=grid.x_range, y_range=grid.y_range
+        )
+
+    def read(self, pose: Pose, grid: BEVGrid) -> Tensor:
+        """Draw the elements in the cells of a frame, as `MapPrior.read` does.
+
+        Closed elements of `AREA_CLASSES` are filled. A cell has the confidence of the element that
+        covers it, times the covered share of its area. Of several elements of a class, the largest
+        value counts.
+
+        Args:
+            pose: Transform from the frame of ``grid`` to the global frame, in metres. Far from the
+                origin it must be float64. (4, 4)
+            grid: Extent and cells of the frame, H rows and W columns.
+
+        Returns:
+            Values in [0, 1], float32 on the device of ``pose``. (C, H, W)
+
+        Raises:
+            ValueError: If ``pose`` is no rigid transform or too far from the origin.
+        """
+        elements = self.read_elements(pose, grid)
+        raster = torch.zeros(len(self.settings.classes), grid.height, grid.width)
+        if len(elements):
+            is_filled = []
+            for line, label, _ in elements.rows:
+                is_area = self.settings.classes[label] in AREA_CLASSES
+                is_filled.append(is_area and is_closed(line))
+            masks = draw_polylines(
+                torch.from_numpy(pad_lines(elements.polylines)).float(),
+                grid,
+                width_m=self.rule.line_width_m,
+                filled=torch.tensor(is_filled),
+            )
+            values = masks * torch.from_numpy(elements.confidence).float()[:, None, None]
+            for value, label in zip(values, elements.labels.tolist(), strict=True):
+                raster[label] = torch.maximum(raster[label], value)
+        return raster.to(pose.device) if isinstance(pose, Tensor) else raster
+
+    def _packed_tiles(self) -> list[tuple[TileKey, bytes]]:
+        """Elements in the tile of their first vertex, compressed."""
+        rows_of_tile: dict[TileKey, list[int]] = defaultdict(list)
+        first_vertices = self.elements.points[self.elements.offsets[:-1]]
+        tiles = np.floor(first_vertices / self.settings.tile_m).astype(np.int64)
+        if np.abs(tiles).max(initial=0) > FARTHEST_TILE:
+            raise InputError(f"tiles of {self.settings.tile_m:g} m are too small for this map.")
+        for row, (column, tile_row) in enumerate(tiles.tolist()):
+            rows_of_tile[column, tile_row].append(row)
+        packed = []
+        for key, rows in sorted(rows_of_tile.items()):
+            packed.append((key, _pack(self.elements.select(np.array(rows)))))
+        return packed
+
+
+def _bounds(elements: MapElements) -> _Bounds:
+    """Bounding boxes of elements, each with at least one vertex."""
+    if not len(elements):
+        return _Bounds(low=np.zeros((0, 2)), high=np.zeros((0, 2)))
+    starts = elements.offsets[:-1]
+    return _Bounds(
+        low=np.minimum.reduceat(elements.points, starts),
+        high=np.maximum.reduceat(elements.points, starts),
+    )
+
+
+def _pack(elements: MapElements) -> bytes:
+    """Numbers of elements and vertices, followed by compressed elements and vertices."""
+    stored = np.zeros(len(elements), _STORED)
+    stored["label"] = elements.labels
+    stored["score"] = elements.confidence
+    stored["num_vertices"] = elements.num_points
+    counts = np.array((len(elements), len(elements.points)), dtype=_COUNTS)
+    vertices = elements.points.astype(_VERTEX)
+    return counts.tobytes() + zlib.compress(stored.tobytes() + vertices.tobytes(), level=1)
+
+
+def _unpack(content: bytes, crc: int, path: Path) -> tuple[NDArray[np.void], list[FloatArray]]:
+    """Decompress a tile of an untrusted file, in bounded memory.
+
+    Args:
+        content: Tile of the file.
+        crc: Expected checksum of ``content``.
+        path: Name of the file, for messages.
+
+    Returns:
+        Stored elements (N,), and the vertices of each one. N x (P, 2)
+    """
+    damage = InputError(f"{path} is damaged: a tile cannot be read; copy or build it again.")
+    if zlib.crc32(content) != crc or len(content) < _COUNTS.itemsize:
+        raise damage
+    counts = np.frombuffer(content[: _COUNTS.itemsize], dtype=_COUNTS)[0]
+    num_elements = int(counts["elements"])
+    num_vertices = int(counts["vertices"])
+    if num_elements > _MOST_ELEMENTS or num_vertices > _MOST_VERTICES_OF_TILE:
+        raise damage
+    packed = content[_COUNTS.itemsize :]  # its checksum was checked with the counts
+    num_bytes_of_elements = num_elements * _STORED.itemsize
+    num_bytes = num_bytes_of_elements + num_vertices * 2 * _VERTEX.itemsize
+    states = unpack_tile(packed, crc=zlib.crc32(packed), num_bytes=num_bytes, path=path)
+    stored = np.frombuffer(states[:num_bytes_of_elements], dtype=_STORED)
+    vertices = np.frombuffer(states[num_bytes_of_elements:], dtype=_VERTEX).reshape(-1, 2)
+    if int(stored["num_vertices"].sum(dtype=np.int64)) != num_vertices:
+        raise damage
+    ends = np.cumsum(stored["num_vertices"], dtype=np.int64)
+    return stored, np.split(vertices, ends[:-1])

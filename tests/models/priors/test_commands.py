@@ -1,0 +1,86 @@
+"""``build_map --elements`` and ``--prior`` of ``infer`` and ``test``, on a tiny MiniCity."""
+
+import json
+
+import pytest
+import torch
+from mmdet3d.registry import MODELS
+
+from gsmap.engine.launch import read_config
+from gsmap.prior import ElementPrior
+from gsmap.structures.elements import MapElements
+from tools import build_map, infer
+
+FUSION = ["--cfg-options", "model.prior.type=ElementFusion"]
+
+
+@pytest.fixture(scope="module")
+def model(tiny_config, tmp_path_factory) -> list[str]:
+    """The words after ``--model``."""
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp("elements") / "weights.pth"
+    model = MODELS.build(read_config(tiny_config).model)
+    model.init_weights()
+    torch.save({"state_dict": model.state_dict()}, path)
+    return [str(tiny_config), str(path)]
+
+
+def lines_of(path):
+    return {r["sample_token"]: r["vectors"] for r in json.loads(path.read_text())["results"]}
+
+
+def test_elements_of_a_drive_are_fused(model, minicity_annotations, tmp_path, capsys):
+    drive = str(minicity_annotations["val"])
+
+    def run(name, *words):
+        out = tmp_path / f"{name}.json"
+        infer.main([drive, "--model", *model, "--out", str(out), *words])
+        return out
+
+    first = run("first")
+    content = json.loads(first.read_text())
+    for record in content["results"]:
+        for line in record["vectors"]:
+            line["confidence_level"] = 0.9  # the untrained model is sure of nothing
+    first.write_text(json.dumps(content))
+    path = tmp_path / "town.elements"
+    words = [str(first), "--ann", drive, "--score-thr", "0", "--prior", str(path)]
+    build_map.main([*words, "--elements", "--join"])
+    prior = ElementPrior.load(path)
+    assert len(prior.elements) > 3
+    expected = f"prior of boston-seaport, {len(prior.elements)} elements: {path}"
+    assert expected in capsys.readouterr().out
+    second = lines_of(run("second", "--prior", str(path), *FUSION))
+    plain = lines_of(run("plain", *FUSION))
+    assert plain == lines_of(run("unset"))
+    assert plain.keys() == second.keys()
+    assert plain != second
+    highest = max(line["confidence_level"] for line in second[next(iter(second))])
+    assert highest > max(line["confidence_level"] for line in plain[next(iter(plain))])
+
+
+def test_priors_and_options_that_do_not_fit_are_refused(
+    model, minicity_annotations, tmp_path, capsys
+):
+    drive, out = str(minicity_annotations["val"]), str(tmp_path / "map.json")
+    path = tmp_path / "town.elements"
+    infer.main([drive, "--model", *model, "--out", out])
+    words = [out, "--ann", drive, "--score-thr", "0", "--prior", str(path)]
+    with pytest.raises(ValueError, match="--elements needs one map, and there are 2: --join"):
+        build_map.write_element_prior(path, "town", ["divider"], [MapElements.from_polylines()] * 2)
+    assert not path.exists()
+    build_map.main([*words, "--elements", "--join"])
+    again = [drive, "--model", *model, "--out", str(tmp_path / "b.json"), "--prior"]
+    with pytest.raises(ValueError, match=r"or set model\.prior\.type=ElementFusion"):
+        infer.main([*again, str(path)])
+    with pytest.raises(ValueError, match="has elements, which a model reads only"):
+        infer.main([*again, str(path), "--update-prior", *FUSION])
+    with pytest.raises(ValueError, match="ElementFusion writes to no prior"):
+        infer.main([*again, str(tmp_path / "new.elements"), "--update-prior", *FUSION])
+    for wrong in (["--elements", "--gaussians"], ["--elements"]):
+        kept = words if "--gaussians" in wrong else [*words[:-2], "--out", str(tmp_path / "maps")]
+        with pytest.raises(SystemExit):
+            build_map.main([*kept, *wrong])
+    errors = capsys.readouterr().err
+    assert "a prior has --gaussians or --elements" in errors
+    assert "--elements is for a --prior" in errors
