@@ -69,7 +69,7 @@ CASES: dict[str, dict[str, Case]] = {
         "on the device": Case({"on_device": True}, adds={*LOADED, "image_steps"}),
     },
     "ScaleImages": {
-        "by a factor": Case({"scale": 0.5}, adds={"scale_factor"}, changes=SCALED),
+        "by a factor": Case({"scale": 0.5}, adds={"scale_factor"}, changes={*SCALED, "raw_shapes"}),
         "to a size": Case({"size": (48, 30)}, changes={*SCALED, "raw_shapes"}),
     },
     "CropImages": {"10 rows": Case({"top": 10}, changes={*SCALED, "raw_shapes"})},

@@ -12,7 +12,8 @@ def test_matrices_take_the_exact_ratio_of_each_axis():
     """Half of 101 x 51 pixels is 50 x 25: a little less than half, by another ratio each way."""
     image = np.zeros((51, 101, 3), np.uint8)
     matrices = {"lidar2img": [np.eye(4)], "img_aug_matrix": [np.diag([2.0, 2.0, 1.0, 1.0])]}
-    results = ScaleImages(0.5).transform({"img": [image], **matrices})
+    results = ScaleImages(0.5).transform({"img": [image], "raw_shapes": [(51, 101)], **matrices})
+    assert results["raw_shapes"] == [(25, 50)]
     assert results["img"][0].shape == (25, 50, 3)
     assert results["img_shape"] == results["pad_shape"] == (25, 50)
     np.testing.assert_allclose(results["lidar2img"][0], np.diag([50 / 101, 25 / 51, 1, 1]))
@@ -23,7 +24,8 @@ def test_sizes_are_not_one_pixel_short():
     """0.58 * 100 is 57.99999999999999 in floating-point numbers."""
     matrices = {"lidar2img": [np.eye(4)], "img_aug_matrix": [np.eye(4)]}
     for size in ((100, 200, 3), (200, 100, 3)):
-        results = ScaleImages(0.58).transform({"img": [np.zeros(size, np.uint8)], **matrices})
+        images_of_size = {"img": [np.zeros(size, np.uint8)], "raw_shapes": [size[:2]]}
+        results = ScaleImages(0.58).transform({**images_of_size, **matrices})
         assert sorted(results["img_shape"]) == [58, 116]
 
 
@@ -45,8 +47,10 @@ def test_images_of_another_size_become_as_long_as_those_of_the_training(
     images._log_other_scale.cache_clear()
     matrices = {"lidar2img": [np.eye(4)], "img_aug_matrix": [np.eye(4)]}
     image = np.zeros((*size[::-1], 3), np.uint8)
-    results = ScaleImages(0.4, trained_size=(160, 90)).transform({"img": [image], **matrices})
+    step = ScaleImages(0.4, trained_size=(160, 90))
+    results = step.transform({"img": [image], "raw_shapes": [size[::-1]], **matrices})
     assert results["img"][0].shape[1::-1] == expected
+    assert results["raw_shapes"] == [expected[::-1]]
     ratio = np.divide(expected, size)
     np.testing.assert_allclose(results["lidar2img"][0], np.diag([*ratio, 1, 1]))
     start = "images of {} x {} are scaled to {} x {}, without".format(*size, *expected)
@@ -86,9 +90,10 @@ def test_images_that_are_far_larger_than_the_trained_ones_shrink_by_area(width, 
     image[:, : width // 2] *= np.arange(width // 2)[None, :, None] % 3 == 0  # no regular pattern
     matrices = {key: [np.eye(4)] for key in ("lidar2img", "img_aug_matrix")}
     step = ScaleImages(0.4, trained_size=(160, 90))
-    (found,) = step.transform({"img": [image], **matrices})["img"]
+    inputs = {"img": [image], "raw_shapes": [image.shape[:2]], **matrices}
+    (found,) = step.transform(dict(inputs))["img"]
     exact = cv2.resize(image, (160, 90), interpolation=cv2.INTER_AREA)
     assert (abs(found - exact).max() < 1e-3) == by_area
-    (same,) = ScaleImages(160 / width).transform({"img": [image], **matrices})["img"]
+    (same,) = ScaleImages(160 / width).transform(dict(inputs))["img"]
     bilinear = cv2.resize(image, (160, 90), interpolation=cv2.INTER_LINEAR)
     np.testing.assert_allclose(same, bilinear, atol=1e-3)  # as in the training

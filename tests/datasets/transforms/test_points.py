@@ -18,6 +18,7 @@ from pyarrow import feather
 
 import gsmap.registered  # noqa: F401
 from gsmap.datasets.errors import BrokenSampleError
+from gsmap.datasets.transforms.images import CropImages, ScaleImages
 from gsmap.datasets.transforms.points import (
     LoadLidarPoints,
     LoadLidarSweeps,
@@ -132,7 +133,7 @@ def test_of_returns_at_one_pixel_the_nearest_counts():
     results = {
         "points": LiDARPoints(points.float(), points_dim=3),
         "img_shape": (32, 32),
-        "raw_shapes": [np.array([32, 32])],
+        "raw_shapes": [(32, 32)],
         "lidar2img": [np.eye(4)],
         "img_aug_matrix": [np.eye(4)],
     }
@@ -141,6 +142,27 @@ def test_of_returns_at_one_pixel_the_nearest_counts():
     assert depths[0, 2, 3] == 5
     assert depths[0, 4, 1] == 6
     assert depths.sum() == 11
+
+
+@pytest.mark.parametrize(
+    ("steps", "pixel"),
+    [([ScaleImages(size=(8, 4))], (3, 7)), ([ScaleImages(0.5), CropImages(2)], (1, 7))],
+)
+def test_depths_fill_a_resized_or_cropped_image_and_not_its_padding(steps, pixel):
+    """Of a 16 x 8 image, column 14 has a point in row 6, and another one below the image."""
+    points = torch.tensor([[14.0 * 5, 6.0 * 5, 5.0], [14.0 * 5, 9.0 * 5, 5.0]])
+    results = {
+        "img": [np.zeros((8, 16, 3), np.uint8)],
+        "raw_shapes": [(8, 16)],
+        "points": LiDARPoints(points, points_dim=3),
+        "lidar2img": [np.eye(4)],
+        "img_aug_matrix": [np.eye(4)],
+    }
+    for step in steps:
+        results = step.transform(results)
+    depths = MakeDepthMap().transform(results)["gt_depth"]
+    assert depths[0][pixel] == 5
+    assert depths.sum() == 5
 
 
 def test_a_sample_without_lidar_is_named():

@@ -33,9 +33,10 @@ class LoadCameraImages(BaseTransform):
 
     It adds the keys of ``LoadMultiViewImageFromFiles`` of mmdet3d that other transforms read, and
     ``lidar2img``, ``img_aug_matrix`` (lists of (4, 4)) and ``img_path``. Smaller images are padded
-    at the bottom and right to the size of the largest; ``raw_shapes`` has (height, width) of each
-    image before the padding. Unlike in mmdet3d, images are contiguous arrays and not strided views
-    of a stack: a copy of such a view takes as long as the decoding of the image.
+    at the bottom and right to the size of the largest. ``raw_shapes`` has (height, width) of each
+    image without the padding, and later transforms keep it up to date. Unlike in mmdet3d, images
+    are contiguous arrays and not strided views of a stack: a copy of such a view takes as long as
+    the decoding of the image.
 
     Args:
         to_float32: Whether to convert the images to float32 directly after loading.
@@ -153,6 +154,10 @@ class ScaleImages(BaseTransform):
         elif size != (width, height):
             take_step(results, self._resize_step(results, size))
         _transform_pixels(results, matrix)
+        raw_shapes = []
+        for raw_height, raw_width in results["raw_shapes"]:
+            raw_shapes.append((round(raw_height * matrix[1, 1]), round(raw_width * matrix[0, 0])))
+        results["raw_shapes"] = raw_shapes
         results["img_shape"] = results["pad_shape"] = size[::-1]
         results["scale_factor"] = size[0] / width
         return results

@@ -190,11 +190,7 @@ class MakeDepthMap(BaseTransform):
             depth = depth[in_range]
             col = np.round(u[in_range] / depth)
             row = np.round(v[in_range] / depth)
-            # Size of the resized image without its padding at the bottom and right:
-            raw_height, raw_width = results["raw_shapes"][view]
-            img_aug_matrix = results["img_aug_matrix"][view]
-            num_rows = np.round(raw_height * img_aug_matrix[1, 1])
-            num_cols = np.round(raw_width * img_aug_matrix[0, 0])
+            num_rows, num_cols = results["raw_shapes"][view]  # without padding at bottom and right
             is_inside = (col >= 0) & (col < num_cols) & (row >= 0) & (row < num_rows)
             depth = depth[is_inside]
             col = col[is_inside].astype(int)
