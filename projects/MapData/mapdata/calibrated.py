@@ -44,7 +44,7 @@ def calibrated_records(
             file defines, or a record has no pose near its time.
     """
     images: dict[str, list[Path]] = {}
-    time_of: dict[str, int] = {}
+    time_of: dict[str, int] = {}  # by the name of the image without its suffix
     for number, record in enumerate(records):
         with explain_errors(f"record {_name_of(record, number)!r}", "correct it"):
             for camera in record["cameras"]:

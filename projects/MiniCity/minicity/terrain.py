@@ -88,7 +88,7 @@ class Terrain:
         eye = self.camera.center
         # Newton's method for the distance at which the ray is 0 m above the ground.
         for _ in range(NEWTON_STEPS):
-            step = 0.02 * reach + 0.02
+            step = 0.02 * reach + 0.02  # of the finite difference that gives the derivative
             here = sample_height(self.grid, eye[:2] + reach[..., None] * direction)
             ahead = sample_height(self.grid, eye[:2] + (reach + step)[..., None] * direction)
             above = eye[2] + reach * fall - here

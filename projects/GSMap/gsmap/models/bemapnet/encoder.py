@@ -111,6 +111,7 @@ class BezierBEVEncoder(CameraEncoder):
         points, on_ground = self.ground_points(
             calibration["ground_from_img"], size=feats.shape[-2:], img_shape=img_shape
         )
+        # The sources are the pixels of all cameras, to which the BEV cells attend.
         images = feats.flatten(0, 1)  # (B * V, C', h, w)
         sources = self.input_proj(images).unflatten(0, feats.shape[:2])  # (B, V, C, h, w)
         sources = sources.permute(0, 1, 3, 4, 2).flatten(1, 3)  # (B, S, C), S = V * h * w
