@@ -137,9 +137,9 @@ def test_the_node_of_ros_publishes_the_map_of_its_images(monkeypatch):
     np.testing.assert_array_equal(image, pixels[:, :400, ::-1])
     rigs, live = [], node.inferencer.live
 
-    def scored(*rig, **options):
-        rigs.append(rig)
-        run = live(*rig, **options)
+    def scored(intrinsics, cam_from_frame, frame, **options):
+        rigs.append((intrinsics, cam_from_frame, frame))
+        run = live(intrinsics, cam_from_frame, frame, **options)
         return lambda images: replace(found := run(images), scores=np.linspace(0, 1, len(found)))
 
     node.inferencer.live = scored

@@ -125,9 +125,9 @@ def read_lanelet2(
         if way_id in bounds:
             continue
         tags = way.tags if rule else _with_class(way.tags, classes)
-        name = collector.class_of(tags)
-        if name is not None:
-            lines.append((name, way.ring_or_line))
+        class_name = collector.class_of(tags)  # None for an element that is only counted
+        if class_name is not None:
+            lines.append((class_name, way.ring_or_line))
     for relation_id, relation in parser.relations.items():
         if relation_id not in crosswalks:
             kind = relation.tags.get("type", "")
@@ -138,8 +138,8 @@ def read_lanelet2(
             f"{path} has nodes without local_x and local_y, and the origin of the global frame is "
             "not known: give --origin or --crs."
         )
-    for name, nodes in lines:
-        collector.add(name, parser.positions(nodes, is_local=is_local))
+    for class_name, nodes in lines:
+        collector.add(class_name, parser.positions(nodes, is_local=is_local))
     return collector.finish(None if is_local else origin)
 
 

@@ -61,7 +61,8 @@ def open_dataset(
     settings["split"] = None
     settings["dim"] = None
     settings["cameras"] = _select_cameras(cfg, samples)
-    # For one sample, serialisation would take most of the time, because it collects garbage.
+    # mmengine collects garbage when it serialises samples. For one sample, this would take most of
+    # the time.
     settings["serialize_data"] = len(samples) > 1
     if source.data_root is not None:
         settings["data_root"] = str(source.data_root.resolve())

@@ -40,7 +40,7 @@ def overfit(cfg: Config, samples: int, iterations: int) -> None:
             f"is a {sampler}: take a config of a model without memory."
         )
     loader.sampler = {"type": "InfiniteSampler", "shuffle": True}
-    loader.dataset.indices = samples
+    loader.dataset.indices = samples  # for mmengine, a number selects the first samples
     loader.batch_size = min(loader.batch_size, samples)
     loader.num_workers = 0
     loader.persistent_workers = False

@@ -13,11 +13,11 @@ from gsmap.utils.errors import InputError
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
-PerElement = Sequence[Any] | npt.NDArray[Any]
+PerElement = Sequence[Any] | npt.NDArray[Any]  # an array or a nested list for each element
 
 
 def ground_truth_elements(results: Mapping[str, Any], transform: object) -> Sequence[Any]:
-    """Return the ground-truth elements of a sample in a pipeline, ``map_instances``.
+    """Return the ground-truth elements of a sample in a pipeline: its list of `MapInstance`.
 
     Args:
         results: Results of the pipeline so far.

@@ -150,7 +150,7 @@ def _fill(
             slope[i] = int((last[0] - first[0]) * _PER_PIXEL / (last[1] - first[1]))
             low[i] = min(a[1], b[1])
             high[i] = max(a[1], b[1])
-            upper = first if a[1] < b[1] else last
+            upper = first if a[1] < b[1] else last  # the point of the edge in the smaller row
             x_start[i] = upper[0] * _PER_PIXEL + (low[i] - upper[1]) * slope[i]  # in row low[i]
             if not cut[i]:
                 x_start[i] += _PER_PIXEL // 2  # the division below then rounds to nearest

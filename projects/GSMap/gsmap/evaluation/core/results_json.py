@@ -230,8 +230,8 @@ def _check_lengths(elements: MapElements) -> None:
     points = elements.points
     if not len(points):
         return
-    # Fast check: no two points are farther apart than the diagonal of the box of all points, so the
-    # product is a bound on the length of all lines.
+    # Fast check: no two points are farther apart than the diagonal of the box of all points. The
+    # product of this diagonal and the number of points is a bound on the length of all lines.
     max_coordinate = np.abs(points).max()
     max_step = 2 * float(max_coordinate) * points.shape[1] ** 0.5
     if max_step * len(points) <= MAX_LENGTH_M:

@@ -46,7 +46,7 @@ class MapAssigner:
             raise InputError("match_costs must hold at least one cost.")
         self.match_costs = [TASK_UTILS.build(cost) for cost in match_costs]
         self.names = [type(cost).__name__ for cost in self.match_costs]
-        points_cost = PointsCost()  # unless the configs have one
+        points_cost = PointsCost()  # replaced by the first `PointsCost` of the configs
         for cost in self.match_costs:
             if isinstance(cost, PointsCost):
                 points_cost = cost
