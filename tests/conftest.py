@@ -6,12 +6,14 @@ import os
 import random
 from collections.abc import Generator
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import HealthCheck, settings
-from parsed_configs import keep_parsed_configs
+from mmengine.dataset import base_dataset
+from parsed_configs import keep_parsed_configs, leave_configs_unformatted
 
 import gsmap  # noqa: F401 - before mmcv.ops, which may need its stand-in
 
@@ -27,7 +29,14 @@ settings.register_profile(
 )
 settings.load_profile("steady")
 keep_parsed_configs()
+leave_configs_unformatted()
+# Each data set that is built would search all objects of the process
+base_dataset.gc = SimpleNamespace(collect=lambda: 0)
 
+# Collections are a fifteenth of the time of an export; now they come a tenth as often
+gc.set_threshold(7_000, 10, 10)
+
+HAS_GPU = torch.cuda.is_available()
 TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None)
 STATM = Path("/proc/self/statm")
 PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
@@ -71,7 +80,9 @@ def pytest_runtest_setup() -> None:
     """Give each test, and fixtures that are made for it, one seed."""
     random.seed(0)
     np.random.seed(0)  # noqa: NPY002 - of libraries
-    torch.manual_seed(0)
+    torch.default_generator.manual_seed(0)
+    if HAS_GPU:  # without one, `torch.manual_seed` takes longer than most tests
+        torch.cuda.manual_seed_all(0)
 
 
 def pytest_runtest_logfinish() -> None:
@@ -83,6 +94,7 @@ def pytest_runtest_logfinish() -> None:
     if TRIM is None or not STATM.exists():
         return
     if _resident_bytes() > resident["bytes"] + (1 << 28):
+        gc.collect()
         TRIM(0)
         resident["bytes"] = _resident_bytes()
 
@@ -159,6 +171,26 @@ def tiny_config(minicity_root: Path, minicity_annotations, tmp_path_factory) -> 
     target = tmp_path_factory.mktemp("config") / "tiny.py"
     target.write_text(TINY_CONFIG.format(repo=REPO, root=f"{minicity_root}/"))
     return target
+
+
+@pytest.fixture(scope="session")
+def small_onnx(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The exported file of a tiny GSMap with one decoder layer."""
+    from export_cases import export_once
+    from model_cases import small_config
+
+    head = {**small_config()["map_head"], "type": "GSMapHead", "masks": {"pixel_m": 1.5}}
+    head["decoder"] = {**head["decoder"], "num_layers": 1}
+    return export_once(tmp_path_factory, "small.onnx", map_head=head)
+
+
+@pytest.fixture(scope="session")
+def stream_onnx(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The exported file of a tiny MapTR that remembers features of the map and queries."""
+    from export_cases import export_once
+
+    memory = {"bev": {}, "queries": {"num": 3}, "embed_dims": 16}
+    return export_once(tmp_path_factory, "stream.onnx", temporal=memory)
 
 
 @pytest.fixture

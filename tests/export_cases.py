@@ -1,8 +1,14 @@
 """Models in torch beside their exported files."""
 
+import fcntl
+import os
+from pathlib import Path
+
 import numpy as np
+import pytest
 import torch
 from mmengine.dataset import pseudo_collate
+from model_cases import IMAGE_SHAPE, NUM_CAMS, build_small
 
 from gsmap.apis.export import export_onnx, graph_inputs, largest_differences
 from gsmap.apis.fast_frame import FastFrames, StaticFrame
@@ -28,6 +34,30 @@ def export(inferencer, dataset, path):
     size = tuple(dataset[0]["inputs"]["img"].shape[-2:])
     export_onnx(inferencer.model, path, cameras, size)
     return OnnxInferencer(path, num_threads=1)
+
+
+def export_once(factory: pytest.TempPathFactory, name: str, **overrides: object) -> Path:
+    """Export the tiny model once for all processes of a test run.
+
+    Args:
+        factory: pytest's factory of temporary folders.
+        name: Name of the file.
+        **overrides: Parts of the model's config, as in `build_small`.
+
+    Returns:
+        The file, which no test may change. Its cameras are ``CAM_0`` to ``CAM_5``.
+    """
+    folder = factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent  # of all workers
+    path = folder / name
+    with (folder / f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not path.exists():
+            model = build_small(**overrides).eval()
+            cameras = [f"CAM_{number}" for number in range(NUM_CAMS)]
+            export_onnx(model, path, cameras, IMAGE_SHAPE)
+    return path
 
 
 def compare(inferencer, dataset, exported, indices=(0, 1)):

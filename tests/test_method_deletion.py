@@ -27,10 +27,12 @@ DELETED = [method.name for method in METHODS if method.name not in STAYS]
 BUILD = """
 import sys
 from mmdet3d.registry import MODELS
+from parsed_configs import keep_parsed_configs
 from unset_weights import unset_weights
 import gsmap.registered
 from gsmap.engine.launch import check_config, read_config
 assert gsmap.__file__.startswith(sys.argv[1]), gsmap.__file__
+keep_parsed_configs()
 for path in sys.argv[2:]:
     cfg = read_config(path)
     check_config(cfg)
@@ -154,9 +156,12 @@ def test_a_config_uses_only_what_its_method_is_built_on(path):
 
 @pytest.fixture(scope="module")
 def copy(tmp_path_factory) -> Path:
-    """A copy of the repository in which only GSMap and what it is built on are left."""
+    """A copy of the repository in which only GSMap and what it is built on are left.
+
+    It has the compiled modules, too, which Python reads for files of the same time and size.
+    """
     root = tmp_path_factory.mktemp("deleted")
-    unneeded = shutil.ignore_patterns("__pycache__", "*.pth", "*.egg-info", "*.jpg", "*.png")
+    unneeded = shutil.ignore_patterns("*.pth", "*.egg-info", "*.jpg", "*.png")
     for path in REPO.iterdir():
         if path.name in ("projects", "configs", "tests", "tools", "benchmarks", "docs", "models"):
             shutil.copytree(path, root / path.name, ignore=unneeded, symlinks=True)
