@@ -1,14 +1,18 @@
 import argparse
+import shutil
 from pathlib import Path
 from types import ModuleType
+from unittest.mock import create_autospec
 
 import pytest
 import torch
 from method_cases import cases_of_methods
+from model_cases import IMAGE_SHAPE, NUM_CAMS
 from test_configs import load, small
 
 from benchmarks import export, fps, live, profile, step
 from benchmarks.model import advance_samples, image_shape, model_and_batch
+from gsmap.apis.export import export_onnx
 
 REPO = Path(__file__).resolve().parents[2]
 
@@ -68,10 +72,19 @@ def test_frames_per_second_are_those_of_the_time(capsys):
     assert ratio == "1.000"
 
 
-@pytest.mark.slow
-def test_an_exported_model_is_measured_beside_torch(monkeypatch, capsys):
-    """In this process: the frames per second above come from processes of their own."""
+def test_an_exported_model_is_measured_beside_torch(small_onnx, monkeypatch, capsys):
+    """In this process: the frames per second above come from processes of their own.
+
+    The exported file is of a model of the same inputs. `test_export.py` exports models.
+    """
     pytest.importorskip("onnxruntime")
+
+    def copy_file(model, out, cameras, image_size):
+        assert not model.training
+        assert (len(cameras), image_size) == (NUM_CAMS, IMAGE_SHAPE)
+        shutil.copy(small_onnx, out)
+
+    monkeypatch.setattr(export, "export_onnx", create_autospec(export_onnx, side_effect=copy_file))
     monkeypatch.setattr(export, "in_own_process", lambda function, *given: function(*given))
     run(export, str(REPO / "configs/maptr/maptr_r18_minicity.py"))
     rows = cells(capsys.readouterr().out)
@@ -89,7 +102,10 @@ def test_a_frame_of_a_known_rig_is_measured_beside_one_of_a_new_rig(capsys):
     assert min(float(known[1]), float(new[1])) > 0
 
 
-def test_a_step_is_measured_for_every_raster_of_gsmap(capsys):
+def test_a_step_is_measured_for_every_raster_of_gsmap(monkeypatch, capsys):
+    """In this process, as above."""
+    name = "benchmarks.model.in_own_process"
+    monkeypatch.setattr(name, lambda function, *given: function(*given))
     run(
         step, str(REPO / "projects/GSMap/configs/gsmap_maptr_r18_minicity.py"),
         "--rasters", "64x32", "80x40",
