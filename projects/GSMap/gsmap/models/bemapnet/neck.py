@@ -130,10 +130,11 @@ class BiFPN(BaseModule):
 
     def forward(self, feats: Sequence[Tensor]) -> list[Tensor]:
         """Fuse levels (n, c, h, w), the finest first, to one map. (n, 5 C, *size)"""
+        # The image features are P3 to P5; P6 and P7 are computed from P5.
         sixth = downsample(self.coarser(feats[-1]))
         seventh = downsample(sixth)
         levels = [conv(level) for conv, level in zip(self.inputs, feats, strict=True)]
-        back_levels = [levels[0]]
+        back_levels = [levels[0]]  # the finest one, which `BiFPNRound` does not read
         for conv, level in zip(self.again, feats[1:], strict=True):
             back_levels.append(conv(level))
         levels += [sixth, seventh]

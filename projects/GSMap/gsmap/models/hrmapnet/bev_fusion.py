@@ -12,6 +12,7 @@ from gsmap.models.base.layers import init_matrices
 from gsmap.models.base.parts import DEFAULTS, build_part
 from gsmap.structures.grid import BEVGrid
 
+# Default settings of the BEV layer.
 _LAYER = {
     "type": "BEVQueryEncoder",
     "cross_attn": {

@@ -103,7 +103,7 @@ class PivotBEVEncoder(CameraEncoder):
     """
 
     calibration = ("img_from_ground",)
-    num_levels = None
+    num_levels = None  # all levels of image features
 
     def __init__(
         self,

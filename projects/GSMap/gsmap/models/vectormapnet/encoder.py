@@ -52,7 +52,7 @@ class HeightPlanesEncoder(CameraEncoder):
         self.num_levels = num_levels
         norm = {"type": "GN", "num_groups": min(32, embed_dims)}
         self.upsampling = nn.ModuleList()
-        for level in range(1, num_levels):
+        for level in range(1, num_levels):  # level i is enlarged i times, by a block each time
             blocks = nn.ModuleList()
             for _ in range(level):
                 block = ConvModule(embed_dims, embed_dims, 3, padding=1, bias=True, norm_cfg=norm)
