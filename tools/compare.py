@@ -41,9 +41,8 @@ from gsmap.engine.arguments import data_root_options
 from gsmap.methods import METHODS
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.errors import InputError, WorkError
-from gsmap.utils.files import read_json, write_text
+from gsmap.utils.files import write_text
 from gsmap.utils.progress import Progress
-from gsmap.utils.shipped import shipped_path
 from gsmap.visualization.figure import save_figure
 
 
@@ -92,14 +91,17 @@ def parse_args() -> argparse.Namespace:
 def read_tables(pattern: str = "*") -> list[dict[str, Any]]:
     """Tables whose name matches a shell pattern.
 
+    Tables with the same name are one table. Each method contributes its rows.
+
     Raises:
         ValueError: If no table matches.
     """
-    tables = []
+    tables: dict[str, dict[str, Any]] = {}
     for method in METHODS:
-        tables += method.paper()["tables"]
-    tables += read_json(shipped_path("configs/tables.json"))  # tables of several methods
-    chosen = [table for table in tables if fnmatchcase(table["table"], pattern)]
+        for part in method.paper()["tables"]:
+            table = tables.setdefault(part["table"], {**part, "rows": []})
+            table["rows"] += part["rows"]
+    chosen = [table for name, table in tables.items() if fnmatchcase(name, pattern)]
     if not chosen:
         raise InputError(
             f"no table is named {pattern!r}: compare.py --list names all {len(tables)}, and a "

@@ -15,6 +15,7 @@ from unset_weights import unset_weights
 from gsmap.engine.arguments import add_config_options
 from gsmap.engine.launch import check_config, read_config
 from gsmap.evaluation.core.metric import metric_class
+from gsmap.methods import METHODS
 from tools.compare import published_figures, read_tables, training_command
 
 REPO = Path(__file__).resolve().parents[2]
@@ -95,6 +96,19 @@ def test_every_figure_has_a_metric_and_no_row_stands_twice():
         for metric in METRICS
         for name in ("mAP", *(f"{c}/AP" for c in base(EXTENDED).classes))
     } | {"fps", "params_M", "memory_MB", "seconds_per_step"}
+
+
+def test_methods_contribute_rows_to_one_table():
+    titles = {}
+    for method in METHODS:
+        for table in method.paper()["tables"]:
+            columns = titles.setdefault(table["table"], table["columns"])
+            assert table["columns"] == columns, table["table"]
+    tables = read_tables()
+    assert [table["table"] for table in tables] == list(titles)
+    (table,) = read_tables("Splits by place, Argoverse 2")
+    configs = {row["config"].split("/")[1] for row in table["rows"]}
+    assert configs >= {"GSMap", "maptr"}
 
 
 def test_the_means_of_the_papers_are_means():

@@ -39,9 +39,10 @@ class Method:
             Dictionary with ``arxiv``, the number of the paper at arXiv; ``parameters``, the number
             of trainable parameters of each config; ``settings``, the published values by config
             and path of the setting; ``heads``, the published parts of each config's head; and
-            ``tables``, tables in the format of ``configs/tables.json``. An entry of ``heads`` has
-            the number of queries of each group, the weights of the losses and auxiliary heads by
-            name, and the weights of the matching costs in the order of the config.
+            ``tables``, the rows of tables that ``compare.py --list`` prints. Tables with the same
+            name in several methods are one table. An entry of ``heads`` has the number of queries
+            of each group, the weights of the losses and auxiliary heads by name, and the weights
+            of the matching costs in the order of the config.
         """
         return read_json(self.folder / "paper.json")
 
