@@ -11,7 +11,7 @@ from setuptools import setup
 from setuptools.command.build_py import build_py
 
 PATTERNS = (
-    *("configs/**/*.py", "projects/GSMap/configs/*.py"),
+    *("configs/**/*.py", "configs/*.json", "projects/GSMap/configs/*.py"),
     *("tools/**/*.py", "tools/*.sh", "models/registry.json", "models/README.md"),
 )
 

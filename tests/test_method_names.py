@@ -22,13 +22,6 @@ GENERAL = {
     "tests/test_method_names.py",
 }
 MOST = 8
-MORE = {
-    # the rules of ground truth on Argoverse 2 (``--compat``), a form of info files and upstream
-    # configs have its name
-    "maptrv2": 15,
-    # AP_raster and upstream configs are its own; the paper of GSMap compares with it
-    "mapvr": 11,
-}
 
 
 @cache
@@ -84,8 +77,7 @@ def test_few_files_elsewhere_name_a_method(method):
     gone = deleted_with(method)
     elsewhere = {name: text for name, text in texts().items() if name not in gone}
     found = files_that_name(method, elsewhere)
-    most = MORE.get(method, MOST)
-    assert len(found) <= most, "\n".join(found)
+    assert len(found) <= MOST, "\n".join(found)
 
 
 def test_names_are_counted_in_texts_and_paths():

@@ -134,7 +134,7 @@ def test_a_source_distribution_holds_what_a_wheel_needs(source, tmp_path):
     assert not done.returncode, done.stderr
     with tarfile.open(next(tmp_path.glob("*.tar.gz"))) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
-    files = {"setup.py", "LICENSE", "tools/dist_train.sh"}
+    files = {"setup.py", "LICENSE", "configs/tables.json", "tools/dist_train.sh"}
     files.add("projects/GSMap/gsmap/models/maptr/paper.json")
     assert files | {"models/gsmap_r18_minicity.pth", "configs/maptr/maptr_r50_24e.py"} <= names
     assert "models/maptr_tiny_r50_24e.pth" not in names

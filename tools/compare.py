@@ -19,7 +19,7 @@ import gsmap  # noqa: F401 - first: it handles Ctrl-C and guards against setting
 import argparse
 import shlex
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -41,8 +41,9 @@ from gsmap.engine.arguments import data_root_options
 from gsmap.methods import METHODS
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.errors import InputError, WorkError
-from gsmap.utils.files import write_text
+from gsmap.utils.files import read_json, write_text
 from gsmap.utils.progress import Progress
+from gsmap.utils.shipped import shipped_path
 from gsmap.visualization.figure import save_figure
 
 
@@ -91,23 +92,40 @@ def parse_args() -> argparse.Namespace:
 def read_tables(pattern: str = "*") -> list[dict[str, Any]]:
     """Tables whose name matches a shell pattern.
 
-    Tables with the same name are one table. Each method contributes its rows.
-
     Raises:
         ValueError: If no table matches.
     """
-    tables: dict[str, dict[str, Any]] = {}
-    for method in METHODS:
-        for part in method.paper()["tables"]:
-            table = tables.setdefault(part["table"], {**part, "rows": []})
-            table["rows"] += part["rows"]
-    chosen = [table for name, table in tables.items() if fnmatchcase(name, pattern)]
+    papers = [method.paper() for method in METHODS]
+    tables = []
+    for paper in papers:
+        tables += paper["tables"]
+    for table in read_json(shipped_path("configs/tables.json")):  # tables of several methods
+        tables.append(_add_rows(table, papers=papers))
+    chosen = [table for table in tables if fnmatchcase(table["table"], pattern)]
     if not chosen:
         raise InputError(
             f"no table is named {pattern!r}: compare.py --list names all {len(tables)}, and a "
             "pattern like 'GSMap*' chooses several."
         )
     return chosen
+
+
+def _add_rows(table: dict[str, Any], papers: Iterable[dict[str, Any]]) -> dict[str, Any]:
+    """Add the rows of all methods to a table of ``configs/tables.json``.
+
+    Args:
+        table: Table with ``variants``: the overrides of the configs by the name of the variant.
+        papers: Contents of the ``paper.json`` of all methods.
+    """
+    configs: dict[str, str] = {}  # by name of the model
+    for paper in papers:
+        configs |= paper.get("shared_tables", {}).get(table["table"], {})
+    rows = []
+    for variant, options in table["variants"].items():
+        for model, config in configs.items():
+            name = f"{model}, {variant}"
+            rows.append({"row": name, "config": config, "options": options, "paper": None})
+    return {**table, "rows": rows}
 
 
 def training_command(row: dict[str, Any]) -> str:

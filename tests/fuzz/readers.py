@@ -105,10 +105,10 @@ class Files:
             "annotation file, its values": lambda: self.annotations(mutations.damaged_rows),
             "annotation file, overwritten in use": lambda: self.in_use(byte),
             "info file of mmdet3d": lambda: self.pickle("v2.pkl", contents.info_v2, read_info_file),
-            "info file of MapTRv2": lambda: self.pickle(
+            "info file of MapTR": lambda: self.pickle(
                 "maptr.pkl", contents.info_of_maptr, self.infos
             ),
-            "info file of MapTRv2, Argoverse 2": lambda: self.pickle(
+            "info file of Argoverse 2": lambda: self.pickle(
                 "av2.pkl", contents.info_of_argoverse2, self.infos
             ),
             "own records": self.records,
@@ -329,7 +329,9 @@ class Files:
         return self.json(path, read)
 
     def upstream(self) -> Reader:
-        path = self.put("upstream.py", upstream_configs.maptrv2().encode())
+        losses = upstream_configs.LOSSES.format(pts=5.0, dir=0.005)
+        parts = {**upstream_configs.LIFTED, "losses": losses + upstream_configs.SEGMENTATION}
+        path = self.put("upstream.py", upstream_configs.maptr(**parts).encode())
         target = self.out / "ours.py"
 
         def read() -> str:

@@ -98,17 +98,24 @@ def test_every_figure_has_a_metric_and_no_row_stands_twice():
     } | {"fps", "params_M", "memory_MB", "seconds_per_step"}
 
 
-def test_methods_contribute_rows_to_one_table():
-    titles = {}
-    for method in METHODS:
-        for table in method.paper()["tables"]:
-            columns = titles.setdefault(table["table"], table["columns"])
-            assert table["columns"] == columns, table["table"]
-    tables = read_tables()
-    assert [table["table"] for table in tables] == list(titles)
+def test_each_method_adds_its_rows_to_a_table_of_several_methods():
     (table,) = read_tables("Splits by place, Argoverse 2")
-    configs = {row["config"].split("/")[1] for row in table["rows"]}
-    assert configs >= {"GSMap", "maptr"}
+    splits = list(table["variants"])
+    assert len(splits) == 2
+    for split in splits:
+        configs = [row["config"] for row in table["rows"] if row["row"].endswith(f", {split}")]
+        assert configs[:2] == [
+            "projects/GSMap/configs/gsmap_maptr_r50_av2_6e.py",
+            "configs/maptr/maptr_r50_av2_6e.py",
+        ]
+    assert table["rows"][-1]["options"] == table["variants"][splits[-1]]
+
+
+def test_shared_tables_exist():
+    names = {table["table"] for table in read_tables() if "variants" in table}
+    assert names
+    for method in METHODS:
+        assert method.paper().get("shared_tables", {}).keys() <= names, method.name
 
 
 def test_the_means_of_the_papers_are_means():

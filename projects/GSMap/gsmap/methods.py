@@ -36,13 +36,22 @@ class Method:
         """Read the numbers of the paper and of the authors' code from ``paper.json``.
 
         Returns:
-            Dictionary with ``arxiv``, the number of the paper at arXiv; ``parameters``, the number
-            of trainable parameters of each config; ``settings``, the published values by config
-            and path of the setting; ``heads``, the published parts of each config's head; and
-            ``tables``, the rows of tables that ``compare.py --list`` prints. Tables with the same
-            name in several methods are one table. An entry of ``heads`` has the number of queries
-            of each group, the weights of the losses and auxiliary heads by name, and the weights
-            of the matching costs in the order of the config.
+            Dictionary with these entries:
+
+            - ``arxiv``: Number of the paper at arXiv.
+            - ``parameters``: Number of trainable parameters of each config.
+            - ``settings``: Published values by config and path of the setting.
+            - ``heads``: Published parts of each config's head: the number of queries of each
+              group, the weights of the losses and auxiliary heads by name, and the weights of the
+              matching costs in the order of the config.
+            - ``tables``: Tables that ``compare.py --list`` prints, each with its name, columns and
+              rows.
+            - ``shared_tables``, optional: Configs by the name of the model, for each table of
+              ``configs/tables.json`` that has rows of this method.
+            - ``upstream``, optional: Settings of ``convert_config.py``. ``models`` lists the types
+              of the authors' detectors. ``configs`` lists our configs, each with its BEV
+              ``encoder`` and ``data_set``. A config with ``depth`` is only for samples with or
+              without depth maps.
         """
         return read_json(self.folder / "paper.json")
 

@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from pprint import pformat
@@ -9,13 +10,13 @@ from typing import Any
 
 from mmengine.config import Config
 
+from gsmap.methods import METHODS
 from gsmap.utils.errors import InputError
 from mapdata.upstream_configs.data import FLAT, data_settings, schedule_settings
 from mapdata.upstream_configs.fields import Fields
 
 _KEY = re.compile(r"[a-zA-Z][\w.-]*", re.ASCII)
 _TYPE = re.compile(r"(mmdet\.)?\w+")
-METHODS = ("MapTR", "MapTRv2", "GeMap", "GeMapFull")
 # Top-level names that configure a run. Other names are variables of the file.
 TOP_LEVEL_NAMES = (
     "_base_", "model", "data", "optimizer", "optimizer_config", "lr_config", "total_epochs",
@@ -54,10 +55,8 @@ PILLAR_NAMES = {
     f"{_PILLARS}.feedforward_channels": _BEV + "layer_cfg.ffn_dims",
     f"{_PILLARS}.ffn_dropout": _BEV + "layer_cfg.dropout",
 }
-# supported types of parts, by section
+# supported types of parts of the model, by section
 KINDS: dict[str, tuple[str, ...]] = {
-    "model": METHODS,
-    _PTS_HEAD: tuple(f"{method}Head" for method in METHODS),
     _ENCODER: ("BEVFormerEncoder", "LSSTransform"),
     _LAYER: ("DetrTransformerDecoderLayer", "DecoupledDetrTransformerDecoderLayer"),
 }
@@ -132,8 +131,13 @@ def convert_upstream(names: dict[str, Any]) -> Conversion:
         ValueError: If the model, one of its parts or the data set is not supported.
     """
     fields = Fields({name: names[name] for name in TOP_LEVEL_NAMES if name in names})
+    models = _entries("models")
+    heads = [f"{model}Head" for model in models]
+    _check_kind(fields, "model", kinds=models)
+    _check_kind(fields, _PTS_HEAD, kinds=heads)
     for section, kinds in KINDS.items():
         _check_kind(fields, section, kinds=kinds)
+    model = fields.section("model")["type"]
     settings = data_settings(fields)
     settings |= schedule_settings(fields)
     settings |= _image_settings(fields)
@@ -155,7 +159,7 @@ def convert_upstream(names: dict[str, Any]) -> Conversion:
     # The map of Argoverse 2 has 60 m along x, which is ahead in its frame. The map of nuScenes has
     # 30 m along x.
     is_argoverse2 = sides[0] == -30.0
-    base = _base_config(encoder, is_argoverse2=is_argoverse2, has_depth=has_depth)
+    base = _base_config(encoder, model=model, is_argoverse2=is_argoverse2, has_depth=has_depth)
     return Conversion(
         base=base,
         settings=settings,
@@ -164,7 +168,15 @@ def convert_upstream(names: dict[str, Any]) -> Conversion:
     )
 
 
-def _check_kind(fields: Fields, section: str, kinds: tuple[str, ...]) -> None:
+def _entries(key: str) -> list[Any]:
+    """List the entries of all methods under a key of ``upstream`` in their ``paper.json``."""
+    entries: list[Any] = []
+    for method in METHODS:
+        entries += method.paper().get("upstream", {}).get(key, [])
+    return entries
+
+
+def _check_kind(fields: Fields, section: str, kinds: Sequence[str]) -> None:
     """Raise a ``ValueError`` if the type of a part is not one of ``kinds``."""
     kind = fields.section(section).get("type")
     if kind not in kinds:
@@ -261,33 +273,29 @@ def _check_type(value: Any, name: str) -> None:
         raise InputError(f"{name} must be the name of a registered class, got {value!r:.60}")
 
 
-def _base_config(encoder: str, is_argoverse2: bool, has_depth: bool) -> str:
+def _base_config(encoder: str, model: str, is_argoverse2: bool, has_depth: bool) -> str:
     """Select the GSMap config with this BEV encoder and data set.
 
     Args:
         encoder: Type of the BEV encoder, as `_encoder_settings` returns it.
+        model: Type of the original detector, for the error message.
         is_argoverse2: Whether the data set is Argoverse 2; otherwise it is nuScenes.
         has_depth: Whether the samples have depth maps.
 
     Returns:
         Path relative to the folder of the configs.
+
+    Raises:
+        ValueError: If no config has this encoder on this data set.
     """
-    nuscenes_configs = {
-        "SpatialCrossAttention": "maptr/maptr_r50_bevformer_24e.py",
-        "PlainLSSTransform": "maptr/maptr_r50_bevpool_24e.py",
-    }
-    if encoder in nuscenes_configs:
-        if is_argoverse2:
-            raise InputError(
-                f"{encoder.removeprefix('Plain')} of MapTR is not supported on Argoverse 2."
-            )
-        return nuscenes_configs[encoder]
-    if encoder != "LSSTransform":
-        schedule = "av2_6e" if is_argoverse2 else "24e"
-        return f"maptr/maptr_r50_{schedule}.py"
-    if not is_argoverse2:
-        return "maptrv2/maptrv2_r50_24e.py"
-    return f"maptrv2/maptrv2_r50_{'av2_depth_6e' if has_depth else 'av2_6e'}.py"
+    data_set = "Argoverse 2" if is_argoverse2 else "nuScenes"
+    for entry in _entries("configs"):
+        has_encoder = entry["encoder"] == encoder and entry["data_set"] == data_set
+        fits_depth = entry.get("depth", has_depth) == has_depth
+        if has_encoder and fits_depth:
+            config: str = entry["config"]
+            return config.removeprefix("configs/")
+    raise InputError(f"{encoder.removeprefix('Plain')} of {model} is not supported on {data_set}.")
 
 
 def _image_settings(fields: Fields) -> dict[str, Any]:
@@ -358,7 +366,7 @@ def _decoder_settings(fields: Fields, settings: dict[str, Any]) -> None:
     """Convert the settings of the decoder's attentions and add them to ``settings``."""
     layer = _DECODER + "layer."
     layer_kind = fields.take(f"{_LAYER}.type")
-    # MapTRv2 has a second self-attention with the settings of the first
+    # a decoupled layer has a second self-attention with the settings of the first
     self_attention, *other_attentions, cross_attention = fields.items(f"{_LAYER}.attn_cfgs")
     _check_kind(fields, self_attention, kinds=_SELF_ATTENTIONS)
     _check_kind(fields, cross_attention, kinds=_CROSS_ATTENTIONS)

@@ -1,5 +1,15 @@
 """Configs in the form of the original repositories, written for the tests."""
 
+from pathlib import Path
+
+from mmengine.config import Config
+
+from mapdata.upstream_configs.reader import read_assignments
+from mapdata.upstream_configs.upstream import convert_upstream, merge
+
+REPO = Path(__file__).resolve().parents[1]
+# every config there has one; it is not followed
+BASE = "_base_ = ['../_base_/default_runtime.py']"
 TEMPLATE = """
 _base_ = ['../_base_/default_runtime.py']
 plugin = True
@@ -125,11 +135,6 @@ SEGMENTATION = (
     ", aux_seg=masks, loss_seg=dict(type='SimpleLoss', pos_weight=4.0, loss_weight=1.0), "
     "loss_pv_seg=dict(type='SimpleLoss', pos_weight=1.0, loss_weight=2.0)"
 )
-GEOMETRY = (
-    ", use_geo_loss=True, intra_loss_weight=1.0, inter_loss_weight=1.0, loss_geo=dict("
-    "type='GeometricLoss', loss_weight=0.005, intra_loss_weight=1.0, inter_loss_weight=1.0, "
-    "num_ins=50, num_pts=points, pc_range=range_m, loss_type='l1')"
-)
 COST = "pts_cost=dict(type='OrderedPtsL1Cost', weight={pts})"
 NUSCENES = {
     "range_m": "[-15.0, -30.0, -2.0, 15.0, 30.0, 2.0]", "rows": 200, "cols": 100,
@@ -145,18 +150,27 @@ LIFTED = NUSCENES | {
 }  # fmt: skip
 
 
-def _layer(kind: str, dropout: float) -> str:
-    """Return the decoder layer of one self-attention."""
+def decoder_layer(kind: str, dropout: float = 0.1) -> str:
+    """Decoder layer with one self-attention.
+
+    Args:
+        kind: Type of the self-attention.
+        dropout: Dropout of the self-attention.
+    """
     attention = ATTENTION.format(kind=kind, dropout=dropout)
     return LAYER.format(self_attn=attention, cross_attn=CROSS)
 
 
 def maptr(**settings: object) -> str:
-    """Return MapTR tiny."""
+    """MapTR tiny, or a method built on it.
+
+    Args:
+        settings: Parts of ``TEMPLATE`` that differ from those of MapTR.
+    """
     values = {
         "model": "MapTR",
         "encoder": KERNEL.format(dropout=0.1),
-        "layer": _layer("MultiheadAttention", 0.1),
+        "layer": decoder_layer("MultiheadAttention"),
         "losses": LOSSES.format(pts=5.0, dir=0.005),
         "costs": COST.format(pts=5.0),
     }
@@ -164,7 +178,7 @@ def maptr(**settings: object) -> str:
 
 
 def maptr_av2() -> str:
-    """Return MapTR on Argoverse 2."""
+    """MapTR on Argoverse 2."""
     encoder = KERNEL.format(dropout=0.1).replace("pc_range=range_m, emb", "num_cams=7, emb")
     return maptr(
         range_m="[-30.0, -15.0, -2.0, 30.0, 15.0, 2.0]", rows=100, cols=200, root="data/av2/",
@@ -173,41 +187,17 @@ def maptr_av2() -> str:
     )  # fmt: skip
 
 
-def mapvr() -> str:
-    """Return MapVR tiny."""
-    return maptr(
-        encoder=KERNEL.format(dropout=0.0), dropout=0.0, batch=8,
-        layer=_layer("MultiheadAttention", 0.0),
-        losses=LOSSES.format(pts=1.0, dir=0.002)
-        + ", loss_rendered_mask=dict(type='RenderedMaskDiceLoss', weight=15.0)",
-        costs=COST.format(pts=1.0)
-        + ", rendered_mask_cost=dict(type='RenderedMaskDiceCost', weight=10.0)",
-    )  # fmt: skip
+def converted(text: str, folder: Path) -> tuple[Config, list[str]]:
+    """Convert a config of an original repository.
 
+    Args:
+        text: Source of the config.
+        folder: Folder to write the source to.
 
-def gemap() -> str:
-    """Return GeMap with its simple objective."""
-    losses = LOSSES.format(pts=5.0, dir=0.005) + GEOMETRY
-    layer = _layer("GeometryDecoupledAttention", 0.1)
-    return maptr(model="GeMap", layer=layer, losses=losses, decay=0.03, evaluate=1)
-
-
-def maptrv2() -> str:
-    """Return MapTRv2."""
-    attention = ATTENTION.format(kind="MultiheadAttention", dropout=0.1)
-    layer = LAYER.format(self_attn=f"{attention}, {attention}", cross_attn=CROSS)
-    return maptr(**LIFTED | {
-        "model": "MapTRv2",
-        "queries": "num_vec_one2one=50, num_vec_one2many=300, k_one2many=6,",
-        "layer": layer.replace("DetrT", "DecoupledDetrT") + ", num_vec=50, num_pts_per_vec=points",
-        "losses": LOSSES.format(pts=5.0, dir=0.005) + SEGMENTATION,
-    })  # fmt: skip
-
-
-def gemap_full() -> str:
-    """Return GeMap with its full objective."""
-    return maptr(**LIFTED | {
-        "model": "GeMapFull", "frozen": -1, "decay": 0.03, "epochs": 110, "evaluate": 1,
-        "layer": _layer("GeometryDecoupledAttention", 0.1),
-        "losses": LOSSES.format(pts=5.0, dir=0.005) + GEOMETRY + SEGMENTATION,
-    })  # fmt: skip
+    Returns:
+        Our config, and the settings without a counterpart.
+    """
+    source = folder / "theirs.py"
+    source.write_text(text)
+    conversion = convert_upstream(read_assignments(source))
+    return merge(conversion, REPO / "configs"), conversion.unplaced
