@@ -1,4 +1,4 @@
-"""Info pickles of MapTR and MapTRv2, synthesised in their formats from known samples."""
+"""Info pickles in the formats of MapTR's repository, synthesised from known samples."""
 
 import os
 import pickle
@@ -114,7 +114,7 @@ def test_maptr_infos_without_maps_have_no_truth(known, tmp_path):
     assert file[0].cameras[0].path.startswith("samples/CAM_FRONT/")
 
 
-def test_maptrv2_infos_bring_their_truth(known, tmp_path):
+def test_infos_with_maps_bring_their_truth(known, tmp_path):
     infos = []
     for sample in known:
         info = nuscenes_info(sample)

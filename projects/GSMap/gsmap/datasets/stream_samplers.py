@@ -38,7 +38,7 @@ class _Scene:
         rng: Generator for the order of the frames and pieces and for the cuts between pieces.
         num_pieces: Number of pieces that the scene is cut into at random places.
         finish_singles: Whether the scene returns all of its single frames before its first piece,
-            as in the public code of StreamMapNet, which introduced this training.
+            as in the public code of the method that introduced this training.
     """
 
     def __init__(
@@ -96,8 +96,9 @@ class StreamTrainSampler(Sampler[int]):
         single_frame_iters: Number of iterations with single frames.
         pieces: Number of pieces that a scene is cut into.
         late_switch: Whether a scene switches to pieces only after all of its single frames, as in
-            the public code of StreamMapNet. The scenes then switch at different times: after 1.6
-            times ``single_frame_iters`` iterations, half of the samples come from pieces.
+            the code that introduced this training. The scenes then switch at different times:
+            after 1.6 times ``single_frame_iters`` iterations, half of the samples come from
+            pieces.
         seed: Seed of the random numbers, equal on all ranks; None for 0.
 
     Raises:

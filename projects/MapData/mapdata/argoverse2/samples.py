@@ -47,7 +47,7 @@ class Argoverse2Options(FileOptions):
             for ``train`` and 2.5 Hz (every fourth sweep) for the other splits.
         thin_over: Samples that are thinned out together: the samples of one ``log``, or of the
             whole ``split`` sorted by time (`thin_out_split`).
-        compat: Rules of the ground truth: ``maptrv2`` or ``maptr``, the published systems whose
+        compat: Rules of the ground truth, one of ``COMPAT_MODES``: the published systems whose
             elements the conversion reproduces.
         dim: Coordinates per point, 2 or 3.
         logs: Ids, or first characters of ids, of the logs to convert; empty converts all.
