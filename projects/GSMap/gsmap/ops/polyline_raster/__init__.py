@@ -1,6 +1,6 @@
 """Rasters of polylines and polygons: soft rasters, and masks of ground truth.
 
-Soft rasters follow MapVR (Zhang et al., arXiv 2306.10502).
+Soft rasters follow Zhang et al., arXiv 2306.10502.
 """
 
 import torch
