@@ -5,7 +5,9 @@ Example: ``python tools/analyze_run.py work_dirs/maptr work_dirs/gsmap --out cur
 ``--keys soft_iou/divider at_floor`` draws these logged values instead, one panel each.
 """
 
-import gsmap  # noqa: F401 - first: it handles Ctrl-C and guards against settings files
+# Imported before all libraries: this handles Ctrl-C during their imports, and keeps them from
+# reading settings files in the working folder.
+import gsmap  # noqa: F401
 
 # isort: split
 import argparse

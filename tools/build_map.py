@@ -9,7 +9,9 @@ Examples:
     python tools/build_map.py --map town.osm --ann annotations.arrow --prior town.prior
 """
 
-import gsmap  # noqa: F401 - first: it handles Ctrl-C and guards against settings files
+# Imported before all libraries: this handles Ctrl-C during their imports, and keeps them from
+# reading settings files in the working folder.
+import gsmap  # noqa: F401
 
 # isort: split
 import argparse

@@ -13,7 +13,9 @@ Examples:
     python tools/compare.py --list --tables 'GSMap Table 5*'
 """
 
-import gsmap  # noqa: F401 - first: it handles Ctrl-C and guards against settings files
+# Imported before all libraries: this handles Ctrl-C during their imports, and keeps them from
+# reading settings files in the working folder.
+import gsmap  # noqa: F401
 
 # isort: split
 import argparse

@@ -8,7 +8,9 @@ Examples:
 The config sets the cameras. The image size is the size of its test samples, or ``--size``.
 """
 
-import gsmap  # noqa: F401 - first: it handles Ctrl-C and guards against settings files
+# Imported before all libraries: this handles Ctrl-C during their imports, and keeps them from
+# reading settings files in the working folder.
+import gsmap  # noqa: F401
 
 # isort: split
 import argparse

@@ -5,7 +5,9 @@ Plugins of other packages are left out. The plugin of open3d, which mmdet3d inst
 usual command on machines without libusb.
 """
 
-import gsmap  # noqa: F401 - first: it handles Ctrl-C and guards against settings files
+# Imported before all libraries: this handles Ctrl-C during their imports, and keeps them from
+# reading settings files in the working folder.
+import gsmap  # noqa: F401
 
 # isort: split
 from absl import app
