@@ -215,9 +215,21 @@ def shrink_backbone(model: ConfigDict) -> None:
 
 
 def shrink_queries(model: ConfigDict) -> None:
-    """Keep a dozen queries of each group, some of which streams remember."""
-    for group in model.map_head.get("query_groups", []):
+    """Keep a dozen queries of each group or class, some of which streams remember.
+
+    Lines that are generated point by point become short, by two layers.
+    """
+    head = model.map_head
+    for group in head.get("query_groups", []):
         group.num = min(group.num, 12)
+    if head.type == "PivotHead":  # lines of each class, and their points
+        head.queries = [(min(lines, 12), points) for lines, points in head.queries]
+    elif head.type == "BezierHead":
+        head.queries = [12] * len(model.classes)
+    elif head.type == "VectorMapNetHead":
+        head.detector.num_queries = 12
+        head.detector.coder.max_num = 12
+        head.generator.update(num_layers=2, max_points=8)
     decoder = model.map_head.get("decoder") or {}
     if "num_masks" in decoder:  # one of each query
         decoder.num_masks = sum(group.num for group in model.map_head.query_groups)

@@ -8,7 +8,7 @@ from method_cases import cases_of_methods
 from model_cases import IMAGE_SHAPE, NUM_CAMS, build_small
 from processes import REPO
 
-from gsmap.apis.export import ExportedDetector, export_onnx, largest_differences
+from gsmap.apis.export import ExportedDetector, largest_differences
 from gsmap.apis.map_inferencer import MapInferencer
 from gsmap.apis.onnx_inferencer import OnnxInferencer
 from gsmap.datasets.elements import elements_of_predictions
@@ -61,12 +61,9 @@ def test_a_stream_runs_step_by_step_as_in_torch(case, drives, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def with_memory(tmp_path_factory):
-    """A small model with memory and its file."""
-    model = build_small(temporal={"bev": {}, "queries": {"num": 3}, "embed_dims": 16}).eval()
-    path = tmp_path_factory.mktemp("memory") / "model.onnx"
-    export_onnx(model, path, [f"CAM_{number}" for number in range(NUM_CAMS)], IMAGE_SHAPE)
-    return OnnxInferencer(path, num_threads=1)
+def with_memory(stream_onnx):
+    """A small model with memory, of its file."""
+    return OnnxInferencer(stream_onnx, num_threads=1)
 
 
 def frame_of(number: int, scene: str = "a", **changes) -> dict:
@@ -120,10 +117,10 @@ def test_a_stream_of_a_file_follows_the_rules_of_streams(with_memory):
         with_memory(images, frame_of(9), stream)
     with pytest.raises(ValueError, match=r"'b10' .* another scene than 'a9'"):
         with_memory(images, frame_of(10, "b"), stream)
-    with pytest.raises(ValueError, match=r"model\.onnx remembers .* new_stream\(\) starts"):
+    with pytest.raises(ValueError, match=r"stream\.onnx remembers .* new_stream\(\) starts"):
         with_memory(images, frame_of(10))
     with pytest.raises(ValueError, match=r"has no \['scene'\] in its metainfo"):
         with_memory(images, frame_of(10, scene=None), stream)
     other = OnnxInferencer(with_memory.path)
-    with pytest.raises(ValueError, match=r"belongs to .*model\.onnx, and .* start a new stream"):
+    with pytest.raises(ValueError, match=r"belongs to .*stream\.onnx, and .* start a new stream"):
         other(images, frame_of(10), stream)

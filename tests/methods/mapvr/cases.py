@@ -9,7 +9,8 @@ LSS = {  # of images alone, without their calibration
     "embed_dims": 128,
     "camera_aware": False,
 }
-EXPORTS = {"LSS": ("configs/mapvr/mapvr_r18_minicity.py", {"model.bev_encoder": LSS})}
+# Another method exports this encoder
+STATIC_FRAMES = {"LSS": ("configs/mapvr/mapvr_r18_minicity.py", {"model.bev_encoder": LSS})}
 
 
 def upstream_config() -> str:
