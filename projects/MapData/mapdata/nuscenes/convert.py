@@ -275,8 +275,9 @@ class _Conversion:
         )
         useful_workers = _count_samples(scenes) // _FRAMES_PER_WORKER
         workers = max(1, min(options.workers, len(scenes), useful_workers))
-        # The samples of each scene are read once, for the workers, which need their poses. ``tee``
-        # keeps them until the workers return the map elements of the scene.
+        # Each scene is read once. Its samples are used twice: the workers take their poses, and the
+        # loop below joins them to the map elements that the workers return. ``tee`` keeps them
+        # until then.
         samples, samples_for_workers = tee(map(self._scene_samples, scenes))
         poses = map(_stack_poses, samples_for_workers)
         results = ordered_map(partial(_extract_instances, local_map), poses, workers=workers)

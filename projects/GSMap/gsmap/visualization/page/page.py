@@ -12,7 +12,7 @@ from string import Template
 from typing import Any
 
 from gsmap.datasets.annotations.file import AnnotationFile
-from gsmap.datasets.annotations.record import MapSample
+from gsmap.datasets.annotations.record import AnnotationMeta, MapSample
 from gsmap.evaluation.analysis import DISTANCE
 from gsmap.evaluation.analysis.bootstrap import Resamples
 from gsmap.evaluation.analysis.distances import distance_groups
@@ -112,18 +112,7 @@ def page_data(
     truth: Mapping[str, MapElements] = {}
     if results:
         truth, _ = read_ground_truth(annotations, meta.classes)
-    scored = []
-    for name, path in results.items():
-        result = score_result(
-            name,
-            path,
-            truth=truth,
-            meta=meta,
-            allow_mismatch=options.allow_mismatch,
-            allow_other_split=options.allow_other_split,
-            law=options.law,
-        )
-        scored.append(result)
+    scored = _score_results(results, truth=truth, meta=meta, options=options)
     tokens = file.column("token")
     seconds = file.seconds_into_scene
     chosen = choose_frames(
@@ -146,13 +135,9 @@ def page_data(
             view=view,
         )
         frames.append(frame)
-    notes = []
-    for result in scored:
-        for note in result.notes:
-            notes.append(f"{result.name}: {note}")
-    if len(chosen) < len(tokens):
-        choice = _describe_choice(scored, num_chosen=len(chosen), max_frames=options.max_frames)
-        notes.append(f"The page shows {len(chosen)} of {len(tokens)} frames: {choice}.")
+    notes = _collect_notes(
+        scored, num_chosen=len(chosen), num_samples=len(tokens), max_frames=options.max_frames
+    )
     tables: list[Table] = []
     if scored:
         tables = _tables(scored, truth=truth, style=style, file=file, options=options)
@@ -175,6 +160,56 @@ def page_data(
         "reliability": reliability_curves(scored, truth, style),
         "frames": frames,
     }
+
+
+def _score_results(
+    results: Mapping[str, str | Path],
+    truth: Mapping[str, MapElements],
+    meta: AnnotationMeta,
+    options: PageOptions,
+) -> list[ScoredResult]:
+    """Score the result files in their order.
+
+    Args:
+        results: Result files by their names on the page.
+        truth: Ground truth of each sample, by token.
+        meta: Metadata of the annotation file.
+        options: Content of the page.
+    """
+    scored = []
+    for name, path in results.items():
+        result = score_result(
+            name,
+            path,
+            truth=truth,
+            meta=meta,
+            allow_mismatch=options.allow_mismatch,
+            allow_other_split=options.allow_other_split,
+            law=options.law,
+        )
+        scored.append(result)
+    return scored
+
+
+def _collect_notes(
+    scored: Sequence[ScoredResult], num_chosen: int, num_samples: int, max_frames: int
+) -> list[str]:
+    """Notes of the results, and a note on the choice of frames if the page leaves frames out.
+
+    Args:
+        scored: Results, with their notes.
+        num_chosen: Number of frames on the page.
+        num_samples: Number of samples of the annotation file.
+        max_frames: Largest number of frames.
+    """
+    notes = []
+    for result in scored:
+        for note in result.notes:
+            notes.append(f"{result.name}: {note}")
+    if num_chosen < num_samples:
+        choice = _describe_choice(scored, num_chosen=num_chosen, max_frames=max_frames)
+        notes.append(f"The page shows {num_chosen} of {num_samples} frames: {choice}.")
+    return notes
 
 
 def _frame_entry(
