@@ -34,20 +34,20 @@ def run(args: argparse.Namespace) -> None:
         costs = {
             "torch": in_own_process(frame_cost, path, args),
             "ONNX Runtime": in_own_process(onnx_cost, path, args, False),
-            "ONNX Runtime, 8 bits": in_own_process(onnx_cost, path, args, True),
+            "ONNX Runtime, 8 bits": in_own_process(onnx_cost, path, args, True),  # eight_bits
         }
         torch_cost = costs["torch"]
-        for name, cost in costs.items():
+        for runtime, cost in costs.items():
             row = [
                 Path(path).stem,
-                name,
+                runtime,
                 f"{cost.cpu_s:.3f}",
                 f"{cost.wall_s:.3f}",
                 f"{cost.cpu_s / torch_cost.cpu_s:.2f}",
                 f"{cost.wall_s / torch_cost.wall_s:.2f}",
             ]
             rows.append(row)
-    header = ["model", "way", "processor s", "wall s", "ratio to torch", "of wall s"]
+    header = ["model", "runtime", "processor s", "wall s", "processor s / torch", "wall s / torch"]
     report(args, header, rows=rows)
 
 
@@ -71,6 +71,6 @@ def onnx_cost(path: str, args: argparse.Namespace, eight_bits: bool) -> Cost:
         file = Path(folder, "model.onnx")
         export_onnx(model.eval(), file, names, (height, width))
         if eight_bits:
-            quantize_onnx(file, file, [arrays])
+            quantize_onnx(file, file, [arrays])  # replaces the file
         inferencer = OnnxInferencer(file, num_threads=args.threads)
     return measure(partial(inferencer.run, arrays), torch.device("cpu"), repeats=args.repeats)

@@ -85,7 +85,7 @@ def measure_images(folder: Path, count: int = 10, workers: Sequence[int] = ()) -
     for name in PIPELINES:
         frames = Frames(files[:_CAMERAS], name, count=count)
         np.random.seed(0)  # noqa: NPY002  generator of mmdet's transforms
-        frames[0]
+        frames[0]  # loads libraries and fills caches before the measurement
         start = time.process_time()
         for row in range(count):
             frames[row]

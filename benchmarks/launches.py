@@ -152,7 +152,7 @@ class Trial:
 
     @contextmanager
     def _count_parts(self) -> Iterator[None]:
-        """Count the launches inside the methods of `PARTS` and of the optimizer for their parts."""
+        """Count each launch for the part, of `PARTS` or of the optimizer, that is running."""
         gpu = self.gpu
         with ExitStack() as stack:
             for attribute, method, part in PARTS:
@@ -190,8 +190,8 @@ def _run_inside(
         with make_context():
             return original(*args, **kwargs)
 
-    # An attribute of the object comes before the method of its class, until it is deleted again.
-    # `object` sets it, as `torch.nn.Module` has rules for its attributes.
+    # An attribute of the object hides the method of its class until the attribute is deleted. It is
+    # set by `object.__setattr__`, because `torch.nn.Module` treats attributes in a way of its own.
     object.__setattr__(owner, method, call_inside)
     try:
         yield

@@ -29,7 +29,7 @@ from gsmap.structures.elements import MapElements
 Frame = tuple[MapElements, MapElements]  # predictions, ground truth
 _OPENCV_VERSION = tuple(int(part) for part in cv2.__version__.split(".")[:2])
 FILLS_AS_RELEASED = (4, 8) <= _OPENCV_VERSION <= (4, 10)
-"""Whether the installed OpenCV fills the pixels that it filled for the published AP_raster."""
+"""Whether the installed OpenCV fills polygons like the versions of the published AP_raster."""
 
 
 def _resample(line: np.ndarray) -> np.ndarray:

@@ -47,7 +47,7 @@ def state_bytes(config: str, options: list[str]) -> dict[str, int]:
     cfg_options = parse_options(options) if options else None
     cfg = read_config(config, cfg_options)
     if cfg.model.get("img_backbone"):
-        cfg.model.img_backbone.init_cfg = None
+        cfg.model.img_backbone.init_cfg = None  # loads no pretrained weights
     with building(cfg):
         model = MODELS.build(cfg.model).eval()
     if model.temporal is None:

@@ -60,7 +60,7 @@ FORMATS = ("geojson", "osm", "rrd", "mcap", "mp4", "png", "svg")
 _LON_LAT = "_lonlat"  # the name of a map in degrees ends in this
 _SCORES = "scores.json"
 _CHANGES = "changes"  # name of the file of changes, without a suffix
-# Bytes that every output of this command holds, by which outputs of other programs are recognized:
+# Bytes that every output of this command contains. A file without them is of another program.
 _MARK = b"gsmap"  # in maps
 _MARK_OF_SCORES = b'"merged"'  # in scores
 # Package and extra that a format needs.
@@ -125,6 +125,14 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--data-root", type=Path, help="folder of the images for rrd, mcap and mp4: that of --ann"
     )
+    add_map_options(parser)
+    args = parser.parse_args(argv)
+    check_combinations(parser, args)
+    return args
+
+
+def add_map_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that read earlier maps, or write maps for a later drive."""
     group = parser.add_argument_group("earlier maps")
     group.add_argument(
         "--changes",
@@ -155,7 +163,10 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         metavar=("KEY", "VALUE=CLASS"),
         help="property of the class in the map of --changes or --map, and its values",
     )
-    args = parser.parse_args(argv)
+
+
+def check_combinations(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
+    """Refuse options that exclude each other, or that need another option."""
     if args.results is None and not args.map:
         parser.error("give results, or a --map for a --prior")
     if args.results is None and (args.changes or args.out):
@@ -169,10 +180,9 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     check_prior_options(parser, args)
     if args.map_classes and not (args.map or args.changes):
         parser.error("--map-classes is for --map and --changes")
-    return args
 
 
-def check_prior_options(parser: CommandParser, args: argparse.Namespace) -> None:
+def check_prior_options(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
     """Refuse options that do not fit ``--prior``."""
     if args.gaussians and not (args.prior and args.results):
         parser.error("--gaussians is for a --prior of results: give both, too")
@@ -218,7 +228,8 @@ def check_options(args: argparse.Namespace, ann: AnnotationFile) -> None:
             "known: give --origin LAT LON (any place will do; nodes keep local_x and local_y), or "
             "--crs if poses are coordinates of a grid."
         )
-    if {"osm", "geojson"} & set(args.formats) and len(unknown) < len(origins):
+    has_known_origin = len(unknown) < len(origins)
+    if {"osm", "geojson"} & set(args.formats) and has_known_origin:  # writes degrees
         import_extra("pyproj", "maps")
 
 
@@ -309,7 +320,14 @@ def write_map(
     style = MapStyle(classes)
     root = args.data_root or args.ann.parent
     colours = [style.colour(label) for label in range(len(classes))]
-    replay = Replay(drive, elements, ann.meta.frame, colours, root, ann.meta.ground_z_m)
+    replay = Replay(
+        drive,
+        elements,
+        frame_kind=ann.meta.frame,
+        colours=colours,
+        data_root=root,
+        ground_z_m=ann.meta.ground_z_m,
+    )
     paths = []
     for suffix in args.formats:
         path = f"{stem}.{suffix}"
@@ -602,6 +620,8 @@ def merge_drives(
         Drives with their merged maps, and the processor time of merging in seconds.
     """
     has_poses = ann.meta.options.get("poses", True)
+    # File names are chosen for all drives of the file, so that a drive has the same name when other
+    # drives are selected.
     all_names = ann.column("map_name" if args.join else "scene")
     names = file_names(sorted({*all_names, *groups}), ("", _LON_LAT))
     if args.out:

@@ -141,15 +141,18 @@ def training_command(row: dict[str, Any]) -> str:
 
 
 def published_figures(table: dict[str, Any], row: dict[str, Any]) -> str:
-    """Mean APs and costs of a row in the paper, or the APs of the classes without a mean."""
+    """Published mean APs and costs of a row; the APs of the classes if it has neither."""
     if row["paper"] is None:
         return "no figure"
     figures = dict(zip(table["columns"], row["paper"], strict=True))
     means = []
     aps = []
     for name, value in figures.items():
-        words = aps if name.endswith("/AP") else means
-        words.append(f"{name} {'-' if value is None else value}")
+        text = f"{name} {'-' if value is None else value}"
+        if name.endswith("/AP"):  # AP of a class
+            aps.append(text)
+        else:
+            means.append(text)
     return ", ".join(means or aps)
 
 
@@ -166,6 +169,7 @@ def listing(tables: list[dict[str, Any]]) -> Iterator[str]:
 
 def slurm_commands(runs: list[Run], partition: str) -> str:
     """Commands for the unfinished runs, one per line: this command with ``--only`` for each run."""
+    # A parser that knows --slurm alone returns all other words of this command line.
     slurm_option = argparse.ArgumentParser(add_help=False)
     slurm_option.add_argument("--slurm")
     _, other_words = slurm_option.parse_known_args()
@@ -236,7 +240,7 @@ def main() -> str:
         runs = plan([parse_entry(text) for text in args.configs], protocol)
     if args.slurm:
         return slurm_commands(runs, args.slurm)
-    chosen = [run for run in runs if args.only in (None, run.label)]
+    chosen = [run for run in runs if args.only in (None, run.label)]  # all without --only
     if args.only and not chosen:
         raise InputError(f"no run is {args.only}; there are {[run.label for run in runs]}.")
     if not args.rescore:

@@ -258,7 +258,7 @@ def test_models_of_generated_streets_say_so_once_on_other_recordings(tmp_path, c
         assert "generated streets alone" not in caplog.text
         inferencer.dataset(tmp_path / "mine.arrow")
         inferencer.dataset(open_input(tmp_path / "mine.arrow"))
-    assert caplog.text.count("the model has seen generated streets alone (MiniCity)") == 1
+    assert caplog.text.count("the model was trained on generated streets only (MiniCity)") == 1
 
 
 @pytest.mark.parametrize("copied", [False, True])
@@ -283,7 +283,7 @@ def test_models_of_generated_streets_say_so_once_of_images_in_memory(caplog):
     with caplog.at_level(logging.WARNING):
         for _ in range(2):
             live.predict(dict.fromkeys(names, np.zeros((90, 160, 3), np.uint8)))
-    assert caplog.text.count("the model has seen generated streets alone (MiniCity)") == 1
+    assert caplog.text.count("the model was trained on generated streets only (MiniCity)") == 1
 
 
 def test_a_model_that_lifts_images_sees_live_what_it_sees_of_files(tmp_path):

@@ -84,7 +84,7 @@ def test_a_gaussian_prior_is_drawn_in_the_cells_of_a_window_and_not_written():
     assert len(rows) >= 24  # 40 m, cells of 1.25 m
     assert (columns == 14).all()  # x of 2.5 to 3.75 m
     assert not window[:2].any()
-    with pytest.raises(ValueError, match="has Gaussians, which a model reads only"):
+    with pytest.raises(ValueError, match="has Gaussians, which a model can only read"):
         GivenMaps([prior], CLASSES, grid=WINDOW, update=True)
 
 

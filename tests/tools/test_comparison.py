@@ -191,7 +191,7 @@ def test_the_config_in_a_runs_folder_says_seed_and_data_and_is_not_run(
     marker = tmp_path / "marker"
     attacks = {
         f"import pathlib; pathlib.Path({str(marker)!r}).touch()": "only assignments",
-        f"randomness = dict(seed=open({str(marker)!r}, 'w'))": r"open\(\) is not called",
+        f"randomness = dict(seed=open({str(marker)!r}, 'w'))": r"calls of open\(\)",
         "_base_ = 'evil.py'\nrandomness = dict(seed='x')": "must be a number, got 'x'",
         None: r"holds no 2\*/vis_data/config.py, which tools/train.py writes",
     }

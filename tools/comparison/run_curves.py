@@ -89,7 +89,9 @@ def _records(path: Path) -> list[dict[str, float]]:
 
 
 def read_run(path: str | Path, name: str | None = None) -> RunLog:
-    """Read the log of a run. Of a step that was logged twice, as after a resume, the later counts.
+    """Read the log of a run.
+
+    A resumed run may log a step a second time. The later record of the step is used.
 
     Args:
         path: Work folder of the run, or a ``scalars.json``.
@@ -112,7 +114,7 @@ def read_run(path: str | Path, name: str | None = None) -> RunLog:
         )
     train: dict[float, dict[str, float]] = {}
     val: dict[float, dict[str, float]] = {}
-    for file in files:  # oldest first: one per start
+    for file in files:  # one for each start of the run, oldest first
         for record in _records(file):
             records = train if "loss" in record else val
             records[record["step"]] = record

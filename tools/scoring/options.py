@@ -74,7 +74,8 @@ def add_metrics(parser: argparse.ArgumentParser) -> None:
         default=list(METRIC_NAMES),
         metavar="METRIC",
         help=f"names of metrics: {', '.join(metric_files())}; chamfer_hard: AP_chamfer at 0.2, "
-        "0.5 and 1.0 m, too. Those of methods, and their variants, are not comparable with others",
+        "0.5 and 1.0 m, too. The metrics of single methods, and their variants, are not comparable "
+        "with other metrics",
     )
     group.add_argument(
         "--custom-imports",
@@ -159,7 +160,7 @@ def add_analysis(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         const=1000,
         metavar="N",
-        help="intervals of 95 %% of every AP, of N resamples of the scenes (1000)",
+        help="interval of 95 %% for every AP, from N resamples of the scenes (1000)",
     )
     group.add_argument("--seed", type=int, default=0, help="seed of the resamples")
     group.add_argument(
@@ -201,7 +202,8 @@ def add_analysis(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--law",
         choices=LAW_NAMES,
-        help="with --uncertainty: distribution of the errors (that of the calibration, or normal)",
+        help="with --uncertainty: distribution of the errors; default: the one that the "
+        "calibration chose, or normal",
     )
     group.add_argument(
         "--reliability", type=output_file, help="with --uncertainty: draw its curves"

@@ -41,6 +41,8 @@ class MergeConfig:
             Variances in square metres. (M,)
         """
         elements = frame.elements
+        # The vertices are in the global frame. Their distance from the vehicle is their distance
+        # from the origin of the annotation frame.
         distances = np.linalg.norm(frame.to_frame(elements.points), axis=1)
         far = (SIGMA_PER_M * distances) ** 2
         if not (self.gaussians and elements.has_gaussians):
@@ -53,7 +55,7 @@ class MergeConfig:
         means = torch.from_numpy(elements.points).split(counts)
         scales = torch.from_numpy(elements.scales).split(counts)
         rotations = torch.from_numpy(elements.rotations).split(counts)
-        sigmas = [np.zeros(0)]
+        sigmas = [np.zeros(0)]  # an empty array, as a frame may have no line
         for line_means, line_scales, line_rotations in zip(means, scales, rotations, strict=True):
             gaussians = Gaussians(line_means, scales=line_scales, rotations=line_rotations)
             _, across = extents_along_line(gaussians).unbind(-1)  # along and across the line

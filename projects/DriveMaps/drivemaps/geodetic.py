@@ -151,11 +151,13 @@ class MapGrid:
         if area is not None and np.abs(points).max(initial=0.0) <= _FARTHEST_M:
             with np.errstate(invalid="ignore"):  # infinite where there is no longitude
                 from_west_deg = (lon_deg - area.west) % 360.0
-            width_deg = (area.east - area.west) % 360.0 or 360.0  # of the whole Earth
+            width_deg = (area.east - area.west) % 360.0
+            if width_deg == 0.0:  # the whole Earth
+                width_deg = 360.0
             is_wrong |= from_west_deg > width_deg
             is_wrong |= (lat_deg < area.south) | (lat_deg > area.north)
         if is_wrong.any():
-            x, y = points[is_wrong.argmax()]
+            x, y = points[is_wrong.argmax()]  # the first wrong position
             raise InputError(
                 f"{where}: the position {x:.0f} {y:.0f} is outside of the area of {self.crs} "
                 f"({system.name}): if positions are metres from a place, give its --origin LAT LON "

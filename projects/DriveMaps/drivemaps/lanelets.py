@@ -257,6 +257,7 @@ def _split(lines: Sequence[FloatArray]) -> list[FloatArray]:
             # at its end.
             around = np.clip([cut - 0.5, cut + 0.5], 0.0, shape.length)
             before, after = shapely.get_coordinates(shapely.line_interpolate_point(shape, around))
+            # The points are about 1 m apart, so the product is about the cosine of the directions.
             follows = (after - before) @ end_directions[end] > _MIN_SUCCESSOR_COSINE
             if follows and min(abs(cut - other) for other in cuts) > _SHORTEST_M:
                 cuts.append(cut)

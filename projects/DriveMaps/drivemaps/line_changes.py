@@ -135,8 +135,8 @@ def line_changes(
     changes = []
     views = evidence.views.sum(axis=0)
     for part in _parts(lines, evidence.is_missing):
-        in_view, num_passes = evidence.count_passes(part, seen=False)
-        if not num_passes:
+        in_view, num_agreeing = evidence.count_passes(part, seen=False)
+        if not num_agreeing:
             continue
         num_without = float((views - support)[part].mean())  # a match counts by its score
         old_score = float(lines.scores[part].mean())
@@ -146,7 +146,7 @@ def line_changes(
             line=lines.points[part],
             confidence=old_score * smooth_share(num_without, float(views[part].mean())),
             passes_in_view=in_view,
-            num_passes=num_passes,
+            num_passes=num_agreeing,
         )
         changes.append(change)
     maps = join_lines([lines, *(dense_elements(one.elements, label) for one in passes)])
@@ -162,7 +162,7 @@ def line_changes(
 
 @dataclass(frozen=True, eq=False)
 class _Moves:
-    """Distances of new lines from the vertices of old ones.
+    """Distances of new lines from the vertices of old ones, in metres; positive on the left.
 
     The map of a pass is more accurate than its frames, so it gives the positions. The frames give
     the error.
@@ -188,7 +188,7 @@ class _Moves:
 
     def shift_of(self, part: slice) -> Shift | None:
         """Mean distance of a part of an old line, and its error; None without enough frames."""
-        by_pass = _by_frame(self.maps, _within(self.map_matches, part))
+        by_pass = _by_frame(self.maps, _within(self.map_matches, part))  # a map is one frame
         by_frame = _by_frame(self.frames, _within(self.frame_matches, part))
         if len(by_frame.distances) < _MIN_FRAMES:
             return None
@@ -241,8 +241,8 @@ def _moved(
         has_moved = evidence.is_present & (side * shifts >= _MIN_MOVE_M)
         for part in _parts(lines, has_moved):
             shift = moves.shift_of(part)
-            in_view, num_passes = evidence.count_passes(part, seen=True)
-            if shift is None or not num_passes or not shift.exceeds(_MIN_MOVE_M):
+            in_view, num_agreeing = evidence.count_passes(part, seen=True)
+            if shift is None or not num_agreeing or not shift.exceeds(_MIN_MOVE_M):
                 continue
             share = smooth_share(float(support[part].mean()), float(views[part].mean()))
             share *= float(lines.scores[part].mean())
@@ -252,7 +252,7 @@ def _moved(
                 line=lines.points[part] + shifts[part, None] * normals[part],
                 confidence=share * shift.probability(_MIN_MOVE_M),
                 passes_in_view=in_view,
-                num_passes=num_passes,
+                num_passes=num_agreeing,
                 moved_m=abs(shift.mean_m),
                 moved_std_m=shift.std_m,
             )
@@ -291,8 +291,8 @@ def _added(old: MapElements, passes: list[Pass], label: int) -> list[Change]:
         is_new &= on_known_ground(lines.points, old) & evidence.is_present
         views = evidence.views.sum(axis=0)
         for part in _parts(lines, is_new):
-            in_view, num_passes = evidence.count_passes(part, seen=True)
-            if not num_passes:
+            in_view, num_agreeing = evidence.count_passes(part, seen=True)
+            if not num_agreeing:
                 continue
             num_views = float(views[part].mean())
             score = float(lines.scores[part].mean())
@@ -302,7 +302,7 @@ def _added(old: MapElements, passes: list[Pass], label: int) -> list[Change]:
                 line=lines.points[part],
                 confidence=smooth_share(score * num_views, num_views),
                 passes_in_view=in_view,
-                num_passes=num_passes,
+                num_passes=num_agreeing,
             )
             changes.append(change)
             known_lines = [*known_lines, change.line]  # so the next passes do not add it again

@@ -19,8 +19,12 @@ __version__ = "0.1.0"
 if starts_a_command():
     leave_at_once_on_ctrl_c()  # the imports that follow take seconds
 use_one_thread_in_forks()
+# Imports do not read settings files in the working folder.
 sys.meta_path.insert(0, SettingsGuard)
-sys.meta_path.append(MmcvExtFinder)  # last: mmcv's own compiled module comes first
+# An mmcv without compiled operators gets a replacement. Finders at the end are asked last, so the
+# compiled operators come first if mmcv has them.
+sys.meta_path.append(MmcvExtFinder)
+# Modules of this package can be imported by their former names.
 sys.meta_path.append(MovedModules())
 
 __getattr__, __dir__, __all__ = lazy_names(
@@ -37,5 +41,5 @@ __getattr__, __dir__, __all__ = lazy_names(
         "load_model": "apis",
         "render_gaussians": "ops",
     },
-    others={"from_records": "mapdata"},
+    others={"from_records": "mapdata"},  # defined in another package
 )

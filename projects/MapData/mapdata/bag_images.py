@@ -24,7 +24,7 @@ _TO_BGR: dict[str, int | None] = {
     "yuv422_yuy2": cv2.COLOR_YUV2BGR_YUYV, "yuyv": cv2.COLOR_YUV2BGR_YUYV,
     "yuv422": cv2.COLOR_YUV2BGR_UYVY, "uyvy": cv2.COLOR_YUV2BGR_UYVY,
 }  # fmt: skip
-_CHANNELS = {  # bytes of a pixel, by encoding; an encoding that is not listed has 1
+_PIXEL_BYTES = {  # bytes of a pixel, by encoding; an encoding that is not listed has 1
     "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4,
     "yuv422_yuy2": 2, "yuyv": 2, "yuv422": 2, "uyvy": 2,
 }  # fmt: skip
@@ -34,7 +34,12 @@ _VIDEO = ("h264", "h265", "hevc", "av1", "vp8", "vp9", "theora", "ffmpeg")
 
 
 def trouble_with(message: Any) -> str | None:
-    """Reason why images in a message's encoding cannot be used; None if they can."""
+    """Reason why images in a message's encoding cannot be used; None if they can.
+
+    Args:
+        message: Message of ROS: a raw image with ``encoding`` (``sensor_msgs/Image``), or a
+            compressed one with ``format`` (``sensor_msgs/CompressedImage``).
+    """
     if hasattr(message, "encoding"):
         if message.encoding in _TO_BGR:
             return None
@@ -56,7 +61,7 @@ def image_size(message: Any) -> tuple[int, int] | None:
         with Image.open(BytesIO(content), formats=FORMATS) as picture:
             return picture.size
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
-        return None
+        return None  # Pillow raises a SyntaxError for a broken header
 
 
 def write_image(message: Any, camera: RigCamera, target: Path, where: str) -> None:
@@ -98,10 +103,10 @@ def _raw_image(message: Any, size_px: tuple[int, int]) -> np.ndarray:
     if (width, height) != size_px:
         raise InputError(f"it has {(width, height)} pixels, and its camera info says {size_px}")
     encoding = message.encoding
-    channels = _CHANNELS.get(encoding, 1)
+    pixel_bytes = _PIXEL_BYTES.get(encoding, 1)
     # A row has `step` bytes, which may include padding at its end.
     rows = np.asarray(message.data, dtype=np.uint8).reshape(height, message.step)
-    image = rows[:, : width * channels].reshape(height, width, channels)
+    image = rows[:, : width * pixel_bytes].reshape(height, width, pixel_bytes)
     code = _TO_BGR[encoding]
     if code is None:
         return image

@@ -106,6 +106,7 @@ def from_records(
         _LOGGER.warning(_UNKNOWN_ROAD, path)
     source = ""
     if shard.count:
+        # Shards are joined only if they were cut from one list, which is recognized by its tokens.
         records = list(records)
         tokens = []
         for record in records:
@@ -154,7 +155,8 @@ def create_samples(
             empty_tokens.append(sample.token)
         if sample.ego_from_frame is None and meta.frame == "lidar" and not has_warned:
             has_warned = True
-            height_m = -frame_view(meta.frame, meta.ground_z_m).ground[2]
+            _, _, road_z_m = frame_view(meta.frame, meta.ground_z_m).ground  # z = a x + b y + c
+            height_m = -road_z_m
             _LOGGER.warning(_UNMOUNTED, sample.token, height_m)
         yield sample
     if empty_tokens:
@@ -210,7 +212,7 @@ def _snap_ends(lines: Sequence[Points]) -> None:
     places: list[np.ndarray] = []
     for line in lines:
         for end in (0, -1):  # first and last vertex
-            other_end = line[-1 - end]
+            other_end = line[-1 - end]  # vertex -1 for end 0, and vertex 0 for end -1
             place = _nearby_place(places, line[end])
             if place is None:
                 places.append(line[end].copy())
@@ -307,7 +309,7 @@ def _rectify_image(camera: Mapping[str, Any], root: Path) -> str:
     rig_camera = RigCamera(
         name=str(camera["name"]),
         intrinsics=np.array(camera["intrinsics"], dtype=np.float64),
-        cam_from_ground=np.eye(4),
+        cam_from_ground=np.eye(4),  # the mounting does not matter for rectification
         size_px=(int(camera["width"]), int(camera["height"])),
         distortion=np.array(camera["distortion"], dtype=np.float64),
         model=str(camera.get("distortion_model", "")),
@@ -348,7 +350,9 @@ def _clip(points: Points, meta: AnnotationMeta) -> list[Points]:
         return list(clip_to_box(points, x_range=meta.x_range, y_range=meta.y_range))
     polygon = shapely.Polygon(points)
     if not polygon.is_valid:
-        raise InputError("a ring that leaves the range crosses itself and cannot be cut: mend it.")
+        raise InputError(
+            "a ring crosses itself, so it cannot be cut at the border of the range: correct it."
+        )
     box = shapely.box(xmin=low[0], ymin=low[1], xmax=high[0], ymax=high[1])
     parts = shapely.get_parts(shapely.intersection(polygon, box))
     is_area = (shapely.get_type_id(parts) == POLYGON) & ~shapely.is_empty(parts)

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 from gsmap.utils.errors import InputError
 from gsmap.utils.extras import import_extra
 
-# Number of bytes that any bag may become, and of further bytes for each of its compressed bytes.
+# A bag may be decompressed to FREE_BYTES, and to TIMES further bytes for each compressed byte.
 FREE_BYTES = 1 << 26
 TIMES = 100
 _DECOMPRESSING = {  # modules that decompress, by the module that is imported
@@ -81,9 +81,8 @@ def _bound(module: Any) -> None:
         module.lz4 = SimpleNamespace(decompress=_bounded_lz4(lz4.decompress))
 
 
-def _count_packed(size: int) -> int:
-    """Count compressed bytes, and return the number of bytes that may still be decompressed."""
-    _Bag.packed += size
+def _remaining_bytes() -> int:
+    """Number of bytes that the current bag may still become by decompression."""
     return FREE_BYTES + TIMES * _Bag.packed - _Bag.unpacked
 
 
@@ -96,8 +95,8 @@ def _count_unpacked(content: bytes, limit: int) -> bytes:
     _Bag.unpacked += len(content)
     if len(content) > limit:
         raise InputError(
-            f"what is packed in it becomes more than {TIMES} times as large: if that is meant, "
-            "unpack the bag first, such as by `mcap compress --compression none`"
+            f"its content is more than {TIMES} times as large after decompression: if that is "
+            "right, decompress the bag first, such as by `mcap compress --compression none`"
         )
     return content
 
@@ -106,7 +105,8 @@ def _bounded_stream(open_stream: Callable[[BytesIO], Any]) -> Callable[..., byte
     """Function that decompresses bytes as a stream, at most up to the limit."""
 
     def decompress(data: bytes, *_: object) -> bytes:
-        limit = _count_packed(len(data))
+        _Bag.packed += len(data)
+        limit = _remaining_bytes()
         with open_stream(BytesIO(data)) as file:
             # One byte beyond the limit shows that there are too many.
             return _count_unpacked(file.read(limit + 1), limit=limit)
@@ -115,10 +115,14 @@ def _bounded_stream(open_stream: Callable[[BytesIO], Any]) -> Callable[..., byte
 
 
 def _bounded_lz4(unbounded: Callable[..., bytes]) -> Callable[..., bytes]:
-    """Function that decompresses LZ4 at once, as it grows by a factor of at most 255."""
+    """Function that decompresses LZ4 at once and counts the bytes afterwards.
+
+    LZ4 grows by a factor of at most 255, so a single call cannot fill the memory.
+    """
 
     def decompress(data: bytes, *options: object) -> bytes:
-        limit = _count_packed(len(data))
+        _Bag.packed += len(data)
+        limit = _remaining_bytes()
         return _count_unpacked(unbounded(data, *options), limit=limit)
 
     return decompress
@@ -128,10 +132,10 @@ def _bounded_file(zstd: Any) -> Callable[..., Any]:
     """Function that opens a compressed file, and counts the bytes of each read."""
 
     def open_file(file: Any, mode: str) -> Any:
-        _count_packed(os.fstat(file.fileno()).st_size)
+        _Bag.packed += os.fstat(file.fileno()).st_size
         unpacked = zstd.open(file, mode)
         read = unpacked.read
-        unpacked.read = lambda size=-1: _count_unpacked(read(size), limit=_count_packed(0))
+        unpacked.read = lambda size=-1: _count_unpacked(read(size), limit=_remaining_bytes())
         return unpacked
 
     return open_file

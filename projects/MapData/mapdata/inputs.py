@@ -9,7 +9,7 @@ from mapdata.argoverse2.log import logs_in
 from mapdata.argoverse2.samples import read_logs
 from mapdata.bag_files import is_bag, parts_in, suffix_advice
 from mapdata.bags import read_bag
-from mapdata.folders.calibration_file import NAMES
+from mapdata.folders.calibration_file import NAMES as CALIBRATION_NAMES
 from mapdata.folders.images import read_image_folder
 from mapdata.infos.recordings import read_info_file
 from mapdata.nuscenes.tables import read_nuscenes, versions_in
@@ -83,7 +83,7 @@ def _open_folder(folder: Path, options: InputOptions) -> Source:
         for reason, count in left_out.items():
             log_notes.append(f"{len(samples)} samples used, left out: {count} for {reason}")
         return Source(samples, frame="ego", data_root=root, notes=tuple(log_notes))
-    files = [folder / name for name in NAMES if (folder / name).is_file()]
+    files = [folder / name for name in CALIBRATION_NAMES if (folder / name).is_file()]
     if not files:
         for pattern in _FILES:
             files += [path for path in folder.glob(pattern) if not is_hidden(path)]

@@ -20,11 +20,12 @@ class InputOptions:
             None takes ``base_footprint`` or ``base_link``.
         vehicle_ground_z_m: Height of the road in that frame in metres; None is 0.
         topics: Topics of the images and of the camera info of a bag, by camera (``parse_topics``).
-        trained: Width, height, fx, fy, cx and cy of the cameras that a model was trained on, by
-            name (``load_model(...).rig``). Images of distorted cameras with these names are
-            rectified to them.
         calibration: Calibration file of a bag's cameras, in place of their camera info and
-            transforms. Its cameras are named as the topics, or their ``images`` are topics.
+            transforms. Each camera of the file gives its topic as ``images``, or is named as the
+            topic.
+        trained: Width, height, fx, fy, cx and cy of the cameras that a model was trained on, by
+            name (``load_model(...).rig``). An image of a distorted camera with one of these names
+            is rectified to the size and the intrinsics of that name.
     """
 
     data_root: Path | None = None

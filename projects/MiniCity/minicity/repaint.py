@@ -91,8 +91,8 @@ def repaint_town(town: Town, seed: int, share: float) -> tuple[Town, list[Change
         share: Share of the streets, in [0, 1].
 
     Returns:
-        The town with other paint and lanes, and every change. It has the surfaces and houses of the
-        given town.
+        The town with the new paint and lanes, and with the surfaces and houses of the given town;
+        and every change.
     """
     roads = list(town.roads)
     changes: list[Change] = []
@@ -183,7 +183,7 @@ def list_changes(before: Road, after: Road) -> list[Change]:
 
 
 def _moved_dividers(before: Road, after: Road) -> list[Change]:
-    """Changes of all dividers of a road that has moved its lanes."""
+    """Changes of all dividers of a road whose lanes are shifted."""
     changes = []
     offsets = zip(divider_offsets(before), divider_offsets(after), strict=True)
     for offset_before, offset_after in offsets:

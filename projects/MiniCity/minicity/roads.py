@@ -10,6 +10,7 @@ from minicity.curves import Array, arc_lengths, interpolate, left_normals, tange
 CROSSING_GAP_M = 0.8  # least distance from the end of a road to a crossing
 STOP_GAP_M = 1.0  # distance from a crossing to its stop line
 STOP_LINE_M = 0.45  # width of a stop line
+_BARE_M = 0.3  # length without divider paint before a crossing without a stop line
 
 
 @dataclass(frozen=True)
@@ -116,7 +117,8 @@ class Lane:
 class Road:
     """Road between two nodes, cut back to the mouths of its junctions.
 
-    Arc lengths are in metres along the centre line.
+    A mouth is the cross-section at which a road meets a junction. Arc lengths are in metres along
+    the centre line.
 
     Attributes:
         index: Number of the road in its town.
@@ -127,7 +129,7 @@ class Road:
         style: Paint and surface.
         crossings: Arc lengths (start, end) of pedestrian crossings.
         clear_start_m: Arc length at which divider paint begins.
-        clear_end_m: Arc length at which divider paint ends.
+        clear_end_m: Arc length at which divider paint ends; 0 is replaced by the whole length.
         stop_forward: Arc lengths (start, end) of the stop line for forward lanes, or None.
         stop_backward: Arc lengths (start, end) of the stop line for backward lanes, or None.
         shift_m: Shift of the painted lines between lanes from the offsets of ``section``, in
@@ -170,6 +172,8 @@ class Road:
             Points in metres. (n, 2)
         """
         end_m = self.length_m if end_m is None else end_m
+        # Vertices of the centre line within 5 cm of the ends are left out: they would almost
+        # coincide with the first or last point.
         inner = self._lengths[(self._lengths > start_m + 0.05) & (self._lengths < end_m - 0.05)]
         arc_m = np.concatenate([[start_m], inner, [end_m]])
         points = interpolate(self.center, self._lengths, at=arc_m)
@@ -297,7 +301,8 @@ class Road:
         """
         # Distances from this end of the road: far side of the crossing, and start of the paint.
         far = start_m + depth_m
-        clear = far + (STOP_GAP_M + STOP_LINE_M if stop else 0.3)
+        bare_m = STOP_GAP_M + STOP_LINE_M if stop else _BARE_M
+        clear = far + bare_m
         if at_start:
             self.crossings.append((start_m, far))
             self.clear_start_m = clear

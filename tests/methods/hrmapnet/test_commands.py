@@ -138,7 +138,7 @@ def test_a_gaussian_prior_of_a_drive_is_read(model, minicity_annotations, tmp_pa
         differences.append(np.abs(np.subtract(from_prior, points)).max())
     assert max(differences) > 0.1
     words = ["--out", str(tmp_path / "no.json"), "--prior", str(path), "--update-prior"]
-    with pytest.raises(ValueError, match="has Gaussians, which a model reads only"):
+    with pytest.raises(ValueError, match="has Gaussians, which a model can only read"):
         infer.main([drive, "--model", *model, *words])
 
 

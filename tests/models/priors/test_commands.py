@@ -73,7 +73,7 @@ def test_priors_and_options_that_do_not_fit_are_refused(
     again = [drive, "--model", *model, "--out", str(tmp_path / "b.json"), "--prior"]
     with pytest.raises(ValueError, match=r"or set model\.prior\.type=ElementFusion"):
         infer.main([*again, str(path)])
-    with pytest.raises(ValueError, match="has elements, which a model reads only"):
+    with pytest.raises(ValueError, match="has elements, which a model can only read"):
         infer.main([*again, str(path), "--update-prior", *FUSION])
     with pytest.raises(ValueError, match="ElementFusion writes to no prior"):
         infer.main([*again, str(tmp_path / "new.elements"), "--update-prior", *FUSION])

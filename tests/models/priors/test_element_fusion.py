@@ -112,7 +112,7 @@ def test_other_priors_places_and_settings_are_refused(plain_head):
     with pytest.raises(ValueError, match=r"the prior of 'town' has no elements.*--elements"):
         fusion.maps_of([MapPrior(settings)])
     prior = prior_of(plain_head, (1.0, 0, 0.5))
-    with pytest.raises(ValueError, match="has elements, which a model reads only"):
+    with pytest.raises(ValueError, match="has elements, which a model can only read"):
         fusion.maps_of([prior], update=True)
     with pytest.raises(ValueError, match="ElementFusion writes to no prior"):
         fusion.new_prior("town")

@@ -201,6 +201,7 @@ class FastFrames:
         """
         samples = batch["data_samples"]
         images = batch["inputs"]["img"]
+        # With `images_on_device`, the pipeline leaves its image steps to the data preprocessor.
         if any(sample.metainfo.get("image_steps") for sample in samples):
             preprocessor = self.frame.model.data_preprocessor
             pixels = torch.stack(upload(images, self.device))

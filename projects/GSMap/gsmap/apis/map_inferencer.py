@@ -104,7 +104,7 @@ def _build_visualizer(cfg: Config) -> "MapVisualizer":
         options = {}
     for name in ("name", "vis_backends", "save_dir"):
         options.pop(name, None)
-    with building(cfg, kind=MapVisualizer):
+    with building(cfg, kind=MapVisualizer):  # errors name the config and the part
         return MapVisualizer(name=f"inferencer-{id(cfg)}", **options)
 
 
@@ -122,7 +122,9 @@ class MapInferencer:
         amp: Whether to use mixed precision. On a GPU, backbone and neck run in float16 and other
             matrix products in TF32. On a CPU, all run in bfloat16.
         cuda_graphs: Whether frames on a GPU are recorded once for each image size and replayed
-            (`FastFrames`). None uses ``CAPTURE_BY_DEFAULT`` for models with a static form.
+            (`FastFrames`). This needs a model with a static form: a prediction of fixed operations
+            on tensors of fixed sizes (`StaticFrame`). None uses ``CAPTURE_BY_DEFAULT`` for such
+            models, and does not record others.
 
     Raises:
         FileNotFoundError: If the config or the checkpoint does not exist.
@@ -227,8 +229,8 @@ class MapInferencer:
             return
         self._warn_generated = False
         _LOGGER.warning(
-            "the model has seen generated streets alone (MiniCity): on real images its maps are a "
-            "trial, not a result; train it on your own data (docs/custom_data.md)."
+            "the model was trained on generated streets only (MiniCity): on real images its maps "
+            "are a trial, not a result; train it on your own data (docs/custom_data.md)."
         )
 
     def _fit_cameras(
@@ -333,11 +335,12 @@ class MapInferencer:
                 model with memory, if frames are out of order, or there are several devices; if a
                 prior is given to a model without one, or does not fit the samples.
         """
-        num_ahead = 0 if stream is not None else len(self.replicas)  # batches in computation
-        if stream is None and self.model.temporal is not None:
+        num_ahead = len(self.replicas)  # batches that are computed ahead of the yielded one
+        if stream is not None:
+            num_ahead = 0  # the caller's stream is then at most a batch ahead of the samples
+            self._temporal()  # raises an error if the model has no memory
+        elif self.model.temporal is not None:
             stream = self._temporal().new_scenes()
-        elif stream is not None:
-            self._temporal()
         maps = self._maps(priors, update=update_priors)
         dataset = self._fit_cameras(dataset, allow_missing_cameras=allow_missing_cameras)
         frames = FrameDataset(dataset, blank_cameras=allow_missing_cameras)
@@ -416,7 +419,7 @@ class MapInferencer:
         device_type = self.devices[turn].type
         fast_frames = self._fast_frames[turn]
         if fast_frames is not None and fast_frames.serves(batch):
-            return fast_frames(batch)
+            return fast_frames(batch)  # such a model has neither a memory nor a prior
         memory = nullcontext() if stream is None else self.model.temporal.using(stream)
         prior = nullcontext() if maps is None else self.model.prior.using(maps)
         in_bfloat16 = self.amp and device_type == "cpu"

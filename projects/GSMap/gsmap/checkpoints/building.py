@@ -98,7 +98,8 @@ def building(cfg: Config, kind: type | None = None) -> Iterator[None]:
         yield
     except GsmapError as error:
         text = str(error)
-        names_a_path = "/" in text  # such as the path of a file that cannot be read
+        # An error that names a file, such as a data file that cannot be read, is not the config's.
+        names_a_path = "/" in text
         if names_a_path or not _parts_under_construction(error):
             raise
         raise type(error)(f"{where}{text}") from error
@@ -106,6 +107,7 @@ def building(cfg: Config, kind: type | None = None) -> Iterator[None]:
         parts = _parts_under_construction(error)
         if kind is not None:
             parts.append(_Part(registry=None, kind=kind))
+        # An error of the machine has a message for users already.
         fault = None if user_message(error) else _describe_fault(error, parts=parts, cfg=cfg)
         if fault is None:
             raise
@@ -167,8 +169,8 @@ def _describe_fault(error: BaseException, parts: list[_Part], cfg: Config) -> st
     absent = _ABSENT_TYPE.match(text)
     if absent is not None and parts[0].registry is not None:
         registry = parts[0].registry
-        close = suggestion(absent[1], names=registry_names(registry))
-        return f"there is no {registry.name} of type {absent[1]!r}{close or '.'}"
+        hint = suggestion(absent[1], names=registry_names(registry)) or "."
+        return f"there is no {registry.name} of type {absent[1]!r}{hint}"
     subject = " of ".join(part.name for part in typed_parts) or "the run"
     place = find_override(error) or _find_place(cfg, parts=parts)
     settings = f"these settings ({place})" if place else "these settings"
@@ -199,7 +201,8 @@ def _sections(settings: Any, prefix: str) -> Iterator[tuple[str, dict[str, Any]]
     """
     items = enumerate(settings) if isinstance(settings, list | tuple) else settings.items()
     for key, value in items:
-        if str(key).startswith("_"):  # a variable of the config: settings have copies of it
+        # Names with "_" are variables of the config file. The settings have copies of them.
+        if str(key).startswith("_"):
             continue
         if isinstance(value, dict) and "type" in value:
             yield f"{prefix}{key}", value
@@ -228,8 +231,8 @@ def _describe_unknown_setting(
         if any(getattr(member, "__name__", None) == target for member in family):
             valid_names = _argument_names(family, method=method)
             break
-    close = suggestion(name, names=valid_names)
-    return f"{owner.removesuffix('.__init__')} has no setting {name!r}{close or '.'}"
+    hint = suggestion(name, names=valid_names) or "."
+    return f"{owner.removesuffix('.__init__')} has no setting {name!r}{hint}"
 
 
 def _argument_names(family: tuple[Any, ...], method: str) -> list[str]:

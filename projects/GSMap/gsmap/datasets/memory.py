@@ -52,7 +52,7 @@ def source_in_memory(
         ValueError: If an array has another shape, a matrix is not a valid calibration, or the
             arguments have different cameras.
     """
-    frames = (VEHICLE, *RANGES)
+    frames = (VEHICLE, *RANGES)  # RANGES has a key for each annotation frame: lidar, ego
     if frame not in frames:
         raise InputError(f"frame must be one of {frames}, got {frame!r}.")
     intrinsics = _by_name(intrinsics)
@@ -82,6 +82,7 @@ def source_in_memory(
     )
     check_samples([sample], AnnotationMeta("memory", frame=annotation_frame, split="test"))
     if frame == VEHICLE:
+        # The cameras are known relative to the ground, and are transformed to the frame ego.
         sample = sample_in_vehicle(
             "in memory", scene="", timestamp_ns=0, cameras=cameras, global_from_ground=None
         )

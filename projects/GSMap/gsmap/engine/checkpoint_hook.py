@@ -124,8 +124,9 @@ class AtomicCheckpointHook(CheckpointHook):
         source = runner._load_from
         if runner._resume:
             check_resumable(checkpoint, runner=runner, path=source)
-        with refusing(source):
+        with refusing(source):  # errors name the source and a remedy
             state = unwrap(checkpoint).state
+        # Other training loops store the weights elsewhere, or below a prefix.
         if state.keys() != checkpoint.get("state_dict", {}).keys():
             checkpoint["state_dict"] = state
         meta = checkpoint.get("meta")
@@ -154,7 +155,7 @@ class AtomicCheckpointHook(CheckpointHook):
         Raises:
             FloatingPointError: If a loss or a weight is not finite.
         """
-        finish_checks(runner)
+        finish_checks(runner)  # raises the error of a loss that was not finite
         state = checkpoint["state_dict"]
         nonfinite_keys = [key for key, value in state.items() if not bool(value.isfinite().all())]
         if nonfinite_keys:
@@ -228,8 +229,10 @@ class AtomicCheckpointHook(CheckpointHook):
     @staticmethod
     def _is_foreign(path: Any, folder: Path) -> bool:
         """Whether a path from a checkpoint is not a best checkpoint in the run's folder."""
+        if path is None:  # no best checkpoint yet
+            return False
         if not isinstance(path, str):
-            return path is not None
+            return True
         place = Path(path)
         is_best = re.fullmatch(r"best_.+_\d+\.pth", place.name)
         return not is_best or place.is_symlink() or place.resolve().parent != folder

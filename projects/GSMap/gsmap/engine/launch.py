@@ -166,7 +166,8 @@ def load_config(args: argparse.Namespace) -> Config:
         if name.startswith("_"):
             cfg.pop(name)
     if args.launcher == "pytorch":
-        # torchrun cannot stop its ranks if it is killed with SIGKILL
+        # torchrun cannot stop its ranks if it is killed with SIGKILL, so each rank watches the
+        # launcher. The variable LAUNCHER names its process; by default it is the parent.
         launcher_process = int(os.environ.pop(LAUNCHER, os.getppid()))
         die_with_parent(launcher_process)
     if args.launcher == "pytorch" and not torch.cuda.is_available():
@@ -213,7 +214,7 @@ def newest_checkpoint(
         match = re.fullmatch(r"(?:epoch|iter)_(\d+)\.pth", path.name)
         if match:
             numbers[path] = int(match[1])
-    for path in sorted(numbers, key=numbers.__getitem__, reverse=True):
+    for path in sorted(numbers, key=numbers.__getitem__, reverse=True):  # the newest first
         reason = f"{path} is damaged and is passed over."
         try:
             if _is_undamaged_zip(path):
@@ -234,9 +235,9 @@ def _is_undamaged_zip(path: Path) -> bool:
     except DAMAGED_ZIP:
         return False
     except OSError as error:
-        if error.errno != errno.EINVAL:  # a damaged archive refers to a negative file position
-            raise
-        return False
+        if error.errno == errno.EINVAL:  # the damaged archive refers to a negative file position
+            return False
+        raise
 
 
 def check_config(cfg: Config) -> None:
@@ -275,10 +276,10 @@ def _check_lengths(cfg: Config) -> None:
                 f"{cfg.filename}: train_cfg.{name} must be an integer >= 1, got {value!r:.60}."
             )
     for part in ("val_cfg", "test_cfg"):
-        halved = (cfg.get(part) or {}).get("fp16", False)
-        if not isinstance(halved, bool):
+        fp16 = (cfg.get(part) or {}).get("fp16", False)
+        if not isinstance(fp16, bool):
             raise InputError(
-                f"{cfg.filename}: {part}.fp16 must be True or False, got {halved!r:.60}."
+                f"{cfg.filename}: {part}.fp16 must be True or False, got {fp16!r:.60}."
             )
 
 
@@ -305,8 +306,8 @@ def _check_schedule(cfg: Config) -> None:
         if last is not None and scheduler.get("by_epoch", True) and last != end:
             raise InputError(
                 f"{cfg.filename}: training lasts {end} epochs but the cosine schedule {last}: set "
-                "both train_cfg.max_epochs and param_scheduler's T_max (a schedule is one base "
-                "file)."
+                "both train_cfg.max_epochs and param_scheduler's T_max, or inherit from a base "
+                "file that sets both."
             )
 
 
@@ -335,8 +336,9 @@ def _check_effect(cfg: Config, name: str) -> None:
     value: Any = cfg.get(top)
     for key in keys:
         value = value.get(key) if isinstance(value, dict) else None
+    # A copy of _name is expected in a setting of that name without the underscore.
     last_key = keys[-1] if keys else top.removeprefix("_")
-    if name == "data_root":
+    if name == "data_root":  # one option sets all copies
         copies = ["--data-root DIR"]
     else:
         settings = {}
@@ -422,5 +424,5 @@ def _check_streams(cfg: Config) -> None:
         if part == "train" and slots != batch_size:
             raise InputError(
                 f"{cfg.filename}: train_dataloader.batch_size is {batch_size} and sampler.slots is "
-                f"{slots}: a place of the batch is a stream, so set both to one number."
+                f"{slots}: each place in the batch follows one stream, so set both to one number."
             )

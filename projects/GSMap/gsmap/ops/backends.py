@@ -87,9 +87,10 @@ def choose_backend(
         raise InputError(f"backend must be one of {choices}, got {backend!r}.")
     if backend == "reference":
         return backend
-    unordered = kernel in UNORDERED and torch.are_deterministic_algorithms_enabled()
+    # Whether the Triton kernel must not be used, because deterministic algorithms are asked for.
+    is_excluded = kernel in UNORDERED and torch.are_deterministic_algorithms_enabled()
     if backend == "auto":
-        takes_triton = kernel in AUTO_KERNELS and not unordered
+        takes_triton = kernel in AUTO_KERNELS and not is_excluded
         candidates = [name for name in fused if name != "triton" or takes_triton]
         return _automatic_backend(candidates, tensor)
     if tensor.dtype != torch.float32:
@@ -98,7 +99,7 @@ def choose_backend(
         )
     if not INSTALLED[backend]:
         raise InputError(f"backend {backend!r} needs {PACKAGES[backend]}, which is not installed.")
-    if backend == "triton" and unordered:
+    if backend == "triton" and is_excluded:
         raise InputError(
             f"backend 'triton' of {kernel} adds gradients up in any order: use 'reference' with "
             "torch.use_deterministic_algorithms."
@@ -190,6 +191,7 @@ def fused_operator(
 
     def differentiate(ctx: Any, grads: Tensor) -> tuple[Any, ...]:
         gradients = gradient(grads, *ctx.saved_tensors, *ctx.settings)
+        # One value for each input of `forward`: None for tensors and settings without a gradient.
         num_without = num_tensors + len(ctx.settings) - differentiable
         return *gradients, *(None,) * num_without
 

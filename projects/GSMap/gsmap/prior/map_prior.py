@@ -34,8 +34,8 @@ class MapPrior:
 
     Tiles are created when a frame is written to them. Those that are not in use leave memory. All
     methods may be called from several threads. `read` and `write` take the nearest cell: a cell of
-    the prior has the index floor(x / cell_m) along each axis of the global frame. As in
-    `MapElements.to_frame`, poses are used by position and yaw.
+    the prior has the index floor(x / cell_m) along each axis of the global frame. Only the position
+    and the yaw of a pose are used, as in `MapElements.to_frame`.
 
     Args:
         settings: Classes, place and cells.
@@ -127,7 +127,9 @@ class MapPrior:
                         rule=self.rule,
                         tiles=self._tiles.packed_tiles(),
                     )
-                if path.is_file():  # no device or pipe
+                # From here on, tiles that leave memory are read from the new file. A device or a
+                # pipe cannot be read again.
+                if path.is_file():
                     mapped = _map_file(path)
                     _, _, places = read_header(mapped, path)
                     self._tiles.open(mapped, path, places=places)
@@ -272,11 +274,11 @@ class MapPrior:
         dx, dy = grid.pixel_size_m
         x = grid.x_range[0] + dx * (np.arange(grid.width) + 0.5)  # (W,)
         y = grid.y_range[0] + dy * (np.arange(grid.height) + 0.5)  # (H,)
-        # The grid lies in a square of num_cells around the origin of the frame. If it lies in one
-        # quadrant, it has a quarter of these cells.
+        # The grid lies in a square around the origin of the frame, which reaches corner_m to each
+        # side. Each of its quadrants may have _MOST_CELLS cells of the prior.
         corner_m = max(map(abs, (*grid.x_range, *grid.y_range)))
-        num_cells = (2 * corner_m / self.settings.cell_m) ** 2
-        if not num_cells <= 4 * _MOST_CELLS:
+        square_cells = (2 * corner_m / self.settings.cell_m) ** 2
+        if not square_cells <= 4 * _MOST_CELLS:  # also refuses NaN
             raise InputError(
                 f"the grid reaches {corner_m:g} m, too far for cells of {self.settings.cell_m:g} m."
             )
@@ -401,9 +403,10 @@ def _largest_per_cell(
     """Combine cells of a frame that lie in one cell of the prior by their largest values.
 
     Args:
-        cells: Cell of the prior of each cell of the frame, in [0, size). (n,)
+        cells: Cell of the prior in which each cell of the frame lies, as an index into the window,
+            in [0, size). (n,)
         values: Prediction. (C, n)
-        size: Number of cells of the prior.
+        size: Number of cells of the window.
 
     Returns:
         Different cells in rising order (m,), and their largest values (C, m).

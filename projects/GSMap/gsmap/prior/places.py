@@ -87,7 +87,9 @@ class PlaceMaps:
         memory: str = "kept",
     ) -> None:
         if memory not in self.memories:
-            raise InputError(f"the memory of a prior must be one of {self.memories}: {memory!r}.")
+            raise InputError(
+                f"the memory of a prior must be one of {self.memories}, got {memory!r}."
+            )
         width_m, height_m = grid.pixel_size_m
         if abs(width_m - height_m) > 1e-6:
             raise InputError(f"cells of a prior must be squares, got {width_m:g} x {height_m:g} m.")
@@ -142,7 +144,7 @@ class PlaceMaps:
         return prior.read(place.pose, self.grid)
 
     def write(self, place: Place | None, raster: Tensor) -> None:
-        """Write the drawn prediction of a frame. A frame without a known place is not written.
+        """Write the rasterized prediction of a frame. A frame of unknown place is not written.
 
         Args:
             place: Place of the frame; None if it is unknown.
@@ -186,8 +188,8 @@ class GivenMaps(PlaceMaps):
             if not isinstance(prior, MapPrior):
                 if update:
                     raise InputError(
-                        f"the prior of {name!r} has {prior.content}, which a model reads only: "
-                        "leave the update out; tools/build_map.py --prior makes it anew."
+                        f"the prior of {name!r} has {prior.content}, which a model can only read: "
+                        "leave the update out; tools/build_map.py --prior builds a new one."
                     )
                 # These priors have no cells: they are drawn on the cells of a window.
                 found = replace(found, cell_m=expected.cell_m, tile_m=expected.tile_m)

@@ -43,7 +43,8 @@ class PriorSettings:
         if not 0.01 <= self.cell_m <= 10:
             raise InputError(f"cell_m must be in [0.01, 10], got {self.cell_m}.")
         cells = self.tile_m / self.cell_m
-        if not 1 <= cells <= _MOST_TILE_CELLS + 0.5 or abs(cells - round(cells)) > 1e-6:
+        is_in_range = 1 <= cells <= _MOST_TILE_CELLS + 0.5  # tolerates rounding of the quotient
+        if not is_in_range or abs(cells - round(cells)) > 1e-6:
             raise InputError(
                 f"tile_m must be 1 to {_MOST_TILE_CELLS} cells of {self.cell_m:g} m, got "
                 f"{self.tile_m:g} m."
@@ -69,8 +70,8 @@ class PriorSettings:
             found = getattr(other, name)
             if found != expected:
                 raise InputError(
-                    f"{where} has {name} {found!r}, and {expected!r} is needed: give the prior of "
-                    f"this {name}, or build one."
+                    f"{where} has {name} {found!r}, and {expected!r} is needed: give a prior with "
+                    f"{name} {expected!r}, or build one."
                 )
 
 

@@ -90,11 +90,15 @@ def largest_deviation(line: Float, curve: Float, num_points: int, enough: float)
 
 @njit(cache=True)
 def deviation_of_fit(line: Float, inverse: Float, weights: Float, enough: float) -> float:
-    """Fit one piece to a line and compute the largest distance of both.
+    """Fit one Bezier curve to a line and compute the largest distance of both.
+
+    The curve is fitted by least squares to points at equal distances. The first and last control
+    points are then moved to the ends of the line.
 
     Args:
         line: Vertices of the line in metres. (n, 2)
-        inverse: Matrix from points at equal distances to control points. (degree + 1, P)
+        inverse: Pseudo-inverse of ``weights``: from points of the line to control points.
+            (degree + 1, P)
         weights: Matrix from control points to points of the curve. (P, degree + 1)
         enough: Distance in metres at which the search ends.
 

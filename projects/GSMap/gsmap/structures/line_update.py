@@ -102,9 +102,11 @@ def update_from_known_lines(
     is_far = (num_beside < 2) | (means_of_pairs >= gate_m)
     mean_distances = means_of_pairs.new_full((len(labels), len(known_labels)), torch.inf)  # (N, M)
     mean_distances[rows, cols] = means_of_pairs.masked_fill(is_far, torch.inf)
-    # Number of the pair of each element and line, to look up the nearest line of an element.
+    # Index of the pair of each element and line among the K pairs. (N, M)
     pairs = torch.zeros_like(mean_distances, dtype=torch.long)
     pairs[rows, cols] = torch.arange(len(rows), device=rows.device)
+    # Nearest line of each element, and the pair of both. An element without a line gets any pair;
+    # its smallest mean is infinite, so `belongs` leaves it unchanged.
     smallest_mean, line = mean_distances.min(1)
     pair = pairs.gather(1, line[:, None])[:, 0]
     point_distances = places.distances[pair]  # (N, P)

@@ -55,7 +55,7 @@ def write_fiftyone(
     file = AnnotationFile(annotations)
     root = Path(data_root or Path(annotations).parent).resolve()
     predictions = None
-    places = {}
+    places = {}  # place of each sample in the result file, by token; elements are loaded in turn
     if results is not None:
         predictions = SampleFile(results, key="results", classes=file.meta.classes)
         places = {token: place for token, _, place in predictions}
@@ -176,6 +176,7 @@ def _visible_parts(line: np.ndarray, camera: CameraRecord) -> list[list[list[flo
     breaks = [i + 1 for i, (before, after) in enumerate(pairwise(index)) if after != before + 1]
     parts = []
     for run in np.split(shares, breaks):
+        # The start of each segment, and the end of the last one.
         vertices = np.concatenate([run[:, 0], run[-1:, 1]])
         parts.append(vertices.tolist())
     return parts

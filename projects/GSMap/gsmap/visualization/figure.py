@@ -342,6 +342,6 @@ def _compress_svg(svg: bytes) -> bytes:
 
 def _jpeg_from_png(match: re.Match[bytes]) -> bytes:
     """Convert an image in an SVG, a PNG data URI, to a JPEG data URI."""
-    pixels = decode_image(base64.b64decode(match[1]), "an image", "figure")
+    pixels = decode_image(base64.b64decode(match[1]), path="an image", where="figure")
     jpeg = base64.b64encode(encode_jpeg(pixels, quality=65))
     return b"data:image/jpeg;base64," + jpeg

@@ -33,8 +33,8 @@ class Py123dOptions(FileOptions):
 
     Args:
         split: Folder of the logs below ``root/logs``, such as ``nuscenes_val``.
-        data_root: Folder that the paths of images in logs are relative to, and into which images in
-            logs are written; None for ``root``.
+        data_root: Folder that the image paths in logs are relative to; None for ``root``. Images
+            whose content is stored in the logs are written to files in this folder.
         rate_hz: Samples per second; None keeps all frames.
         logs: Names, or first characters of names, of the logs to convert; empty converts all.
         ground_z_m: Height of the road in the frame of the rear axle, in metres; None takes the
@@ -93,6 +93,7 @@ def convert_py123d(options: Py123dOptions) -> ConversionSummary:
     )
     with Progress(own_logs, desc=f"py123d {options.split}", unit="logs") as progress:
         records = _all_records(progress, options, summary=summary)
+        # The first record is read before the file is opened: without one, no file is written.
         first = next(records, None)
         if first is None and not options.shard.count:
             raise WorkError(f"no sample is left of {options.split}:\n{summary.text()}")
@@ -176,8 +177,8 @@ def _records(
     log: Log, log_map: Map | None, options: Py123dOptions, summary: ConversionSummary
 ) -> Iterator[dict[str, Any]]:
     """Yield the records of a log; frames that cannot be used are counted and left out."""
-    frames = {}
-    for time_ns, rows in log.frames():
+    frames = {}  # by time in nanoseconds: the row of the image in the table of each camera
+    for time_ns, rows in log.frames():  # a camera without an image has None
         if not rows:
             raise InputError("it has no camera that can be used")
         known_rows = {name: row for name, row in rows.items() if row is not None}
@@ -187,8 +188,9 @@ def _records(
             summary.add_problem(reason, f"{log.name}_{time_ns // 1000}")
         else:
             frames[time_ns] = known_rows
-    limits = np.abs([options.x_range, options.y_range])
-    radius_m = float(np.hypot(*limits.max(axis=1)))
+    # The map is cut around the vehicle, as far as the farthest corner of the range.
+    largest_x_m, largest_y_m = np.abs([options.x_range, options.y_range]).max(axis=1)
+    radius_m = float(np.hypot(largest_x_m, largest_y_m))
     root = options.data_root or options.root
     for time_ns in thin_out(np.array(sorted(frames), np.int64), options.rate_hz).tolist():
         token = f"{log.name}_{time_ns // 1000}"
@@ -236,7 +238,7 @@ def _cameras(
         row = rows[camera.name]
         with explain_errors(f"camera {camera.name!r}", REMEDY):
             global_from_camera = camera.global_from_camera(row, track=log.track)
-            record = camera.calibration
+            record = camera.calibration  # a new dictionary at each access
             record["path"] = camera.image_path(row, root=root, scene=log.name)
             record["cam_from_frame"] = invert_rigid(global_from_camera) @ global_from_axle
         cameras.append(record)
@@ -260,7 +262,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add("--centerline", action="store_true", help="add the class centerline")
     add("--out-dir", type=Path, help="folder of the annotation file (default: the data root)")
-    add("--tag", default="", help="suffix of its name, such as _extended")
+    add("--tag", default="", help="suffix of the file's name, such as _extended")
     add_range_options(parser, RANGES["ego"])
     add_shard_options(parser)
 

@@ -23,6 +23,7 @@ FILE_SETTINGS = (
     "load_interval aux_seg fixed_ptsnum_per_line"
 )
 FLAT = {"pred_z_flag": False, "gt_z_flag": False}  # z_cfg of points without heights
+# dotted names of settings in GSMap, by their dotted names in the original config
 SCHEDULE = {
     "lr_config.warmup_iters": "param_scheduler.0.end",
     "lr_config.warmup_ratio": "param_scheduler.0.start_factor",

@@ -76,7 +76,7 @@ class _Names(dict[str, Any]):
             ValueError: If the name is not assigned, or the limit of the copies is exceeded.
         """
         if name not in self:
-            raise InputError(f"{name} is not assigned before")
+            raise InputError(f"the name {name} is not assigned in an earlier line")
         self._count(self[name], depth=0)
         return copy.deepcopy(self[name])
 
@@ -84,7 +84,7 @@ class _Names(dict[str, Any]):
         """Subtract the size of a value from the remaining size; ``depth`` is its nesting."""
         self._remaining -= len(value) if isinstance(value, str) else 1
         if self._remaining < 0 or depth > _DEEPEST:
-            raise InputError("earlier names stand for too much, or for lists nested too deep")
+            raise InputError("the values of earlier names are too large or nested too deep")
         if isinstance(value, dict):
             items: Iterable[Any] = (*value, *value.values())
         elif isinstance(value, (list, tuple)):
@@ -126,21 +126,21 @@ def _compute(node: ast.expr, names: _Names) -> Any:
         case ast.Call(ast.Name(name), [argument], []) if name in CALLS:
             return CALLS[name](_value(argument, names))
         case ast.Call(function):
-            raise InputError(f"{ast.unparse(function)}() is not called")
+            raise InputError(f"calls of {ast.unparse(function)}() are not evaluated")
         case ast.UnaryOp(ast.USub(), operand):
             return -_value(operand, names)
         case ast.BinOp(left, sign, right) if type(sign) in ARITHMETIC:
             first = _value(left, names)
             second = _value(right, names)
             are_numbers = isinstance(first, (int, float)) and isinstance(second, (int, float))
-            # a repeated text or list may exceed the memory
             if isinstance(sign, ast.Mult) and not are_numbers:
-                raise InputError("only numbers are multiplied")
+                # A repeated string or list may exceed the memory.
+                raise InputError("only numbers can be multiplied")
             result = ARITHMETIC[type(sign)](first, second)
             if isinstance(result, (int, float)) and not abs(result) <= _LARGEST:
-                raise InputError(f"no setting is beyond {_LARGEST:g}")
+                raise InputError(f"the result is larger than {_LARGEST:g}, the limit of numbers")
             return result
-    raise InputError(f"{ast.unparse(node)!r} is more than a value")
+    raise InputError(f"expressions such as {ast.unparse(node)!r} are not evaluated")
 
 
 def _mapping(pairs: Iterable[Any], names: _Names) -> dict[Any, Any]:

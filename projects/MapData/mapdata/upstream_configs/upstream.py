@@ -152,7 +152,7 @@ def convert_upstream(names: dict[str, Any]) -> Conversion:
         values = fields.section(section)
         if values.get(weight) == 0:
             values.clear()
-    for section in {**IGNORED_NAMES, **FIXED_VALUES}:
+    for section in {**IGNORED_NAMES, **FIXED_VALUES}:  # sections of either mapping
         fixed_values = FIXED_VALUES.get(section, {})
         fields.drop(section, names=IGNORED_NAMES.get(section, ""), **fixed_values)
     has_depth = settings.pop("with_depth")

@@ -35,7 +35,7 @@ _SHIFTS_M = (0.02, 0.05, 0.1, 0.2, 0.4)
 _VISIBILITY_M = (200.0, 100.0, 60.0, 40.0, 25.0)  # limit of visibility in fog
 _RAIN_DENSITIES = (0.001, 0.002, 0.0035, 0.0055, 0.008)  # share of pixels with a streak of rain
 _EXPOSURES = (0.6, 0.4, 0.25, 0.15, 0.08)  # at night, relative to day
-_NIGHT_NOISE = 12.0  # standard deviation in grey levels without any light
+_NIGHT_NOISE = 12.0  # standard deviation in grey levels at an exposure of 0
 _BLUR_LENGTHS = (0.01, 0.02, 0.03, 0.045, 0.06)  # relative to the width of the image
 _JPEG_QUALITIES = (25, 18, 15, 10, 7)  # as in ImageNet-C
 _FOG_GREY = 200.0  # grey level of fog
@@ -69,7 +69,7 @@ def lose_cameras(results: dict[str, Any], views: NDArray[np.integer[Any]]) -> No
 
 
 def _set_extrinsics(results: dict[str, Any], view: int, lidar2cam: NDArray[np.float64]) -> None:
-    """Set the extrinsics of a view and update its projection. (4, 4)"""
+    """Set the extrinsics (4, 4) of a view, and update its projection from metres to pixels."""
     lidar2img = results["img_aug_matrix"][view] @ results["cam2img"][view] @ lidar2cam
     results["lidar2cam"][view] = lidar2cam
     results["lidar2img"][view] = lidar2img

@@ -36,7 +36,7 @@ from gsmap.utils.errors import InputError
 
 PIXEL_M = 0.15
 _FAR_PX = 2.0**20  # farther points are pulled in, so that they fit the integers of the drawing
-_NO_PIXEL = 1e6  # distance in pixels in a column without a pixel of the line, beyond any canvas
+_NO_PIXEL = 1e6  # distance where a column has no pixel of the line: larger than any canvas
 MaskArray = npt.NDArray[np.int32]
 GapArray = npt.NDArray[np.float32]
 
@@ -385,6 +385,7 @@ def sample_aps(detections: ClassDetections) -> FloatArray:
     num_preds = np.bincount(samples, minlength=num_samples)
     aps = np.full((num_samples, len(detections.thresholds)), fill_value=np.nan)
     aps[num_preds + num_gts > 0] = 0.0
+    # After `order` below, the predictions of sample s are entries starts[s] to ends[s] - 1.
     ends = np.cumsum(num_preds)
     starts = ends - num_preds
     for t, hits in enumerate(detections.hits.T):
@@ -427,8 +428,10 @@ def sample_ap_reports(matches: MatchTable, config: SampleAP) -> list[MetricRepor
             class_means = [_mean(values) for values in class_aps.T]
             for key, value in distance_figures(ranked, class_means).items():
                 metrics[f"{class_name}/{key}"] = value
+            # Whether the AP of a sample is defined does not depend on the threshold.
             num_samples = (~np.isnan(class_aps[:, 0])).sum()
             metrics[f"{class_name}/num_samples"] = float(num_samples)
+            # Reports mark an undefined AP by UNDEFINED, and `_mean` leaves out NaN.
             means[row] = np.where(np.equal(class_means, UNDEFINED), np.nan, class_means)
             detections[class_name] = ranked
             aps[class_name] = class_aps

@@ -157,7 +157,7 @@ def class_weights(weight: WeightConfig, labels: Tensor) -> Tensor:
     Returns:
         The weights in float32. (M,), or () for one weight
     """
-    weights = constant(labels, weight, torch.float32)
+    weights = constant(labels, weight, torch.float32)  # on the device of labels: (), or (classes,)
     return weights[labels] if weights.ndim else weights
 
 

@@ -1,4 +1,7 @@
-"""Piecewise Bezier curves of a head's predictions, and their recovery of masks."""
+"""Points along predicted piecewise Bezier curves, and the loss of the masks around them.
+
+BeMapNet calls this loss the point-curve-region recovery loss.
+"""
 
 from collections.abc import Sequence
 
@@ -67,7 +70,7 @@ class Curve(nn.Module):
 
         Args:
             controls: Control points, unused ones at the end. (..., k * d + 1, 2)
-            pieces: Number of pieces of each curve less one. (...,)
+            pieces: Index into ``weights``: number of pieces of each curve less one. (...,)
 
         Returns:
             Points along the curves. (..., 100, 2)
@@ -94,7 +97,7 @@ def neighbourhood(points: Tensor, size: Sequence[int]) -> Tensor:
         Points in [0, 1]. (..., 2500, 2)
     """
     steps = torch.arange(-REACH_PX, REACH_PX + 1, device=points.device)
-    kernel = torch.cartesian_prod(steps / size[1], steps / size[0])  # (25, 2)
+    kernel = torch.cartesian_prod(steps / size[1], steps / size[0])  # offsets (x, y): (25, 2)
     return (points[..., None, :] - kernel).clamp(0, 1).flatten(-3, -2)
 
 

@@ -1,6 +1,7 @@
 """Mapping between the state keys of the released BeMapNet and of this project.
 
-The texts in `rules_of` are pairs ``released=here`` of the rest of the keys, or one name for both.
+`rules_of` takes the prefix of the released keys, the prefix of the keys here, and the rest of the
+keys as words: ``released=here``, or one name if the rest is equal on both sides.
 """
 
 from collections.abc import Sequence

@@ -41,19 +41,20 @@ class BEVSelfAttention(BEVDeformableAttention):
             num_points=num_points,
             query_dims=2 * embed_dims,
             dropout=dropout,
-            num_parts=2,
+            num_parts=2,  # entries of the queue
         )
 
     def weights(self, query: Tensor) -> Tensor:
         """Attention weights: a softmax per entry of the queue, averaged over the queue.
 
         Args:
-            query: Pairs of queries. (B, Q, 2 C)
+            query: Entries of both places of the queue, concatenated. (B, Q, 2 C)
 
         Returns:
             Weights that sum to 1 over S. (B, Q, heads, S)
         """
         logits = self.attention_weights(query).float()
+        # (B, Q, heads, 2, S / 2): the samples of each entry of the queue
         logits = logits.unflatten(-1, (self.num_heads, self.num_parts, -1))
         return logits.softmax(-1).flatten(-2) / self.num_parts
 
@@ -68,8 +69,9 @@ class BEVEncoderLayer(nn.Module):
         num_points: Samples of the self-attention, per head and entry of its queue.
         ffn_dims: Hidden channels of the feed-forward network.
         dropout: Probability to drop a value in training.
-        released_pairs: Pair sample b with the query of sample floor(b / 2), as the released code of
-            BEVFormer does. The result of a sample then depends on its batch.
+        released_pairs: The self-attention reads each sample's queries concatenated with themselves.
+            With this flag, the first half of sample b is taken from sample floor(b / 2), as in the
+            released code of BEVFormer. The result of a sample then depends on its batch.
     """
 
     def __init__(

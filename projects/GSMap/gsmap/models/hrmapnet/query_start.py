@@ -110,8 +110,8 @@ class PriorHook(FlowHook):
     def start(self, head: FlowHead, start: FlowStart) -> FlowStart:
         """Queries of the head, changed by the map, with references from the changed queries.
 
-        Differs from HRMapNet for heads whose queries have a positional half: this half attends, and
-        both halves change.
+        Differs from HRMapNet: where a head's queries have a state and a positional encoding, the
+        positional encoding attends to the map, and the result is added to both.
 
         Args:
             head: The head.
@@ -125,6 +125,7 @@ class PriorHook(FlowHook):
         change = self.queries(own_positions, self.keys)
         new_positions = own_positions + change
         new_states = states[:, :num] + change
+        # `head.reference` is the module that computes reference points from positional encodings.
         new_references = head.reference.start(new_positions)
         num_references = new_references.shape[1]
         queries = Queries(
@@ -135,7 +136,7 @@ class PriorHook(FlowHook):
         return start._replace(queries=queries)
 
     def outputs(self, head: Any, layers: list[Predictions]) -> list[Predictions]:
-        """Keep the predictions of the last layer on their way to the host.
+        """Start to copy the predictions of the last layer to the host, and keep the copies.
 
         Args:
             head: The head.

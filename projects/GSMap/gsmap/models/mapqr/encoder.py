@@ -44,8 +44,10 @@ class MovingPillars:
         self.img_shape = img_shape
         matrices = img_from_frame.float()
         with torch.autocast(feet.device.type, enabled=False):
-            self.feet = feet @ matrices.transpose(-1, -2)  # (B, V, Q, 4)
-        self.upwards = matrices[:, :, None, None, :, 2]  # per metre of height (B, V, 1, 1, 4)
+            # Homogeneous image points of the cell centres at z = 0. (B, V, Q, 4)
+            self.feet = feet @ matrices.transpose(-1, -2)
+        # Change of a homogeneous image point per metre of height. (B, V, 1, 1, 4)
+        self.upwards = matrices[:, :, None, None, :, 2]
 
     def move(self, offsets_m: Tensor, accumulate: bool) -> PillarProjection:
         """Add offsets to the heights and project the pillars.
@@ -58,7 +60,7 @@ class MovingPillars:
         self.heights = old_heights + at_least_float32(offsets_m) / self.extent_m
         heights_m = self.low_m + self.heights * self.extent_m
         z = heights_m[:, None, ..., None]  # (B, 1, Q, Z, 1)
-        projected = self.feet[:, :, :, None] + z * self.upwards
+        projected = self.feet[:, :, :, None] + z * self.upwards  # (B, V, Q, Z, 4)
         return visible_points(projected, self.img_shape)
 
 

@@ -8,7 +8,7 @@ from gsmap.models.base.pairs import MatchedPairs
 from gsmap.models.base.parts import WeightConfig
 from gsmap.structures.tensors import check_same_shape
 
-_EPS = 1e-12
+_EPS = 1e-12  # added to squared lengths, so that an edge of length 0 has no infinite gradient
 
 
 @MODELS.register_module()
@@ -17,7 +17,7 @@ class PointsLoss(MapLoss):
 
     Args:
         loss_weight: Weight of the loss (lambda_v).
-        flags: Flags of `MapLoss`.
+        flags: ``last_layer_only`` and ``first_group_only`` of `MapLoss`.
     """
 
     name = "pts"
@@ -40,7 +40,7 @@ class DirectionLoss(MapLoss):
 
     Args:
         loss_weight: Weight of the loss.
-        flags: Flags of `MapLoss`.
+        flags: ``last_layer_only`` and ``first_group_only`` of `MapLoss`.
     """
 
     name = "dir"

@@ -9,11 +9,12 @@ from gsmap.models.base.queries import head_setting
 
 @MODELS.register_module()
 class PointsOfInstances(nn.Linear):
-    """Linear layer that computes the embeddings of points from their instance's (MGMap).
+    """Linear layer that computes point embeddings from the embedding of their instance (MGMap).
 
     Args:
         num_points: Points per instance P.
-        embed_dims: Channels C of a query; an embedding has 2 C channels.
+        embed_dims: Channels C of a query. An embedding has 2 C channels, for the state and the
+            positional encoding of the query.
     """
 
     def __init__(self, num_points: int, embed_dims: int) -> None:

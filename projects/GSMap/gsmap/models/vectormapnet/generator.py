@@ -225,8 +225,8 @@ class PolylineGenerator(BaseModule):
         if tokens.shape[1] > 2 * self.position.num_embeddings + 1:
             raise InputError(
                 f"an annotated line has {tokens.shape[1] // 2} points, and num_positions of "
-                f"PolylineGenerator is {self.position.num_embeddings}: set it higher, or "
-                "tolerance_m of FormatPolylineTargets."
+                f"PolylineGenerator is {self.position.num_embeddings}: set a larger num_positions, "
+                "or a larger tolerance_m of FormatPolylineTargets."
             )
         if not len(tokens):  # a loss of 0 that gives every parameter a gradient of 0
             sums = [parameter.sum() for parameter in self.parameters()]

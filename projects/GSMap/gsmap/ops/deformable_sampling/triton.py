@@ -131,7 +131,8 @@ def forward_kernel(
             channel_offsets = pixel_offset[:, None] + channel[None, :]
             mask = inside[:, None] & is_channel[None, :]
             pixel = tl.load(value + channel_offsets, mask=mask, other=0.0).to(tl.float32)
-            # A product instead of tl.where keeps a NaN weight outside of the map.
+            # The product passes on a NaN weight of a cell outside of the map, which tl.where would
+            # drop.
             total += pixel * (corner_weight * inside.to(tl.float32))[:, None]
     out_pointers = out + row[:, None] * C + channel[None, :]
     tl.store(out_pointers, total, mask=valid[:, None] & is_channel[None, :])
@@ -221,6 +222,7 @@ def backward_kernel(
 def _plan_launch(value, weights):
     """Number of rows, sizes that are constants of the compiled kernel, and grid of the programs."""
     channels = value.shape[3]
+    # At least 16, so that a program has at most BLOCK / 16 = 32 rows.
     padded_channels = max(16, triton.next_power_of_2(channels))
     rows_per_program = max(1, BLOCK // padded_channels)
     rows = weights.shape[:3].numel()

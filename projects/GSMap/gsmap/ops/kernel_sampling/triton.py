@@ -1,10 +1,11 @@
 # Functions of Triton have no types, since Triton infers them.
 # mypy: disable-error-code="no-untyped-def"
-"""Triton kernels: fixed kernels around projected points, forward and backward in one launch each.
+"""Triton kernels: weighted pixels at fixed offsets from projected points, forward and backward.
 
-A row is the output of one head of one BEV cell, with all channels of the head. A program computes
-several neighbouring rows and loops over the cameras. A camera to which none of its cells is visible
-is skipped by a scalar branch. Sums are float32 for every dtype of the maps.
+The forward and the backward pass are one launch each. A row is the output of one head of one BEV
+cell, with all channels of the head. A program computes several neighbouring rows and loops over the
+cameras. If a camera sees none of the program's cells, a scalar branch skips it. Sums are float32
+for every dtype of the maps.
 
 Multiplications and additions are not fused: coordinates then have the rounding errors of plain
 torch, and are rounded to the same pixel. The gradient of the maps is added by atomics in any order,
@@ -25,7 +26,11 @@ ROUNDING = tl.constexpr(12582912.0)
 
 @triton.jit
 def _nearest(position, size):
-    """Clamp coordinates in pixels to the map, and round them half to even. (ROWS,)"""
+    """Clamp coordinates in pixels to the map, and round them half to even. (ROWS,)
+
+    Without a shift by half a pixel, as in the released code of GKT: pixel 0 reaches from -0.5 to
+    0.5. With bilinear interpolation it reaches from 0 to 1, and its centre is 0.5.
+    """
     position = tl.minimum(tl.maximum(position, 0.0), size - 1.0)
     return ((position + ROUNDING) - ROUNDING).to(tl.int32)
 
@@ -141,7 +146,8 @@ def forward_kernel(
                         pixel = tl.load(value + channel_offsets, mask=mask, other=0.0).to(
                             tl.float32
                         )
-                        # A product instead of tl.where keeps a NaN weight outside of the map.
+                        # The product passes on a NaN weight of a pixel outside of the map;
+                        # tl.where would drop it.
                         total += pixel * (corner_weight * inside.to(tl.float32))[:, None]
                 else:
                     pixel_index = _nearest(at_y, height) * width + _nearest(at_x, width)
@@ -199,7 +205,7 @@ def backward_kernel(
         height: Rows h of a map.
         width: Columns w of a map.
         BILINEAR: Interpolate between pixels instead of rounding to one.
-        S: Number of pixels of a kernel.
+        S: Number of pixels of a kernel (offsets).
         SP: S rounded up to a power of two.
         C: Number of channels of a head.
         CP: C rounded up to a power of two.
@@ -286,6 +292,7 @@ def _plan_launch(value, weights):
     """Number of rows, sizes that are constants of the compiled kernel, and grid of the programs."""
     batch, queries, heads, samples = weights.shape
     channels = value.shape[4]
+    # At least 16, so that a program has at most BLOCK / 16 = 32 rows.
     padded_channels = max(16, triton.next_power_of_2(channels))
     rows_per_program = max(1, BLOCK // padded_channels)
     rows = batch * queries * heads

@@ -62,6 +62,7 @@ def pairwise_minima(preds, targets):
     """Sum the minima of each pair of flat float32 masks. (N, pixels), (K, pixels) -> (N, K)"""
     minima = torch.empty(len(preds), len(targets), dtype=torch.float32)
     starts, indices, values = list_pixels(targets.contiguous().numpy())
-    # A prediction is read at each listed pixel: their number decides about threads.
+    # The work for one prediction is the number of listed pixels. `run_in_threads` decides from this
+    # number whether threads are worth their start.
     run_in_threads(sum_minima, len(indices), preds, starts, indices, values, minima)
     return minima
