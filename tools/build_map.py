@@ -60,7 +60,7 @@ FORMATS = ("geojson", "osm", "rrd", "mcap", "mp4", "png", "svg")
 _LON_LAT = "_lonlat"  # the name of a map in degrees ends in this
 _SCORES = "scores.json"
 _CHANGES = "changes"  # name of the file of changes, without a suffix
-# Bytes that every output of this command contains. A file without them is of another program.
+# Bytes that every output of this command contains. A file without them belongs to another program.
 _MARK = b"gsmap"  # in maps
 _MARK_OF_SCORES = b'"merged"'  # in scores
 # Package and extra that a format needs.
@@ -86,13 +86,14 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         "--min-confidence",
         type=float,
         default=MergeConfig.min_confidence,
-        help="keep a place if this share of the frames that see it found it, weighted by score",
+        help="smallest confidence of a place in the map: share of the frames with the place in "
+        "view that detected it, weighted by score",
     )
     parser.add_argument(
         "--min-area-confidence",
         type=float,
         default=MergeConfig.min_area_confidence,
-        help="the same for areas, such as crossings",
+        help="smallest confidence of areas, such as crossings",
     )
     parser.add_argument(
         "--no-gaussians",
@@ -120,10 +121,13 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--allow-other-split",
         action="store_true",
-        help="score maps of a model that was trained on another split, whose places it may share",
+        help="score maps even if the model was trained on another split, which may contain places "
+        "of this one",
     )
     parser.add_argument(
-        "--data-root", type=Path, help="folder of the images for rrd, mcap and mp4: that of --ann"
+        "--data-root",
+        type=Path,
+        help="folder of the images for rrd, mcap and mp4 (default: the folder of --ann)",
     )
     add_map_options(parser)
     args = parser.parse_args(argv)
@@ -139,7 +143,7 @@ def add_map_options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="OLD",
         help="write what was removed, added and moved since this map of the place (GeoJSON, "
-        "Lanelet2); each drive is a pass",
+        "Lanelet2); each drive counts as one pass of the place",
     )
     group.add_argument(
         "--prior", type=output_file, metavar="OUT", help="write the maps as a MapPrior to this file"
@@ -290,7 +294,7 @@ def find_origin(
     Args:
         args: The options of the command; ``--crs`` and ``--origin`` come first.
         ann: The samples.
-        map_name: Name of their map, which has a known origin in nuScenes and Argoverse 2.
+        map_name: Name of the map of the samples. Its origin is known in nuScenes and Argoverse 2.
     """
     if args.crs:
         return MapGrid(args.crs)
@@ -431,7 +435,7 @@ def place_of(ann: AnnotationFile, scenes: Iterable[str]) -> str:
     if len(places) != 1:
         raise InputError(
             f"an earlier map or a prior is of one place, and the drives lie in {sorted(places)}: "
-            "choose the drives of one with --scene."
+            "choose the drives of one place with --scene."
         )
     return places.pop()
 
@@ -538,7 +542,9 @@ def write_gaussian_prior(
     drive = passes[0].drive
     prior = GaussianPrior(PriorSettings(drive.classes, place))
     extent = BEVGrid(drive.x_range, drive.y_range, height=1, width=1)  # only its range is used
-    samples = [frame.sample for one_pass in passes for frame in one_pass.drive.frames]
+    samples = []
+    for one_pass in passes:
+        samples += [frame.sample for frame in one_pass.drive.frames]
     samples.sort(key=lambda sample: sample.timestamp_ns)
     for sample in samples:
         elements = results[sample.token].with_coordinates(2)
@@ -627,7 +633,10 @@ def merge_drives(
     if args.out:
         own_names = [names[name] for name in groups]
         if args.changes and _CHANGES in own_names:
-            raise InputError(f"drive {_CHANGES!r} has the name of the file of --changes.")
+            raise InputError(
+                f"drive {_CHANGES!r} has the name of the file that --changes writes: leave "
+                "--changes out, or choose other drives with --scene."
+            )
         require_own_files(args, names=own_names, scored=has_truth(ann))
     passes = []
     processor_s = 0.0

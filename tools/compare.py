@@ -1,9 +1,9 @@
 #!/usr/bin/env python
 r"""Train and test several configs on the same data, seeds and budget, and write a table.
 
-``CONFIG`` is a file, the name of a model, or ``NAME=CONFIG[,KEY=VALUE...]``. Give a stopped command
-again to continue it; finished runs are not repeated. ``--list`` prints every row of the papers'
-tables (``gsmap/models/<method>/paper.json``) with the command that trains it.
+``CONFIG`` is a file, the name of a model, or ``NAME=CONFIG[,KEY=VALUE...]``. Repeat a stopped
+command to continue it; finished runs are not trained again. ``--list`` prints every row of the
+papers' tables (``gsmap/models/<method>/paper.json``) with the command that trains it.
 
 Examples:
     python tools/compare.py maptr_r18_minicity gsmap_r18_minicity --seeds 3 --budget 6400 --out s
@@ -59,7 +59,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--batch", type=int, default=4, help="samples per iteration")
     parser.add_argument("--out", type=Path, metavar="DIR", help="work folders, tables and plots")
     parser.add_argument(
-        "--init", metavar="CHECKPOINT", help="common start of all runs: file or name"
+        "--init", metavar="CHECKPOINT", help="checkpoint that all runs start from: file or name"
     )
     parser.add_argument(
         "--runs", nargs="+", default=[], metavar="NAME=DIR", help="work folders of finished runs"
@@ -242,14 +242,15 @@ def main() -> str:
         return slurm_commands(runs, args.slurm)
     chosen = [run for run in runs if args.only in (None, run.label)]  # all without --only
     if args.only and not chosen:
-        raise InputError(f"no run is {args.only}; there are {[run.label for run in runs]}.")
+        labels = [run.label for run in runs]
+        raise InputError(f"no run has the name {args.only}; there are {labels}.")
     if not args.rescore:
         train(chosen)
     tables = "" if args.only else tabulate(runs, args)
     failed = [run.label for run in chosen if not run.is_done]
     if failed:
         sys.stdout.write(f"{tables}\n")
-        raise WorkError(f"{', '.join(failed)} did not end: the table says why.")
+        raise WorkError(f"{', '.join(failed)} did not end: the table names the reason.")
     return tables
 
 

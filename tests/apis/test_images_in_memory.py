@@ -164,7 +164,7 @@ def test_an_absent_camera_in_memory_is_an_error_or_blank(inferencer, tmp_path):
         (1, np.eye(4), ValueError, r"CAM_BACK: intrinsics must be numbers of shape \(3, 3\)"),
         (1, np.zeros((3, 3)), ValueError, "intrinsics must be finite, with focal lengths > 0"),
         (2, np.ones((4, 4)), ValueError, "cam_from_frame is no rigid transform"),
-        (2, None, ValueError, r"cam_from_frame must have the cameras of images, \['CAM_FRONT', "),
+        (2, None, ValueError, r"cam_from_frame must have the cameras of the images"),
     ],
 )
 def test_wrong_arrays_are_refused(inferencer, tmp_path, which, value, error, text):

@@ -75,7 +75,7 @@ def _records(path: Path) -> list[dict[str, float]]:
         try:
             record = json.loads(line)
             if not isinstance(record, dict):
-                raise InputError("it is no object")
+                raise InputError("it is not a JSON object")
             scalars = {}
             for key, value in record.items():
                 if isinstance(value, int | float):
@@ -138,7 +138,7 @@ def smooth(values: np.ndarray) -> np.ndarray:
 
 
 def _draw_training(ax: Axes, runs: Sequence[RunLog], key: str, title: str) -> None:
-    """Draw a scalar of training, faintly with all its values and smoothed, one colour per run."""
+    """Draw a scalar of training for each run: all values faintly, and a smoothed curve."""
     for run, colour in zip(runs, RUN_COLOURS * len(runs), strict=False):
         steps, values = run.series(key)
         ax.plot(steps, values, color=colour, alpha=0.25, linewidth=0.8)

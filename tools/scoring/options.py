@@ -126,8 +126,8 @@ def add_rules(parser: argparse.ArgumentParser) -> None:
         nargs=4,
         type=float,
         metavar=("X0", "Y0", "X1", "Y1"),
-        help="canvas of AP_raster in metres: the annotation file's, or nuScenes' -15 -30 15 30; "
-        "Argoverse 2: -30 -15 30 15",
+        help="canvas of AP_raster in metres (default: the range of the annotation file, or "
+        "nuScenes' -15 -30 15 30; Argoverse 2 has -30 -15 30 15)",
     )
     group.add_argument(
         "--gt-points",

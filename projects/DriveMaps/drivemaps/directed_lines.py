@@ -6,7 +6,7 @@ import shapely
 from gsmap.structures.elements import FloatArray
 
 STEP_M = 2.0
-"""Largest distance in metres of the points at which directions and distances are measured."""
+"""Largest distance in metres between the points at which directions and distances are measured."""
 
 
 def rotate_to_left(directions: FloatArray) -> FloatArray:

@@ -79,7 +79,7 @@ class MapOrigin:
 
         Args:
             lon_lat: Longitude and latitude in degrees. (n, 2)
-            where: Name of their file, for the message.
+            where: Name of the file, for the message.
 
         Returns:
             Points in metres. (n, 2)
@@ -137,7 +137,7 @@ class MapGrid:
 
         Args:
             positions: Positions of the vehicle in the global frame. (n, >= 2)
-            where: Name of their file, for the message.
+            where: Name of the file, for the message.
 
         Raises:
             ValueError: If all coordinates are within 100 km and a position is outside of the area,
@@ -188,7 +188,7 @@ class MapGrid:
 
         Args:
             lon_lat: Longitude and latitude in degrees. (n, 2)
-            where: Name of their file, for the message.
+            where: Name of the file, for the message.
 
         Returns:
             Points in metres. (n, 2)
@@ -222,7 +222,7 @@ def require_near(positions: FloatArray, where: str) -> None:
 
     Args:
         positions: Positions of the vehicle in metres in the global frame. (n, >= 2)
-        where: Name of their file, for the message.
+        where: Name of the file, for the message.
 
     Raises:
         ValueError: If a coordinate is larger than 100 km.

@@ -31,7 +31,7 @@ HALF_WIDTH_M = 1.75
 _MOST_HALF_WIDTH_M = 3.0  # a border farther away belongs to another lane
 _MIN_HALF_WIDTH_M = 0.5
 _JOIN_M = 1.0  # ends within this distance are one node of the lane graph
-_SHORTEST_M = 2.0  # a lane is split only at points farther apart, and farther from its ends
+_SHORTEST_M = 2.0  # lanes are not split closer than this to an end or to another split
 _MIN_SUCCESSOR_COSINE = 0.5  # smallest cosine between the directions of successive lanes
 _MIN_PARALLEL_COSINE = 0.7  # smallest |cosine| between a line and a piece that runs along it
 

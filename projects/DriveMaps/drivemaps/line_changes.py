@@ -107,8 +107,8 @@ def line_changes(
 ) -> list[Change]:
     """Find the changes of the lines of one class.
 
-    Lines of low confidence are no changes themselves, but they show that a line is not new or not
-    gone.
+    A line of low confidence is not reported as a change. It only shows that a line at its place is
+    not new, or has not been removed.
 
     Args:
         old: Old map in the global frame.
@@ -140,6 +140,7 @@ def line_changes(
             continue
         num_without = float((views - support)[part].mean())  # a match counts by its score
         old_score = float(lines.scores[part].mean())
+        # `smooth_share` is the share of the frames, lowered where few frames have the part in view.
         change = Change(
             REMOVED,
             label,
@@ -164,8 +165,8 @@ def line_changes(
 class _Moves:
     """Distances of new lines from the vertices of old ones, in metres; positive on the left.
 
-    The map of a pass is more accurate than its frames, so it gives the positions. The frames give
-    the error.
+    The positions come from the maps of the passes, which are more accurate than single frames. The
+    errors come from the frames.
 
     Args:
         maps: Old lines as the first ones, and the lines of the maps of the passes.

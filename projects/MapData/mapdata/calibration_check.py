@@ -20,7 +20,7 @@ from gsmap.visualization.figure import compose_figure
 from gsmap.visualization.style import MapStyle
 
 _REACH_M = 30.0  # length of the ground lines ahead of and behind the vehicle
-_SIDE_REACH_M = 15.0  # length of the ground lines to its left and right
+_SIDE_REACH_M = 15.0  # length of the ground lines to the left and right of the vehicle
 _WEDGE_M = 6.0  # length of a field of view in the panel from above
 _WIDTH_PX = 3200  # six cameras of about 750 px, large enough to see an error of a few centimetres
 # Classes of the drawn lines; "cameras" are the fields of view. The order decides the colours.
@@ -28,7 +28,7 @@ _LINE_CLASSES = ("ahead", "left", "every_5_m", "behind", "right", "cameras")
 
 
 def image_warnings(sample: MapSample, data_root: Path) -> list[str]:
-    """Warnings about images of a sample whose size differs from their calibration.
+    """Warnings about images whose size differs from the size in the calibration of the camera.
 
     Args:
         sample: The sample.

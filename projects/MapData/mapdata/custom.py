@@ -208,7 +208,7 @@ def join_lines(instances: Sequence[MapInstance]) -> list[MapInstance]:
 
 
 def _snap_ends(lines: Sequence[Points]) -> None:
-    """Move ends of lines that meet to one place. The lines are changed. each (n, dim)"""
+    """Give equal coordinates to ends of lines that meet, in place. each (n, dim)"""
     places: list[np.ndarray] = []
     for line in lines:
         for end in (0, -1):  # first and last vertex
@@ -221,7 +221,7 @@ def _snap_ends(lines: Sequence[Points]) -> None:
 
 
 def _nearby_place(places: Sequence[np.ndarray], point: np.ndarray) -> np.ndarray | None:
-    """First place that meets a point in the plane. (dim,)"""
+    """First place near a point in the plane; None if there is none. (dim,)"""
     for place in places:
         if np.linalg.norm(place[:2] - point[:2]) <= _SAME_PLACE_M:
             return place

@@ -30,6 +30,7 @@ def foxglove_parser(name: str, descriptors: bytes) -> Callable[[bytes], Any]:
 def _header(message: Any) -> Any:
     """Header of ROS with the time and the frame of a message of Foxglove."""
     stamp = SimpleNamespace(sec=message.timestamp.seconds, nanosec=message.timestamp.nanos)
+    # Transforms have a parent frame instead of a frame.
     return SimpleNamespace(stamp=stamp, frame_id=getattr(message, "frame_id", ""))
 
 

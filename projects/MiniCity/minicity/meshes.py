@@ -34,7 +34,7 @@ class Mesh:
         colors: Colour of each quad in full light, BGR in [0, 255].
         groups: Index of the object of each quad.
         layers: Drawing order of each quad inside its object; higher layers cover lower ones.
-        glow: Whether each quad shines without light on it.
+        glow: Whether each quad is bright without light from outside, like a lit window.
         discs: (x, y, z, radius) of each disc; discs always face the camera.
         disc_colors: Colour of each disc in full light, BGR in [0, 255].
         disc_groups: Index of the object of each disc.
@@ -136,7 +136,7 @@ class FrozenMesh:
 
 
 def merge(first: FrozenMesh, second: FrozenMesh) -> FrozenMesh:
-    """Concatenate two meshes. Objects of the second mesh are numbered on after the first mesh."""
+    """Concatenate two meshes. The numbers of the second mesh's objects follow the first mesh's."""
     shift = len(first.anchors)
     return FrozenMesh(
         quads=np.concatenate([first.quads, second.quads]),
@@ -256,10 +256,10 @@ def add_tree(mesh: Mesh, tree: Array, ground_z_m: float = 0.0) -> None:
     mesh.begin(np.array([x, y, ground_z_m]))
     trunk = rectangle(np.array([x, y]), 0.0, length_m=TRUNK_M, width_m=TRUNK_M)
     trunk_top = ground_z_m + 0.5 * height
-    for side in prism_faces(trunk, low_m=ground_z_m, high_m=trunk_top)[:4]:
+    for side in prism_faces(trunk, low_m=ground_z_m, high_m=trunk_top)[:4]:  # without the top
         mesh.add_quad(side, BARK)
     radius = 0.24 * height
-    shade = 0.8 + 0.05 * (int(x * 10) % 7)  # differs from tree to tree by its position
+    shade = 0.8 + 0.05 * (int(x * 10) % 7)  # from the position, so that neighbours differ
     for dx, dy, dz, tone in CROWN:
         above = 0.68 * height + radius * dz
         spot = np.array([x + radius * dx, y + radius * dy, ground_z_m + above])
@@ -279,7 +279,7 @@ def add_pole(mesh: Mesh, pole: Array, ground_z_m: float = 0.0) -> None:
     mesh.begin(np.array([x, y, ground_z_m]))
     top = ground_z_m + height
     shaft = rectangle(foot, 0.0, length_m=POLE_M, width_m=POLE_M)
-    for side in prism_faces(shaft, low_m=ground_z_m, high_m=top)[:4]:
+    for side in prism_faces(shaft, low_m=ground_z_m, high_m=top)[:4]:  # without the top
         mesh.add_quad(side, (92, 94, 96))
     lamp = rectangle(foot, 0.0, length_m=4 * POLE_M, width_m=4 * POLE_M)
     for face in prism_faces(lamp, low_m=top - 0.3, high_m=top):

@@ -216,7 +216,7 @@ class FastFrames:
         with (
             self._lock,
             torch.no_grad(),
-            matrix_products(self.frame.model.half_backbone is not None),
+            matrix_products(in_tf32=self.frame.model.half_backbone is not None),
         ):
             batch_elements = self._run(inputs)
         predictions: list[Det3DDataSample] = []
@@ -257,8 +257,9 @@ class FastFrames:
             for buffer, value in zip(recording.inputs, inputs, strict=True):
                 buffer.copy_(value, non_blocking=True)
             recording.graph.replay()
-            # While the GPU computes, the weights are compared with those of the recording. If they
-            # have changed, this result is dropped, and the loop records the frame again.
+            # While the GPU computes, the versions of the weights are compared with the versions at
+            # the recording. If a weight has changed, this result is dropped, and the loop records
+            # the frame again.
             if tensor_versions(self.frame.model) == recording.versions:
                 self._graphs.move_to_end(key)
                 return recording.output.cpu()
@@ -287,8 +288,8 @@ class FastFrames:
                     output = self.frame(*buffers)
             except RuntimeError as error:
                 raise WorkError(
-                    f"a frame could not be captured as a CUDA graph ({error!s:.300}): run it "
-                    f"without ({SWITCH}=False, --no-{SWITCH.replace('_', '-')})."
+                    f"a frame could not be captured as a CUDA graph ({error!s:.300}): run the "
+                    f"model without CUDA graphs ({SWITCH}=False, --no-{SWITCH.replace('_', '-')})."
                 ) from error
         versions = tensor_versions(self.frame.model)
         self._graphs[key] = _Recording(

@@ -72,7 +72,9 @@ def select_samples(
         indices = []
         for token in wanted:
             if token not in index_by_token:
-                raise InputError(f"No sample has the token {token!r}; there are {len(tokens)}.")
+                raise InputError(
+                    f"No sample has the token {token!r}; there are {len(tokens)} samples."
+                )
             indices.append(index_by_token[token])
     return [indices[i] for i in spread_evenly(len(indices), max_num=max_num)]
 
@@ -179,7 +181,9 @@ class MapInferencer:
             model.halve_backbone()
         reason = reason_against(model)
         if cuda_graphs and reason:
-            raise InputError(f"cuda_graphs=True does not serve this model: {reason}. Leave it out.")
+            raise InputError(
+                f"cuda_graphs=True cannot be used with this model: {reason}. Leave it out."
+            )
         capture = CAPTURE_BY_DEFAULT if cuda_graphs is None else cuda_graphs
         if reason or not capture:
             return None
@@ -272,7 +276,7 @@ class MapInferencer:
         """Read the LiDAR points of a sample.
 
         Args:
-            dataset: From ``dataset``.
+            dataset: Data set that the method ``dataset`` has created.
             index: Index of the sample.
 
         Returns:
@@ -312,7 +316,7 @@ class MapInferencer:
         """Predict samples of a data set. Several devices take batches in turn.
 
         Args:
-            dataset: From ``dataset``.
+            dataset: Data set that the method ``dataset`` has created.
             indices: Indices of the samples; None predicts all.
             batch_size: Samples per forward pass.
             num_workers: Number of processes that read images.
@@ -349,6 +353,7 @@ class MapInferencer:
             subset, batch_size=batch_size, num_workers=num_workers, collate_fn=collate
         )
         with ExitStack() as stack:
+            # One thread for each replica.
             pools = [stack.enter_context(ThreadPoolExecutor(1)) for _ in self.replicas]
             pending: deque[Future] = deque()
             for number, (batch, broken) in enumerate(batches):
@@ -426,7 +431,7 @@ class MapInferencer:
         with (
             memory,
             prior,
-            matrix_products(model.half_backbone is not None),
+            matrix_products(in_tf32=model.half_backbone is not None),
             torch.autocast(device_type, enabled=in_bfloat16),
         ):
             return [sample.cpu() for sample in model.test_step(batch)]

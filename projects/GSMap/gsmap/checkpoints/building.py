@@ -80,7 +80,7 @@ def reading_config(source: object) -> Iterator[None]:
 
 @contextmanager
 def building(cfg: Config, kind: type | None = None) -> Iterator[None]:
-    """Add the names of the config and of its parts to errors that are raised in building them.
+    """Add the names of the config and of its parts to errors that are raised while they are built.
 
     The parts under construction are read from the traceback. This covers nested parts, and parts
     that mmengine or mmdet3d build.

@@ -101,7 +101,7 @@ def _require_cameras(argument: str, values: Mapping[str, np.ndarray], names: lis
     """Raise an error unless an argument has a value for each camera of the images."""
     if set(values) != set(names) or not names:
         raise InputError(
-            f"{argument} must have the cameras of images, {names}, got {list(values)}."
+            f"{argument} must have the cameras of the images, {names}, got {list(values)}."
         )
 
 

@@ -38,7 +38,7 @@ def add_config_options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="DIR",
         action=_OptionAction,
-        help="folder of the data set: its annotation files, whose paths are relative to it",
+        help="folder with the annotation files of the data set; paths in them are relative to it",
     )
     parser.add_argument(
         "--image-scale",

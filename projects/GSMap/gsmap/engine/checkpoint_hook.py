@@ -248,7 +248,7 @@ class AtomicCheckpointHook(CheckpointHook):
                 means = [metric for metric in metrics if metric.endswith("/mAP")]
                 raise InputError(
                     f"default_hooks.checkpoint.save_best names {name!r}, which the validation does "
-                    f"not measure; it has {', '.join(means)}."
+                    f"not measure; it measures {', '.join(means)}."
                 )
         super().after_val_epoch(runner, metrics=metrics)
         if runner.rank == 0:

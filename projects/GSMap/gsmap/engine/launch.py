@@ -135,8 +135,8 @@ def _fit_loaders(cfg: Config) -> None:
                 step.on_device = True
             elif step.type == "MultiViewWrapper":
                 raise InputError(
-                    f"{cfg.filename}: images_on_device does not go with {step.type}, which reads "
-                    "pixels on the host: take DistortImages in its place, or leave out "
+                    f"{cfg.filename}: images_on_device cannot be used with {step.type}, which "
+                    "reads pixels on the host: take DistortImages in its place, or leave out "
                     "images_on_device."
                 )
 
@@ -375,7 +375,7 @@ def _find_copies(settings: Any, key: str, value: Any, prefix: str) -> Iterator[s
 
 
 def _check_keys(cfg: Config) -> None:
-    """Refuse unknown top-level keys, and sections that are not dictionaries or lists of them."""
+    """Refuse unknown top-level keys, and sections of the wrong type."""
     for key, value in cfg.items():
         is_known = key in _known_keys()
         is_section = is_known and key.endswith(_SECTIONS)
@@ -414,10 +414,9 @@ def _check_streams(cfg: Config) -> None:
         class_names = {base.__name__ for base in sampler_class.__mro__}
         if loader and needed_sampler not in class_names:
             raise InputError(
-                f"{cfg.filename}: {part}_dataloader.sampler is {kind!r}, which tears scenes apart "
-                "(several ranks take turns with their frames), so model.temporal would remember "
-                f"other frames than the last: set its type to '{needed_sampler}', or "
-                "model.temporal=None."
+                f"{cfg.filename}: {part}_dataloader.sampler is {kind!r}, which may give the frames "
+                "of a scene to several ranks, so model.temporal would not remember the previous "
+                f"frame: set the sampler's type to '{needed_sampler}', or model.temporal=None."
             )
         slots = sampler.get("slots")
         batch_size = loader.get("batch_size")

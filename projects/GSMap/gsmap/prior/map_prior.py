@@ -32,10 +32,11 @@ _MOST_CELLS = 1 << 24  # largest number of cells in the rectangle around the vie
 class MapPrior:
     """Raster of the map at places that a vehicle has passed, with one channel per class.
 
-    Tiles are created when a frame is written to them. Those that are not in use leave memory. All
-    methods may be called from several threads. `read` and `write` take the nearest cell: a cell of
-    the prior has the index floor(x / cell_m) along each axis of the global frame. Only the position
-    and the yaw of a pose are used, as in `MapElements.to_frame`.
+    A tile is created when a frame is written to it. Beyond ``memory_bytes``, least recently used
+    tiles are moved from memory to a temporary file. All methods may be called from several threads.
+    `read` and `write` take the nearest cell: a cell of the prior has the index floor(x / cell_m)
+    along each axis of the global frame. Only the position and the yaw of a pose are used, as in
+    `MapElements.to_frame`.
 
     Args:
         settings: Classes, place and cells.
@@ -127,8 +128,7 @@ class MapPrior:
                         rule=self.rule,
                         tiles=self._tiles.packed_tiles(),
                     )
-                # From here on, tiles that leave memory are read from the new file. A device or a
-                # pipe cannot be read again.
+                # From here on, tiles are read from the new file. A device or a pipe cannot be read.
                 if path.is_file():
                     mapped = _map_file(path)
                     _, _, places = read_header(mapped, path)
@@ -267,7 +267,7 @@ class MapPrior:
                     tile[:, channel, mask] = updated[:, 0]
 
     def _window(self, pose: Pose, grid: BEVGrid) -> "_Window":
-        """Place the cells of a frame in the rectangle around them, in cells of the prior."""
+        """Find the rectangle of the prior's cells around a frame, and the frame's cells in it."""
         frame = planar_pose(pose)
         cos = frame.cos
         sin = frame.sin
@@ -400,7 +400,7 @@ def _cuts(first: int, length: int, side: int) -> list[tuple[int, slice, slice]]:
 def _largest_per_cell(
     cells: NDArray[np.int64], values: NDArray[np.float32], size: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Combine cells of a frame that lie in one cell of the prior by their largest values.
+    """Largest value of the frame's cells that lie in each cell of the prior.
 
     Args:
         cells: Cell of the prior in which each cell of the frame lies, as an index into the window,
@@ -409,7 +409,8 @@ def _largest_per_cell(
         size: Number of cells of the window.
 
     Returns:
-        Different cells in rising order (m,), and their largest values (C, m).
+        Cells of the prior in which a cell of the frame lies, ascending (m,), and the largest value
+        in each (C, m).
     """
     is_touched = np.zeros(size, dtype=np.bool_)
     is_touched[cells] = True

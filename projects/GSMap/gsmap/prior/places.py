@@ -214,7 +214,7 @@ class GivenMaps(PlaceMaps):
         if place.name not in self._priors:
             raise InputError(
                 f"sample {place.token!r} is in {place.name or 'an unknown place'!r}, and the "
-                f"priors are of {sorted(self._priors)}: give the prior of its place, too."
+                f"priors are of {sorted(self._priors)}: give the prior of this place, too."
             )
         return self._priors[place.name]
 

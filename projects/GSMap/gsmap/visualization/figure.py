@@ -107,8 +107,9 @@ def _layout(
         Boxes of the cameras, boxes of the panels, and the lower edge of all in px.
     """
     if num_panels == 1 and len(rows) > 1:
-        # The rows of cameras have the height slope * width + offset, and the panel has the width
-        # aspect * height. At one width of the cameras, both heights are equal.
+        # Cameras of total width w have rows of total height slope * w + offset. The panel and its
+        # frame have this height, so the panel has the width
+        # aspect * (slope * w + offset - frame_height). Both widths and the labels fill the figure.
         slope = sum(1 / sum(row) for row in rows)
         offset = _GAP * (len(rows) - 1) - sum(_GAP * (len(row) - 1) / sum(row) for row in rows)
         frame_height = _TITLE + _TICKS  # above and below the panel
@@ -178,6 +179,7 @@ def _draw_header(figure: Figure, title: str, lines: Sequence[Line2D], style: Map
     if len(title) > _LONGEST_TITLE:
         title = title[: _LONGEST_TITLE - 1] + "\N{HORIZONTAL ELLIPSIS}"
     figure.text(margin, 1 - 0.3 * _HEADER / height, title, size=9, color=style.ink, va="center")
+    # A handle and the gap after an entry take about as much space as five letters.
     num_letters = sum(len(str(line.get_label())) + 5 for line in lines)
     figure.legend(
         handles=lines,

@@ -64,7 +64,10 @@ def read_boxes(folder: Path, tokens: Collection[str]) -> dict[str, Boxes]:
             poses[token].append(pose_of(record))
             halves_m[token].append(np.array([length, width, height]) / 2)
     if not any(poses.values()):
-        raise InputError(f"{folder} has no box of these samples: give the tables of their data.")
+        raise InputError(
+            f"{folder} has no box of these samples: give the tables from which the annotation file "
+            "was made."
+        )
     boxes = {}
     for token in poses:
         global_from_box = np.array(poses[token]).reshape(-1, 4, 4)

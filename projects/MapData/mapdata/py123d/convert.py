@@ -103,9 +103,11 @@ def convert_py123d(options: Py123dOptions) -> ConversionSummary:
     path = options.shard.path_of(target)
     for sample in AnnotationFile(path):
         summary.add_sample(options.split, sample)
-    tables = sorted({table for log in own_logs for table in log.unused_tables})
+    tables: set[str] = set()
+    for log in own_logs:
+        tables.update(log.unused_tables)
     if tables:
-        names = ", ".join(tables)
+        names = ", ".join(sorted(tables))
         summary.notes.append(f"only cameras, poses and maps are read, but not the tables {names}")
     summary.notes.append(f"written to {path}")
     return summary
@@ -126,7 +128,7 @@ def _find_logs(options: Py123dOptions) -> list[Path]:
         # The table of a log is at logs/SPLIT/LOG/sync.arrow.
         splits = sorted({path.parts[-3] for path in options.root.glob(f"logs/*/*/{SYNC}")})
         known = f"; there are {', '.join(splits)}" if splits else ""
-        raise FileNotFoundError(f"no log of py123d as asked for in {parent}{known}.")
+        raise FileNotFoundError(f"no log of py123d with the given names in {parent}{known}.")
     return folders
 
 

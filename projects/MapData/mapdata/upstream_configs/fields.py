@@ -96,7 +96,8 @@ class Fields:
         Args:
             section: Dotted name of the section of the settings.
             names: Names of settings to remove, separated by spaces.
-            fixed: Settings to remove if they have the given value, the only one in GSMap.
+            fixed: Settings to remove if they have the given value, which is the only value that
+                GSMap supports.
         """
         values = self.section(section)
         for name in names.split():

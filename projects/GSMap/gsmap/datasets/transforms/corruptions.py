@@ -110,6 +110,7 @@ class CorruptImages(BaseTransform):
         finish_on_host(results)
         rng = generator(self.seed, results["token"])
         level = self.severity - 1
+        # Entries of the lists are replaced below, and the lists of the caller must not change.
         for key in ("img", "lidar2cam", "lidar2img"):
             results[key] = list(results[key])
         views = range(len(results["img"]))

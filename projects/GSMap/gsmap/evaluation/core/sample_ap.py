@@ -186,10 +186,10 @@ class _MaskPixels:
 
 @njit(cache=True)
 def _fill_gaps(gaps: GapArray, mask: MaskArray, number: int) -> None:
-    """Write to ``gaps`` how far each pixel is from the nearest pixel of an element in its column.
+    """Measure the distance of each pixel to an element within the column of the pixel.
 
     Args:
-        gaps: Distances in pixels, overwritten. (H, W)
+        gaps: Output for the distances in pixels. (H, W)
         mask: Number of the element at each pixel, or -1. (H, W)
         number: Number of the element.
     """
@@ -213,7 +213,9 @@ def _distance_from_gaps(gaps: GapArray, column: int) -> float:
         column: Column of the pixel.
     """
     best_sq = gaps[column] ** 2
-    step = 1  # columns aside; pixels there are at least as far away as this number
+    # Pixels in the columns `step` aside are at least `step` away, so the search ends when `step`
+    # reaches the smallest distance so far.
+    step = 1
     while step * step < best_sq and step < len(gaps):
         if column >= step:
             best_sq = min(best_sq, step * step + gaps[column - step] ** 2)
@@ -287,7 +289,8 @@ def line_distances(
     from_pred = _mean_distances(
         gt.mask, is_near=is_near, rows=pred.rows, columns=pred.columns, owners=pred.owners
     ).T  # (n, k)
-    is_near = from_pred * PIXEL_M / 2 < limit_m  # one direction is half of the distance
+    # The distance is the mean of both directions, so it is at least half of the first one.
+    is_near = from_pred * PIXEL_M / 2 < limit_m
     from_gt = _mean_distances(
         pred.mask, is_near=is_near, rows=gt.rows, columns=gt.columns, owners=gt.owners
     )

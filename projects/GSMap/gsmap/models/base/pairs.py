@@ -33,7 +33,7 @@ class Predictions:
         scores: Class logits. (B, N, classes)
         decoded: Output of the decoder layer, with states and references.
         bev_feats: BEV features. (B, C, H, W)
-        reference: Decodes ``decoded.references`` to points, metres and masks.
+        reference: Module that decodes ``decoded.references`` to points, metres and masks.
         masks: Settings and rasters of the masks in losses and in matching costs.
 
     Attributes:
@@ -110,8 +110,8 @@ class GroundTruth:
         instances: Elements of each sample, with ``labels_3d`` (K,), ``pts`` (K, P, 2 or 3) and
             ``pts_shifts`` (K, S, P, 2 or 3) in metres, which are the points in S equivalent
             orders. Masks also need ``polylines`` (K, M, 2 or 3) in metres.
-        reference: Normalises points to [0, 1] over the map.
-        masks: Draws the masks.
+        reference: Module that normalises points to [0, 1] over the map.
+        masks: Object that draws the masks.
 
     Attributes:
         counts: Number K of elements of each sample.

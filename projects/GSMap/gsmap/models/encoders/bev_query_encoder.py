@@ -174,19 +174,19 @@ class BEVQueryEncoder(CameraEncoder):
         self.grid = grid.rasterized(bev_pixel_m)
         self.z_range = (float(z_range[0]), float(z_range[1]))
         self.bev_embedding = nn.Embedding(self.grid.height * self.grid.width, embed_dims)
-        start: dict[str, Any] = {"type": "Normal", "layer": "Embedding", "std": 1.0}
+        position_init: dict[str, Any] = {"type": "Normal", "layer": "Embedding", "std": 1.0}
         if uniform_positions:
-            start = {"type": "Uniform", "layer": "Embedding"}
+            position_init = {"type": "Uniform", "layer": "Embedding"}
         self.positional_encoding = LearnedPositionalEncoding(
             embed_dims // 2,
             self.grid.height,
             self.grid.width,
-            init_cfg=start,
+            init_cfg=position_init,
         )
         # The released models have embeddings of four levels. The first ``num_levels`` are used.
         self.level_embeds = nn.Parameter(torch.empty(4, embed_dims))
         self.cams_embeds = nn.Parameter(torch.empty(num_cams, embed_dims))
-        self.calibration = ("img_from_frame",)
+        self.calibration = ("img_from_frame",)  # names of the arrays that `encode` reads
         self.can_bus_mlp = None
         if with_can_bus:
             self.calibration = ("img_from_frame", "can_bus")
@@ -248,6 +248,7 @@ class BEVQueryEncoder(CameraEncoder):
         query = self.bev_embedding.weight.expand(len(first), -1, -1)  # (B, Q, C)
         if self.can_bus_mlp is not None:
             query = query + self.can_bus_mlp(calibration["can_bus"])[:, None]
+        # mmdet's encoding takes a padding mask, of which only the shape is used.
         query_pos = self.positional_encoding(first.new_zeros((1, *bev_shape)))
         query_pos = query_pos.flatten(2).transpose(1, 2)  # (1, Q, C)
         projection = self.project(calibration["img_from_frame"], img_shape)

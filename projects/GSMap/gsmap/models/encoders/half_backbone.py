@@ -23,8 +23,9 @@ class HalfBackbone:
     def __init__(self) -> None:
         self.backbone: nn.Module | None = None
         self.neck: nn.Module | None = None
-        self.fuses = False  # whether blocks are fused convolutions, on a GPU
-        self.state: list[tuple[int, int]] = []  # address and version of the original tensors
+        self.fuses = False  # whether the blocks can run as fused convolutions on a GPU
+        # Address and version of each original tensor, which show whether a weight has changed.
+        self.state: list[tuple[int, int]] = []
 
     @torch.no_grad()
     def __call__(

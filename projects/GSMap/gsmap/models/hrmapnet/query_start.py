@@ -90,7 +90,7 @@ class PriorQueries(BaseModule):
 
 
 class PriorHook(FlowHook):
-    """Hook of a batch that starts its queries from the map, and keeps its predictions.
+    """Hook that starts the queries of a batch from the map, and keeps the batch's predictions.
 
     Args:
         queries: Attention to the map, or None to leave the queries as they are.

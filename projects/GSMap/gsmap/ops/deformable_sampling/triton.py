@@ -20,16 +20,19 @@ OPTIONS = {"num_warps": 4, "enable_fp_fusion": True}
 
 @triton.jit
 def _locate_sample(locations, weights, sample, valid, height, width):
-    """Column and row of a sample's upper left cell, x and y distance from it, weight. (ROWS,) each
+    """Locate a sample among the centres of the four cells around it.
 
-    The value of a cell lies at its centre.
+    Returns:
+        Column and row of the upper left cell, distance of the sample from its centre along x and y
+        in cells, and weight of the sample. (ROWS,) each
     """
+    # The centre of cell 0 has the coordinate 0.5 of a cell.
     x = tl.load(locations + sample * 2, mask=valid, other=0.0) * width - 0.5
     y = tl.load(locations + sample * 2 + 1, mask=valid, other=0.0) * height - 0.5
-    col = tl.floor(x)
-    row = tl.floor(y)
+    left = tl.floor(x)
+    top = tl.floor(y)
     weight = tl.load(weights + sample, mask=valid, other=0.0)
-    return col, row, x - col, y - row, weight
+    return left, top, x - left, y - top, weight
 
 
 @triton.jit
@@ -74,6 +77,7 @@ def _locate_rows(
     row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
     batch = row // (queries * heads)
     head = row % heads
+    # Offset of value[batch, 0, head, 0]. A cell is `heads * C` values after the previous one.
     head_offset = (batch * cells * heads + head) * C
     channel = tl.arange(0, CP)
     return row, row < rows, head_offset, channel, channel < C
@@ -215,6 +219,7 @@ def backward_kernel(
             grad_x += product * weight_y * slope_x
             grad_y += product * weight_x * slope_y
         tl.store(grad_weights + sample, grad_weight, mask=valid)
+        # Locations are shares of the map: a change by 1 is a change by `width` or `height` cells.
         tl.store(grad_locations + sample * 2, grad_x * weight * width, mask=valid)
         tl.store(grad_locations + sample * 2 + 1, grad_y * weight * height, mask=valid)
 

@@ -4,8 +4,8 @@
 
 The forward and the backward pass are one launch each. A row is the output of one head of one BEV
 cell, with all channels of the head. A program computes several neighbouring rows and loops over the
-cameras. If a camera sees none of the program's cells, a scalar branch skips it. Sums are float32
-for every dtype of the maps.
+cameras. If none of its cells is visible to a camera, a scalar branch skips the camera. Sums are
+float32 for every dtype of the maps.
 
 Multiplications and additions are not fused: coordinates then have the rounding errors of plain
 torch, and are rounded to the same pixel. The gradient of the maps is added by atomics in any order,
