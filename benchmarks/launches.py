@@ -104,7 +104,7 @@ class Trial:
         if self.model.lidar_encoder is not None:
             scale = torch.tensor([20.0, 40.0, 2.0, 1.0, 0.0])  # x, y, z in metres, intensity, time
             self.inputs["points"] = [(torch.rand(2000, 5) - 0.5) * scale for _ in range(batch)]
-        self.settings = read_config(config).optim_wrapper
+        self.settings = read_config(config).optim_wrapper  # config of the optimizer wrapper
         self.gpu = PretendedGPU()
         self.wrapper: Any = None
 

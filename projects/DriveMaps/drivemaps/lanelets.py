@@ -150,10 +150,10 @@ def lane_graph(centerlines: Iterable[FloatArray], borders: Sequence[FloatArray])
     lanelets: list[Lanelet] = []
     lanes_between: dict[tuple[int, int], list[shapely.LineString]] = {}
     for index, line in enumerate(lines):
-        entry = int(nodes.node_of_end[2 * index])
-        end = int(nodes.node_of_end[2 * index + 1])
+        entry_node = int(nodes.node_of_end[2 * index])
+        exit_node = int(nodes.node_of_end[2 * index + 1])
         lane = shapely.LineString(line)
-        known_lanes = lanes_between.setdefault((entry, end), [])
+        known_lanes = lanes_between.setdefault((entry_node, exit_node), [])
         if any(shapely.hausdorff_distance(lane, known) <= _JOIN_M for known in known_lanes):
             continue
         known_lanes.append(lane)
@@ -162,7 +162,7 @@ def lane_graph(centerlines: Iterable[FloatArray], borders: Sequence[FloatArray])
         left_m, right_m = half_widths[index]
         left = inner + left_m * to_left
         right = inner - right_m * to_left
-        lanelets.append(Lanelet(left, right, entry=entry, exit=end))
+        lanelets.append(Lanelet(left, right, entry=entry_node, exit=exit_node))
     return LaneGraph(lanelets, left=nodes.left, right=nodes.right)
 
 

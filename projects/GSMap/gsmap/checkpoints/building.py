@@ -98,7 +98,7 @@ def building(cfg: Config, kind: type | None = None) -> Iterator[None]:
         yield
     except GsmapError as error:
         text = str(error)
-        # An error that names a file, such as a data file that cannot be read, is not the config's.
+        # An error that names a file, such as unreadable data, is not a fault of the config.
         names_a_path = "/" in text
         if names_a_path or not _parts_under_construction(error):
             raise

@@ -347,24 +347,24 @@ def match_sample_ap(
     for label in range(len(config.classes)):
         pred_mask = draw_numbers(confident_predictions, label=label, config=config)
         gt_mask = draw_numbers(ground_truth, label=label, config=config)
-        distance, pred_rows, gts = line_distances(pred_mask, gt_mask, limit_m=limit_m)
-        preds = confident[pred_rows]  # index in `predictions` of each row of `distance`
+        distance, pred_indices, gts = line_distances(pred_mask, gt_mask, limit_m=limit_m)
+        preds = confident[pred_indices]  # index in `predictions` of each row of `distance`
         matched = closest_pairs(distance, limit_m)  # column of each row of `distance`, or -1
         is_match = matched >= 0
         is_visible[preds] = True
         num_gts[label] = len(gts)
         partners[preds[is_match]] = gts[matched[is_match]]
         quality[preds[is_match]] = distance[is_match, matched[is_match]]
-    rows = np.flatnonzero(is_visible)
-    rows = rows[np.argsort(-predictions.confidence[rows], kind="stable")]
-    within = quality[rows, None] < thresholds  # (n, T)
+    visible = np.flatnonzero(is_visible)
+    ranked = visible[np.argsort(-predictions.confidence[visible], kind="stable")]
+    within = quality[ranked, None] < thresholds  # (n, T)
     return FrameMatches(
         token=token,
-        pred_index=rows,
-        labels=predictions.labels[rows],
-        scores=predictions.confidence[rows],
-        matched_gt=np.where(within, partners[rows, None], -1),
-        quality=quality[rows],
+        pred_index=ranked,
+        labels=predictions.labels[ranked],
+        scores=predictions.confidence[ranked],
+        matched_gt=np.where(within, partners[ranked, None], -1),
+        quality=quality[ranked],
         num_gts=num_gts,
     )
 

@@ -1,7 +1,4 @@
-"""Points along predicted piecewise Bezier curves, and the loss of the masks around them.
-
-BeMapNet calls this loss the point-curve-region recovery loss.
-"""
+"""Points along predicted piecewise Bezier curves, and a loss of mask values (BeMapNet)."""
 
 from collections.abc import Sequence
 

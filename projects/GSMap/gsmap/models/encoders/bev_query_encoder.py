@@ -178,7 +178,7 @@ class BEVQueryEncoder(CameraEncoder):
         if uniform_positions:
             position_init = {"type": "Uniform", "layer": "Embedding"}
         self.positional_encoding = LearnedPositionalEncoding(
-            embed_dims // 2,
+            embed_dims // 2,  # channels for the column, and as many for the row
             self.grid.height,
             self.grid.width,
             init_cfg=position_init,

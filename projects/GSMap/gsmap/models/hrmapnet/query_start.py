@@ -120,17 +120,17 @@ class PriorHook(FlowHook):
         if self.queries is None:
             return start
         states, positions, references = start.queries
-        num = _num_rows(head)  # queries of other hooks follow
-        own_positions = positions[:, :num]
+        num_rows = _num_rows(head)  # queries of other hooks follow
+        own_positions = positions[:, :num_rows]
         change = self.queries(own_positions, self.keys)
         new_positions = own_positions + change
-        new_states = states[:, :num] + change
+        new_states = states[:, :num_rows] + change
         # `head.reference` is the module that computes reference points from positional encodings.
         new_references = head.reference.start(new_positions)
         num_references = new_references.shape[1]
         queries = Queries(
-            state=torch.cat([new_states, states[:, num:]], dim=1),
-            position=torch.cat([new_positions, positions[:, num:]], dim=1),
+            state=torch.cat([new_states, states[:, num_rows:]], dim=1),
+            position=torch.cat([new_positions, positions[:, num_rows:]], dim=1),
             reference=torch.cat([new_references, references[:, num_references:]], dim=1),
         )
         return start._replace(queries=queries)
@@ -143,9 +143,9 @@ class PriorHook(FlowHook):
             layers: Predictions of each layer.
         """
         last = layers[-1]
-        num = head.query_groups[0].num
-        points_m = head.reference.metres(last.pts[:, :num].detach().float())
-        self.scores = LateValues(last.scores[:, :num].float())
+        num_instances = head.query_groups[0].num  # the first group predicts
+        points_m = head.reference.metres(last.pts[:, :num_instances].detach().float())
+        self.scores = LateValues(last.scores[:, :num_instances].float())
         self.points_m = LateValues(points_m[..., :2])
         return layers
 

@@ -143,6 +143,7 @@ class PolylineGenerator(BaseModule):
         Returns:
             Embeddings. (n, T, C)
         """
+        # Tokens 2 p and 2 p + 1 are x and y of point p.
         number = torch.arange(start, start + tokens.shape[1], device=tokens.device)
         positions = self.position(number // 2)
         axes = self.axis(number % 2)

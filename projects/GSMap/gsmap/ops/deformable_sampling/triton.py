@@ -124,7 +124,8 @@ def forward_kernel(
         left, top, dx, dy, weight = _locate_sample(
             locations, weights, sample=row * S + s, valid=valid, height=height, width=width
         )
-        for corner in tl.static_range(4):  # cells around the sample: 0 and 1 above, 2 and 3 below
+        # Cells around the sample: 0 and 1 above, 2 and 3 below; 0 and 2 left, 1 and 3 right.
+        for corner in tl.static_range(4):
             pixel_index, inside = find_corner(
                 left + corner % 2, top + corner // 2, valid=valid, height=height, width=width
             )
@@ -195,7 +196,8 @@ def backward_kernel(
         grad_weight = tl.zeros((ROWS,), dtype=tl.float32)
         grad_x = tl.zeros((ROWS,), dtype=tl.float32)
         grad_y = tl.zeros((ROWS,), dtype=tl.float32)
-        for corner in tl.static_range(4):  # cells around the sample: 0 and 1 above, 2 and 3 below
+        # Cells around the sample: 0 and 1 above, 2 and 3 below; 0 and 2 left, 1 and 3 right.
+        for corner in tl.static_range(4):
             pixel_index, inside = find_corner(
                 left + corner % 2, top + corner // 2, valid=valid, height=height, width=width
             )

@@ -122,13 +122,15 @@ def forward_kernel(
                 weight = tl.load(weights + row * S + s, mask=visible, other=0.0)
                 at_x = x + tl.load(offsets + 2 * s).to(tl.float32)
                 at_y = y + tl.load(offsets + 2 * s + 1).to(tl.float32)
-                if BILINEAR:  # the four pixels around the point: 0 and 1 above, 2 and 3 below
+                if BILINEAR:
                     at_x = at_x - 0.5
                     at_y = at_y - 0.5
                     left = tl.floor(at_x)
                     top = tl.floor(at_y)
                     dx = at_x - left
                     dy = at_y - top
+                    # Pixels around the point: 0 and 1 above, 2 and 3 below; 0 and 2 left, 1 and 3
+                    # right.
                     for corner in tl.static_range(4):
                         pixel_index, inside = find_corner(
                             left + corner % 2,
@@ -235,13 +237,15 @@ def backward_kernel(
                 at_x = x + tl.load(offsets + 2 * s).to(tl.float32)
                 at_y = y + tl.load(offsets + 2 * s + 1).to(tl.float32)
                 grad_weight = tl.zeros((ROWS,), dtype=tl.float32)
-                if BILINEAR:  # the four pixels around the point: 0 and 1 above, 2 and 3 below
+                if BILINEAR:
                     at_x = at_x - 0.5
                     at_y = at_y - 0.5
                     left = tl.floor(at_x)
                     top = tl.floor(at_y)
                     dx = at_x - left
                     dy = at_y - top
+                    # Pixels around the point: 0 and 1 above, 2 and 3 below; 0 and 2 left, 1 and 3
+                    # right.
                     for corner in tl.static_range(4):
                         pixel_index, inside = find_corner(
                             left + corner % 2,
