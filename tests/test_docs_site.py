@@ -109,14 +109,19 @@ def test_mkdocs_names_pages_that_exist():
 
 
 def test_the_navigation_is_one_book():
-    """At most 40,000 words: figures belong to results/, lists to pages outside the navigation."""
+    """At most 40,000 words with twelve pages of methods; each further page adds 700.
+
+    Figures belong to results/, lists to pages outside the navigation.
+    """
     hooks = runpy.run_path(str(REPO / "docs/site_hooks.py"))
     config = hooks["on_config"](load_config(str(REPO / "mkdocs.yml")))  # adds the methods' pages
     pages = re.findall(r"[\w/]+\.md", str(config.nav))
     files = [REPO / hooks["OUTSIDE"].get(page, f"docs/{page}") for page in pages]
     texts = [file.read_text(encoding="utf-8") for file in files]
     assert len(texts) > 40
-    assert sum(len(text.split()) for text in texts) <= 40_000
+    of_methods = [page for page in pages if page.startswith("methods/")]
+    limit = 31_600 + 700 * len(of_methods)
+    assert sum(len(text.split()) for text in texts) <= limit
 
 
 def test_summary_and_changelog_are_short():

@@ -1,1 +1,1 @@
-"""Damaged and crafted files for every reader: ``PYTHONPATH=tests python -m fuzz --cases 5000``."""
+"""Damaged files for every reader: ``PYTHONPATH=tests:tests/map_data python -m fuzz``."""

@@ -1,6 +1,6 @@
 """Read damaged files, case by case in child processes, and count how each reader ends.
 
-``PYTHONPATH=tests:tests/converters python -m fuzz --cases 5000`` prints the table of
+``PYTHONPATH=tests:tests/map_data python -m fuzz --cases 5000`` prints the table of
 results/tests.md; ``--reader NAME ...`` takes the readers whose names begin so.
 """
 
