@@ -61,10 +61,9 @@ def test_a_head_has_the_published_queries_and_weights(config: str, published: di
 @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
 def test_a_paper_has_its_page_and_its_row_in_the_comparison(method):
     paper = PAPERS[method.name]
-    row = next(
-        line
-        for line in (REPO / "docs/methods.md").read_text().splitlines()
-        if line.startswith(f"| {method.title}, ")
-    )
+    lines = (REPO / "docs/methods.md").read_text().splitlines()
+    rows = [line for line in lines if line.startswith(f"| {method.title}, ")]
+    assert len(rows) == 1, f"docs/methods.md needs one row of {method.title}."
+    (row,) = rows
     assert all(f"{number:,}" in row for number in paper["parameters"].values())
     assert f"arxiv.org/abs/{paper['arxiv']}" in row
