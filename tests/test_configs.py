@@ -241,6 +241,10 @@ def shrink_queries(model: ConfigDict) -> None:
 def shrink_cells(cfg: Config) -> None:
     """Make fine cells of features of the map, and masks of their size, twice as wide."""
     encoder = cfg.model.get("bev_encoder") or {}
+    if encoder.get("type") in ("PivotBEVEncoder", "BezierBEVEncoder"):
+        encoder.bev_pixel_m = 1.875  # as in their small models
+    if cfg.model.map_head.type == "BezierHead":
+        cfg.model.map_head.bev_pixel_m = 0.9375
     if encoder.get("bev_pixel_m", 1.0) >= 1.0 or "lidar_encoder" in cfg.model:
         return
     encoder.bev_pixel_m *= 2
