@@ -17,13 +17,13 @@ needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GP
 needs_ptxas = pytest.mark.skipif(not find_ptxas(), reason="needs the assembler of Triton's wheel")
 
 
-@pytest.mark.parametrize("kernel", CASES)
-def test_kernels_equal_the_float64_reference_in_the_interpreter(kernel):
+@pytest.mark.timeout(1800)
+def test_kernels_equal_the_float64_reference_in_the_interpreter():
     """A process of its own: Triton reads ``TRITON_INTERPRET`` when it is imported."""
     pytest.importorskip("triton")
     paths = [str(Path(__file__).parent), str(Path(gsmap.__file__).parents[1])]
     environment = {"TRITON_INTERPRET": "1", "PYTHONPATH": os.pathsep.join(paths)}
-    result = run_python("-c", f"import triton_cases; triton_cases.run({kernel!r})", env=environment)
+    result = run_python("-c", "import triton_cases; triton_cases.run()", env=environment)
     assert result.returncode == 0, result.stderr
 
 

@@ -31,14 +31,15 @@ def case(kernel, *variants):
     return register
 
 
-def run(kernel):
-    """Run the cases of a kernel in Triton's interpreter, on the CPU."""
+def run():
+    """Run the cases of all kernels in Triton's interpreter, on the CPU."""
     torch.set_num_threads(1)
-    for name, check in CASES[kernel].items():
-        try:
-            check("cpu")
-        except Exception as error:
-            raise AssertionError(f"case {name!r} of {kernel}") from error
+    for kernel, checks in CASES.items():
+        for name, check in checks.items():
+            try:
+                check("cpu")
+            except Exception as error:
+                raise AssertionError(f"case {name!r} of {kernel}") from error
 
 
 def values_and_gradients(function, leaves, upstream):
