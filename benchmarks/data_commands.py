@@ -18,12 +18,12 @@ def loading(args: argparse.Namespace) -> dict[str, float]:
 
 
 def ground_truth(args: argparse.Namespace) -> dict[str, float]:
-    """Measure ground truth per frame."""
+    """Measure the computation of the ground truth of a frame."""
     return benchmarks.measure_ground_truth(args.root, args.annotations)
 
 
 def pipeline(args: argparse.Namespace) -> dict[str, float]:
-    """Measure training samples."""
+    """Measure the training pipeline."""
     from mmengine.config import Config
     from mmengine.registry import init_default_scope
 
@@ -36,21 +36,21 @@ def pipeline(args: argparse.Namespace) -> dict[str, float]:
 
 
 def images(args: argparse.Namespace) -> dict[str, float]:
-    """Measure the image steps of a sample."""
+    """Measure the transforms of the images of a sample."""
     from benchmarks.images import measure_images
 
     return measure_images(args.folder, count=args.samples, workers=args.workers)
 
 
 def argoverse2(args: argparse.Namespace) -> dict[str, float]:
-    """Measure Argoverse 2 ground truth."""
+    """Measure the computation of the ground truth of Argoverse 2."""
     from benchmarks.argoverse2 import measure_extraction
 
     return measure_extraction(args.root, split=args.split, stride=args.stride)
 
 
 def memory(args: argparse.Namespace) -> dict[str, float]:
-    """Measure the memory of the conversion."""
+    """Measure the peak memory of the conversion of nuScenes."""
     return measure_memory(args.root, args.version, copies=tuple(args.copies))
 
 
@@ -61,17 +61,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     command.add_argument("annotations", type=Path)
     command.add_argument("--samples", type=int, default=28_130)
     command.set_defaults(measure=loading)
-    command = commands.add_parser("ground-truth", help="ground truth, prepared and made per item")
+    command = commands.add_parser(
+        "ground-truth", help="ground truth of a frame, with and without maps prepared once"
+    )
     command.add_argument("root", type=Path)
     command.add_argument("annotations", type=Path)
     command.set_defaults(measure=ground_truth)
-    command = commands.add_parser("pipeline", help="training samples, from the file and per item")
+    command = commands.add_parser(
+        "pipeline", help="training samples, with ground truth from the file or computed for each"
+    )
     command.add_argument("root", type=Path)
     command.add_argument("annotations", type=Path)
     command.add_argument("--config", default="configs/_base_/datasets/minicity.py")
     command.add_argument("--samples", type=int, default=20)
     command.set_defaults(measure=pipeline)
-    command = commands.add_parser("images", help="image steps of a sample, and samples a second")
+    command = commands.add_parser("images", help="image transforms of a sample, samples a second")
     command.add_argument("folder", type=Path, help="six JPEG files, such as a frame of nuScenes")
     command.add_argument("--samples", type=int, default=10)
     command.add_argument("--workers", type=int, nargs="*", default=[], help="numbers of processes")
@@ -81,10 +85,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     command.add_argument("--split", default="val")
     command.add_argument("--stride", type=int, default=10, help="every N-th pose")
     command.set_defaults(measure=argoverse2)
-    command = commands.add_parser("memory", help="peak of the conversion, extrapolated")
+    command = commands.add_parser(
+        "memory", help="peak memory of the conversion, extrapolated to nuScenes trainval"
+    )
     command.add_argument("root", type=Path)
     command.add_argument("--version", default="v1.0-mini")
-    command.add_argument("--copies", type=int, nargs=2, default=(16, 48))
+    command.add_argument(
+        "--copies",
+        type=int,
+        nargs=2,
+        default=(16, 48),
+        help="how often ROOT is repeated in the small and in the large measurement",
+    )
     command.set_defaults(measure=memory)
 
 

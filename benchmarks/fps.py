@@ -33,7 +33,8 @@ def run(args: argparse.Namespace) -> None:
     """
     costs = measure_each(frame_cost, [(path, args, args.cuda_graphs) for path in args.configs])
     device = torch.device(args.device)
-    first = costs[0][1].time_s(device)
+    _, first_cost = costs[0]
+    first = first_cost.time_s(device)
     rows = []
     for path, cost in costs:
         seconds = cost.time_s(device)
@@ -76,7 +77,7 @@ def frame_cost(path: str, args: argparse.Namespace, cuda_graphs: bool = False) -
     def predict() -> None:
         advance_samples(samples)
         autocast = torch.autocast(args.device, enabled=args.fp16 and not halved)
-        with autocast, matrix_products(halved):
+        with autocast, matrix_products(in_tf32=halved):
             model.predict(inputs, samples)
 
     return measure(predict, torch.device(args.device), repeats=args.repeats)
@@ -90,6 +91,7 @@ def _replayed_frame_cost(
         model.halve_backbone()
     device = torch.device(args.device)
     frames = FastFrames(StaticFrame(model), device)
-    images = (inputs["imgs"][0] * 50 + 120).clamp(0, 255).to(torch.uint8)  # about the pixels
+    # Roughly the inverse of the normalisation, from normalised images to pixel values.
+    images = (inputs["imgs"][0] * 50 + 120).clamp(0, 255).to(torch.uint8)
     batch = {"inputs": {"img": [images]}, "data_samples": samples[:1]}
     return measure(partial(frames, batch), device, repeats=args.repeats)

@@ -61,13 +61,16 @@ def profile(path: str, args: argparse.Namespace) -> tuple[dict[str, float], tupl
         times.setdefault(part, []).append(clock() - start)
         return result
 
-    for _ in range(args.repeats + 1):  # the first is a warm-up
+    for _ in range(args.repeats + 1):
         with torch.autocast(args.device, enabled=args.fp16):
+            # `folded_backbone` runs a copy of the backbone whose batch norms are folded into its
+            # convolutions, as in prediction.
             feats = time_part("image backbone", model.folded_backbone, model.img_backbone, images)
             if model.img_neck is not None:
                 feats = time_part("image neck", model.img_neck, feats)
-            feats = [level.unflatten(0, (1, -1)) for level in feats]
+            feats = [level.unflatten(0, (1, -1)) for level in feats]  # (1, V, C, h, w) each
             bev = time_part("BEV encoder", model.bev_encoder, feats, [samples[0].metainfo])
             time_part("map head", model.map_head.predict, bev, samples)
+    # The first repeat is a warm-up, which does not count.
     shortest = {part: min(values[1:]) for part, values in times.items()}
     return shortest, (cameras, height, width)

@@ -2,12 +2,11 @@
 r"""Fit the sigmas of a model's Gaussians to its errors, and write a calibrated checkpoint.
 
 RESULTS are predictions of this checkpoint on samples that are not in its training. For each class,
-the fit gives a factor for sigma along the line and a factor for sigma across it. Sigma times its
-factor is such that 68.3 % of the errors lie within one sigma or, with ``--sigmas 2``, 95.4 % within
-two. With ``--law laplace``, these shares of the errors lie within the interval of a Laplace
-distribution with this sigma, which has longer tails: 0.81 sigma to each side, or 2.18 sigma with
-``--sigmas 2``. The law and the number of sigmas are recorded as ``calibration`` in the meta of the
-checkpoint and in its results.
+the fit gives a factor for sigma along the line and a factor for sigma across it. After sigma is
+multiplied by its factor, 68.3 % of the errors lie within one sigma or, with ``--sigmas 2``, 95.4 %
+within two. ``--law laplace`` assumes a Laplace distribution, which has longer tails. Then 68.3 % of
+the errors lie within 0.81 sigma or, with ``--sigmas 2``, 95.4 % within 2.18 sigma. The law and the
+number of sigmas are recorded as ``calibration`` in the meta of the checkpoint and in its results.
 
 Results of another checkpoint are refused, and so are samples of the split of the training.
 
@@ -60,8 +59,8 @@ def parse_args() -> argparse.Namespace:
 
 
 def require_held_out(trained: Mapping[str, Any], ground_truth: Path) -> None:
-    """Refuse samples of the training's split, if both splits are known."""
-    if ground_truth.suffix.lower() != ".json":
+    """Refuse samples of the split that the model was trained on, if both splits are known."""
+    if ground_truth.suffix.lower() != ".json":  # a JSON file names no split
         meta = AnnotationFile(ground_truth).meta
         if (trained.get("dataset"), trained.get("split")) == (meta.dataset, meta.split):
             raise InputError(
@@ -90,7 +89,7 @@ def main() -> str:
         adopt_settings(cfg, args.checkpoint, None)
         if cfg.model.map_head.get("temperatures"):
             raise InputError(
-                f"{args.checkpoint} is calibrated already: give the checkpoint that it was made of."
+                f"{args.checkpoint} is calibrated already: give the checkpoint it was made from."
             )
         classes = tuple(cfg.model.classes)
         model = MODELS.build(cfg.model)
@@ -113,7 +112,7 @@ def main() -> str:
         SIGNALS: source.can_bus,
         CALIBRATION: {"law": args.law, "sigmas": args.sigmas},
     }
-    if source.dataset_meta:  # a test checks its split
+    if source.dataset_meta:  # a test warns of samples of this split
         meta["dataset_meta"] = dict(source.dataset_meta)
     if source.image_size:
         meta[IMAGE_SIZE] = source.image_size

@@ -27,7 +27,10 @@ COMMANDS = {
     "infos": ("mapdata.infos.convert", "convert an info file of MapTR or its successors"),
     "split": ("mapdata.splitter", "split scenes by place, at a distance from each other"),
     "overlap": ("mapdata.overlap", "list the validation samples that lie near training"),
-    "occlusion": ("mapdata.nuscenes.occlusion", "group samples by how much boxes hide of the map"),
+    "occlusion": (
+        "mapdata.nuscenes.occlusion",
+        "group samples by the share of the map that boxes hide",
+    ),
     "check": ("mapdata.check", "check annotation files completely"),
     "fiftyone": (
         "gsmap.visualization.fiftyone",
@@ -49,10 +52,12 @@ def make() -> str | None:
         if name == chosen:
             importlib.import_module(module).add_arguments(subparser)
     arguments = parser.parse_args()
-    if getattr(arguments, "executor", None):
+    if getattr(arguments, "executor", None):  # only some commands have --executor
         return run_on_ray(arguments, sys.argv)
     module, _ = COMMANDS[arguments.command]
-    words = without_options(sys.argv, "--shard")  # the command that writes the whole file
+    # The command line is recorded in the output. Without --shard, it is equal for all shards, and
+    # it creates the complete output again.
+    words = without_options(sys.argv, "--shard")
     arguments.command = printable(shlex.join(["python", *words]))
     return importlib.import_module(module).run(arguments)
 

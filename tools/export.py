@@ -47,14 +47,19 @@ def parse_args() -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("config", help="config, by file or name, or the name of a trained model")
-    parser.add_argument("checkpoint", nargs="?", help="its checkpoint; not needed with a name")
+    parser.add_argument(
+        "checkpoint",
+        nargs="?",
+        help="checkpoint of the model; not needed with the name of a trained model",
+    )
     parser.add_argument("--out", type=output_file, required=True, help="ONNX file to write")
     parser.add_argument(
         "--size",
         type=int,
         nargs=2,
         metavar=("H", "W"),
-        help="rows and columns of the images after the data pipeline; the test samples' by default",
+        help="rows and columns of the images after the data pipeline; by default as in the test "
+        "samples",
     )
     precision = parser.add_mutually_exclusive_group()
     precision.add_argument("--fp16", action="store_true", help="convolutions in half precision")
@@ -63,7 +68,10 @@ def parse_args() -> argparse.Namespace:
         "--calibration", type=Path, help="samples for --int8; the config's training set by default"
     )
     parser.add_argument(
-        "--calibration-samples", type=int, default=32, help="number of them, evenly spread"
+        "--calibration-samples",
+        type=int,
+        default=32,
+        help="number of samples for --int8, evenly spread over --calibration",
     )
     parser.add_argument(
         "--samples", type=Path, help="samples to compare on; the config's test set by default"
@@ -170,6 +178,7 @@ def check(inferencer: MapInferencer, exported: OnnxInferencer, args: argparse.Na
     """
     dataset = open_samples(inferencer, args, args.samples, split="test")
     chosen = select_samples(dataset.annotations.column("token"), max_num=args.check)
+    # Indices of the classes whose points the model reorders to a short path.
     unfolded = exported.metadata.get("unfold_classes", [])
     in_torch = inferencer.predict(dataset, chosen)
     samples = graph_inputs(exported, dataset, chosen)
@@ -186,9 +195,9 @@ def check(inferencer: MapInferencer, exported: OnnxInferencer, args: argparse.Na
     equal_classes = [pair for pair in differences if np.isfinite(pair).all()]
     score, distance_m = np.max(equal_classes or [(0, 0)], axis=0)
     return (
-        f"{len(equal_classes)} of {len(chosen)} samples have the same classes in ONNX Runtime as "
-        f"in torch; these differ by at most {score:.1e} in score, {distance_m:.1e} m in the "
-        "nearest element"
+        f"in {len(equal_classes)} of {len(chosen)} samples, ONNX Runtime and torch predict equal "
+        "numbers of elements of each class; in these samples, scores differ by at most "
+        f"{score:.1e}, and nearest elements by at most {distance_m:.1e} m"
     )
 
 

@@ -65,7 +65,7 @@ def test_hand_worked_ap():
     # the scores 0.9, 0.8 and 0.7 against 1, 1 and 0 at 1.5 m: (0.1 + 0.2 + 0.7) / 3
     cells = "divider 0.8333 0.5000 1.0000 1.0000 1.0000 0.5000 0.3333 2 3"
     assert divider.split() == cells.split()
-    assert "without ground truth, and in no mean: boundary" in format_table(report)
+    assert "without ground truth, left out of the means: boundary" in format_table(report)
 
 
 def test_precision_envelope_lifts_an_early_miss():

@@ -71,7 +71,7 @@ def test_command_writes_flat_figures_of_samples_paired_by_token(files, tmp_path,
     assert curves.read_bytes().startswith(b"\x89PNG")
     said = capsys.readouterr().out
     assert "mAP_chamfer = 0.750000" in said
-    assert said.count("without ground truth, and in no mean: boundary\n") == 2
+    assert said.count("without ground truth, left out of the means: boundary\n") == 2
 
 
 def test_annotation_file_and_json_give_the_same_figures(files, tmp_path):

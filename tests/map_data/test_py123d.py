@@ -143,7 +143,7 @@ def test_what_cannot_be_used_is_left_out_by_name(tmp_path):
     ("table", "column", "values", "message"),
     [
         ("camera.pcam_f0", "data", pa.array(["../a.jpg"] * 5), "the path must lie below"),
-        ("sync", "camera.pcam_f0", pa.array([9, -1, 9, 9, 9]), "has 5 images, not row 9"),
+        ("sync", "camera.pcam_f0", pa.array([9, -1, 9, 9, 9]), "has 5 images, so no row 9"),
         (
             "ego_state_se3",
             "imu_se3",
@@ -188,7 +188,7 @@ def test_cameras_of_other_models_are_left_out_by_name(tmp_path):
         "left out: its model is 'fisheye_mei', not 'pinhole', for example fmcam_l of log1",
         "left out: its model is 'ftheta', not 'pinhole', for example ftcam_f0 of log1",
         "left out: it has no intrinsics, for example pcam_l0 of log1",
-        "left out: sync.arrow has no column of it, for example pcam_r0 of log1",
+        "left out: sync.arrow has no column for it, for example pcam_r0 of log1",
     ):
         assert f"1 x camera {line}" in text
 

@@ -49,7 +49,7 @@ class Result:
         name: Name of the config in the comparison.
         seed: The seed; None if it is unknown.
         folder: The work folder.
-        state: ``done``, or the fault.
+        state: ``done``, or how far the run came, such as ``not started``.
         figures: All figures of the test, by flat key; empty if the run is not done.
         costs: Iterations, million parameters, seconds per step and per tested sample, peak memory
             in MiB, as far as they are known; keys of ``_COSTS``.
@@ -77,6 +77,7 @@ def read_result(name: str, folder: Path, seed: int | None = None) -> Result:
     """
     record = _json(folder / RECORD)
     figures = _json(folder / "metrics.json")
+    # The folder of a training log is named by the date of its start, such as 20260131_120000.
     log = read_run(folder, name) if any(folder.glob("2*/vis_data/scalars.json")) else None
     steps = []
     if log:
@@ -88,18 +89,11 @@ def read_result(name: str, folder: Path, seed: int | None = None) -> Result:
         state = record.get("state", default_state)
         if steps:
             state += f", after {max(steps):.0f} iterations"
-    costs = {}
-    if log and steps:
-        costs["iterations"] = max(steps)
-        _, seconds = log.series("time")
-        costs["seconds a step"] = float(np.median(seconds))
-        _, memory = log.series("memory")  # only logged on a GPU
-        if len(memory) or "peak_mib" in record:
-            costs["peak MiB"] = float(memory.max()) if len(memory) else record["peak_mib"]
+    costs = _training_costs(log, record) if log and steps else {}
     newest = newest_checkpoint(folder) if figures else None
     if newest:
         costs["million parameters"] = _count_parameters(newest) / 1e6
-    # The last line of the log of a test has the mean times of a sample.
+    # The last line of the log of a test, which is named by its date, has the mean times per sample.
     tests = sorted(folder.glob("test/*/[0-9]*.json"))
     if tests:
         timing = json.loads(tests[-1].read_text().splitlines()[-1])
@@ -120,6 +114,24 @@ def read_result(name: str, folder: Path, seed: int | None = None) -> Result:
         record=record,
         log=log,
     )
+
+
+def _training_costs(log: RunLog, record: Mapping[str, Any]) -> dict[str, float]:
+    """Costs of a training that has begun, by keys of ``_COSTS``.
+
+    Args:
+        log: The training log.
+        record: Record of the run, with ``peak_mib`` if `execute` has measured its memory.
+    """
+    steps = [entry["step"] for entry in log.train]
+    _, seconds = log.series("time")
+    costs = {"iterations": max(steps), "seconds a step": float(np.median(seconds))}
+    _, memory = log.series("memory")  # only logged on a GPU
+    if len(memory):
+        costs["peak MiB"] = float(memory.max())
+    elif "peak_mib" in record:
+        costs["peak MiB"] = record["peak_mib"]
+    return costs
 
 
 def _count_parameters(checkpoint: Path) -> int:
@@ -145,7 +157,7 @@ def _config(folder: Path) -> Fields:
     configs = sorted(folder.glob("2*/vis_data/config.py"))
     if not configs:
         raise InputError(
-            f"{folder} does not say what it is a run of: it holds no 2*/vis_data/config.py, which "
+            f"{folder} does not contain the config of its run, 2*/vis_data/config.py, which "
             "tools/train.py writes. Copy the whole work folder."
         )
     return Fields(read_assignments(configs[-1]))
@@ -227,6 +239,7 @@ def _columns(results: Sequence[Result]) -> list[str]:
     columns = []
     for metric in METRIC_NAMES:
         aps = []
+        # Groups of classes have an AP too, but only classes have a number of ground truths.
         for key in tested[0].figures:
             if re.fullmatch(rf"{metric}/[^/]+/num_gts", key):
                 aps.append(key.replace("num_gts", "AP"))
@@ -247,7 +260,8 @@ def _cell(values: Sequence[float], factor: float = 1.0, form: str = ".1f") -> st
     scaled = [factor * value for value in values]
     text = f"{mean(scaled):{form}}"
     if len(scaled) > 1:
-        text += f" ± {stdev(scaled):{form.lstrip('+')}}"
+        unsigned_form = form.lstrip("+")
+        text += f" ± {stdev(scaled):{unsigned_form}}"
     return text
 
 

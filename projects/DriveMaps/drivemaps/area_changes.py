@@ -73,16 +73,18 @@ def area_changes(
         num_missing = int((in_view & ~is_seen).sum())
         views, matches = _views_of(outline, area=area, detections=detections)
         score_sum = sum(matches.scores)
-        is_removed = 2 * num_missing > num_in_view  # by more than half of the passes
+        # More than half of the passes with the area in view do not have it in their map.
+        is_removed = 2 * num_missing > num_in_view
         if is_removed:
-            num_without = views - score_sum  # a detection counts by its score
+            # Frames that do not show the area. A detection counts as much as its score.
+            num_without = views - score_sum
             change = Change(
                 REMOVED,
                 label,
                 line=shapely.get_coordinates(area.exterior),
                 confidence=old_score * smooth_share(num_without, views),
                 passes_in_view=num_in_view,
-                num_passes=num_missing,
+                num_passes=num_missing,  # passes that agree with the change
             )
             changes.append(change)
         elif num_in_view and len(matches.scores) >= _MIN_FRAMES:
@@ -174,7 +176,7 @@ def _outline(area: shapely.Polygon) -> FloatArray:
 
 
 def _overlaps(area: shapely.Polygon, others: list[shapely.Polygon]) -> bool:
-    """Whether an area and any other one are one object."""
+    """Whether an area and any of some others are one object."""
     return bool(_shared_shares(area, others).max(initial=0.0) >= _MIN_OVERLAP)
 
 
@@ -186,7 +188,7 @@ def _passes_that_have(
 
 
 def _shared_shares(area: shapely.Polygon, others: list[shapely.Polygon]) -> FloatArray:
-    """Ground that an area shares with each other area, as a part of the smaller one. (n,)"""
+    """Overlap of an area with each of n others, as a share of the smaller one of both. (n,)"""
     shapes = np.array(others, dtype=object)
     shared_m2 = shapely.area(shapely.intersection(area, shapes))
     smaller_m2 = np.minimum(area.area, shapely.area(shapes))

@@ -19,8 +19,8 @@ STEP_M = 1.0
 """Largest distance in metres between the vertices of densely sampled lines."""
 _MAX_TURN_DEG = 30.0  # largest angle between two lines that are matched
 _CHUNK_SIZE = 2000  # vertices that are matched at once; memory grows with it
-# At most so many pairs of a vertex and a nearby segment are examined: the larger one of
-# `_MOST_PAIRS` and `_MOST_PAIRS_PER_FRAME` for each vertex and frame.
+# Limit of the number of pairs of a vertex and a nearby segment that are examined: the larger one of
+# `_MOST_PAIRS`, and `_MOST_PAIRS_PER_FRAME` times the number of vertices and of frames.
 _MOST_PAIRS = 2 * 10**7
 _MOST_PAIRS_PER_FRAME = 16
 
@@ -108,11 +108,12 @@ def dense_predictions(drive: Drive, label: int, config: MergeConfig) -> DenseLin
     Returns:
         Lines with a length, of all frames.
     """
+    # Each list begins with an empty entry, so that it can be concatenated without any line.
     points = [np.zeros((0, 2))]
     variances = [np.zeros(0)]
     frames = [np.zeros(0, np.int64)]
     scores = [np.zeros(0)]
-    counts = [0]
+    counts = [0]  # the cumulative sum of the counts gives the offsets, which begin with 0
     for frame_index, frame in enumerate(drive.frames):
         elements = frame.elements
         vertex_variances = config.variances(frame)
@@ -156,9 +157,9 @@ def match_vertices(
 ) -> Matches:
     """Match each vertex, in each other frame, with the nearest line of about the same direction.
 
-    There is no match if the frame of the vertex has another line, on this side of the vertex, at
-    less than twice the distance of the match. Lines of one frame belong to different objects, so
-    the match could belong to the other line.
+    There is no match if the frame of the vertex itself has another line on the side of the match,
+    at less than twice the distance of the match. Lines of one frame belong to different objects, so
+    the match could belong to that other line.
 
     Args:
         lines: Lines of all frames.
@@ -189,10 +190,10 @@ def match_vertices(
         num_pairs_left -= len(positions)
         if num_pairs_left < 0:
             raise InputError(
-                f"the {len(points)} vertices of lines of one class, at most {STEP_M:g} m apart, "
-                f"lie too close together: more than {_MOST_PAIRS:.0e} pairs, and "
-                f"{_MOST_PAIRS_PER_FRAME} of a vertex and frame, are within {REACH_M:g} m; raise "
-                "--score-thr."
+                f"the lines of one class lie too close together: more than {_MOST_PAIRS:.0e} pairs "
+                f"of a vertex and a segment are within {REACH_M:g} m, and more than "
+                f"{_MOST_PAIRS_PER_FRAME} for each of the {len(points)} vertices and each frame; "
+                "raise --score-thr."
             )
         candidates = _match_pairs(
             lines, normals, vertices=chunk[positions], segments=lines.segment_starts[segments]

@@ -13,9 +13,13 @@ from mapdata.folders.rig import PoseTrack
 VEHICLE_FRAMES = ("base_footprint", "base_link")
 _GAP_NS = 10**9  # longest gap between two poses in which the pose is interpolated
 _FOREVER_NS = 10**20  # gap of a static transform, longer than any recording
-_SELDOM_NS = 500_000_000  # transforms with a longer average step hold until the next one
+_SELDOM_NS = 500_000_000  # transforms sent less often than this on average hold until the next one
 _STILL_M = 1e-3  # smaller changes of a pose do not count as a motion
 _STILL_JUMP_M = 0.1  # smaller distances of successive poses do not count as jumps
+# Ranks of odometry by the frame of its body; the lowest is preferred.
+_OF_VEHICLE = 0
+_OF_CONNECTED_FRAME = 1
+_OF_UNKNOWN_FRAME = 2
 
 
 def is_static_topic(topic: str) -> bool:
@@ -65,6 +69,7 @@ class Transforms:
         return bool(np.abs(np.array(self.poses) - self.poses[0]).max() > _STILL_M)
 
     def __str__(self) -> str:
+        """Parent and source, for notes such as "the transforms from 'base_link' to ..."."""
         return f"{self.parent!r} ({self.count} messages on {self.topic})"
 
 
@@ -175,14 +180,16 @@ class FrameTree:
         candidates = VEHICLE_FRAMES if wanted is None else (wanted,)
         known_names = [name for name in candidates if name in self.frames]
         if not known_names:
+            wanted_names = " or ".join(candidates)
             raise InputError(
-                f"its transforms have no frame {wanted or ' or '.join(VEHICLE_FRAMES)!s}: name the "
-                f"frame of the vehicle with --vehicle-frame, or give --calibration "
-                f"calibration.yaml; there are {sorted(self.frames) or 'no transforms at all'}"
+                f"its transforms have no frame {wanted_names}: name the frame of the vehicle with "
+                "--vehicle-frame, or give --calibration calibration.yaml; there are "
+                f"{sorted(self.frames) or 'no transforms at all'}"
             )
         for name in known_names:
             self._choose_parents(name)
-            is_moving = any(not self._chosen[frame].is_static for frame in self.chain(name)[:-1])
+            lower_frames = self.chain(name)[:-1]  # the root has no transform to a parent
+            is_moving = any(not self._chosen[frame].is_static for frame in lower_frames)
             if is_moving:
                 break
         else:  # no frame moves
@@ -248,9 +255,9 @@ class FrameTree:
         return names
 
     def between(self, vehicle: str, frame: str) -> np.ndarray | None:
-        """Pose of a frame on the vehicle; None if the two are not connected. (4, 4)
+        """Pose of a frame in the vehicle's frame; None if the two are not connected. (4, 4)
 
-        If a transform between the two moves, the first pose is used, which is noted.
+        If a transform between the two moves, its first pose is used, with a note in ``notes``.
         """
         frame_chain = self.chain(frame)
         vehicle_chain = self.chain(vehicle)
@@ -276,8 +283,8 @@ class FrameTree:
             edge = self._chosen[name]
             pose = edge.poses[0] @ pose
             note = (
-                f"the transform from {name!r} to {edge.parent!r} moves, and is used as it is "
-                f"at first for where {frame!r} is on the vehicle"
+                f"the transform from {name!r} to {edge.parent!r} moves: its first pose is used for "
+                f"the place of {frame!r} on the vehicle"
             )
             if edge.moves and note not in self.notes:
                 self.notes.append(note)
@@ -293,7 +300,8 @@ class FrameTree:
         Returns:
             The poses; None if no transform moves, or transforms jump back and forth.
         """
-        edges = [self._chosen[name] for name in self.chain(vehicle)[:-1]]
+        lower_frames = self.chain(vehicle)[:-1]  # the root has no transform to a parent
+        edges = [self._chosen[name] for name in lower_frames]
         moving_edges = [edge for edge in edges if not edge.is_static]
         if not moving_edges:
             return None
@@ -309,7 +317,7 @@ class FrameTree:
             if edge.is_static:
                 steps.append(PoseTrack(edge.times_ns, edge.poses, gap_ns=_FOREVER_NS))
                 continue
-            # A transform such as map to odometry is only sent when it changes.
+            # Some transforms, such as from the odometry to the map, are only sent when they change.
             count = len(edge.times_ns)
             is_seldom = count == 1 or count * _SELDOM_NS < drive_ns
             holds = edge is not lowest and is_seldom
@@ -359,16 +367,17 @@ def odometry_poses(
     Returns:
         The poses, or None without usable odometry, and notes on assumptions.
     """
-    # Rank (0 is the best), index in ``odometries``, and transform from the vehicle to the body.
+    # Rank (0 is the best), index in ``odometries``, and transform from the vehicle's frame to the
+    # frame of the odometry's body.
     candidates: list[tuple[int, int, np.ndarray]] = []
     notes = []
     for number, odometry in enumerate(odometries):
         child = odometry.child
         if child == vehicle:
-            candidates.append((0, number, np.eye(4)))
+            candidates.append((_OF_VEHICLE, number, np.eye(4)))
             continue
         if not child or not vehicle:
-            candidates.append((2, number, np.eye(4)))
+            candidates.append((_OF_UNKNOWN_FRAME, number, np.eye(4)))
             continue
         child_from_vehicle = tree.between(child, vehicle) if child in tree.frames else None
         if child_from_vehicle is None:
@@ -377,17 +386,18 @@ def odometry_poses(
                 "its frame with --vehicle-frame if it is the vehicle's"
             )
         else:
-            candidates.append((1, number, child_from_vehicle))
+            candidates.append((_OF_CONNECTED_FRAME, number, child_from_vehicle))
     if not candidates:
         return None, notes
 
     def order(candidate: tuple[int, int, np.ndarray]) -> tuple[int, int]:
+        """Sort key of a candidate; the smallest one is the best."""
         rank, number, _ = candidate
         return rank, -len(odometries[number].poses)
 
     rank, number, child_from_vehicle = min(candidates, key=order)
     best = odometries[number]
-    if rank == 2 and best.child not in VEHICLE_FRAMES:
+    if rank == _OF_UNKNOWN_FRAME and best.child not in VEHICLE_FRAMES:
         notes.append(f"{best} is taken for the poses of the vehicle's frame")
     others = [str(odometries[other]) for _, other, _ in candidates if other != number]
     if others:

@@ -34,7 +34,7 @@ def _open(path: Path) -> AnnotationFile:
         reader = pa.ipc.open_file(pa.memory_map(str(path)))
         for number, batch in enumerate(file.batches):
             if not reader.get_batch(number).equals(batch):
-                raise InputError(f"it lists another part {number}")
+                raise InputError(f"part {number} that it lists is not the one in the file")
     except (pa.ArrowException, OSError, ValueError) as error:
         if is_machine_error(error):
             raise
@@ -119,7 +119,7 @@ def check_files(paths: Sequence[Path], root: Path | None, workers: int) -> str:
                 text = "; ".join(problems[:_MOST_PROBLEMS])
                 if len(problems) > _MOST_PROBLEMS:
                     text += f", and {len(problems) - _MOST_PROBLEMS} more"
-                raise InputError(f"{path} is right, but: {text}")
+                raise InputError(f"{path} itself is right, but not all files that it names: {text}")
             lines[-1] += ", images and LiDAR files whole"
     return "\n".join(lines)
 
@@ -127,8 +127,8 @@ def check_files(paths: Sequence[Path], root: Path | None, workers: int) -> str:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``tools/create_data.py check``."""
     parser.add_argument("annotations", type=Path, nargs="+", help="annotation files (.arrow)")
-    root = "read every image and LiDAR file below this folder too"
-    parser.add_argument("--data-root", type=Path, help=root)
+    root_help = "also read all images and LiDAR files, whose paths are relative to this folder"
+    parser.add_argument("--data-root", type=Path, help=root_help)
     add_workers_option(parser)
 
 

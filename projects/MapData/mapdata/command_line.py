@@ -115,8 +115,8 @@ def add_file_options(parser: argparse.ArgumentParser, frame: str, max_sweeps: in
     add_range_options(parser, RANGES[frame])
     sweeps = "earlier LiDAR sweeps to list per sample (default: %(default)s)"
     add("--max-sweeps", type=int, default=max_sweeps, help=sweeps)
-    add("--out-dir", type=Path, help="where the annotation files go (default: the data root)")
-    add("--tag", default="", help="appended to the file names, such as _extended")
+    add("--out-dir", type=Path, help="folder of the annotation files (default: the data root)")
+    add("--tag", default="", help="suffix of the file names, such as _extended")
     add_workers_option(parser)
     add_shard_options(parser)
 
@@ -124,11 +124,11 @@ def add_file_options(parser: argparse.ArgumentParser, frame: str, max_sweeps: in
 def add_split_options(parser: argparse.ArgumentParser, names: tuple[str, ...]) -> None:
     """Add the options that select a split; ``names`` are the published splits."""
     add = parser.add_argument
-    text = f"a published split by place: {', '.join(names)}"
-    add("--split-name", default="", choices=names, metavar="NAME", help=text)
-    add("--split-file", type=Path, help="own splits as JSON (docs/data.md)")
-    text = "convert a published split even if scenes of it are missing"
-    add("--allow-missing", action="store_true", help=text)
+    names_help = f"a published split by place: {', '.join(names)}"
+    add("--split-name", default="", choices=names, metavar="NAME", help=names_help)
+    add("--split-file", type=Path, help="file with the scenes of other splits (docs/data.md)")
+    missing_help = "convert a published split even if scenes of it are missing"
+    add("--allow-missing", action="store_true", help=missing_help)
 
 
 def add_range_options(
@@ -142,7 +142,7 @@ def add_range_options(
     """
     for axis, name in enumerate("xy"):
         default = None if ranges is None else ranges[axis]
-        usual = f"{default[0]:g} {default[1]:g}" if default else "the data set's usual"
+        usual = f"{default[0]:g} {default[1]:g}" if default else "the usual one of the data set"
         parser.add_argument(
             f"--{name}-range", type=float, nargs=2, default=default, metavar=("MIN", "MAX"),
             help=f"{name} of the ground truth in metres (default: {usual})",
@@ -167,7 +167,7 @@ def add_log_options(parser: argparse.ArgumentParser, usual_rate: str) -> None:
     add = parser.add_argument
     add("--root", type=Path, required=True, help="folder that holds train, val and test")
     add("--split", default="val", choices=("train", "val", "test"))
-    logs_help = "only these (ids, or their first characters)"
+    logs_help = "use only these logs, given by their ids or the first characters of them"
     add("--logs", nargs="+", default=(), metavar="LOG", help=logs_help)
     rate_help = f"samples or pictures per second, such as 2.5hz, or all (default: {usual_rate})"
     add("--rate", type=parse_rate, default=argparse.SUPPRESS, dest="rate_hz", help=rate_help)

@@ -186,7 +186,7 @@ def _paths_from(source: int, graph: dict[int, list[Edge]]) -> Iterator[list[int]
     stack = [(1, source, iter(graph[source]))]
     while stack:
         length, node, edges = stack[-1]
-        del path[length:]
+        del path[length:]  # go back to the node
         edge = _next_edge(edges, visited)
         if edge is None:
             stack.pop()

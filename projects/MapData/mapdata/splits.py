@@ -14,7 +14,7 @@ from gsmap.utils.split_lists import list_identity
 
 OFFICIAL = "official"
 _PARTS = ("train", "val", "test")
-_FORM = '{"train": ["scene-0001", ...], "val": [...]}, or a text file with a scene a line'
+_FORM = '{"train": ["scene-0001", ...], "val": [...]}, or a text file with one scene per line'
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class SplitList:
                 "the data set with the missing scenes (docs/data.md), or use the present scenes "
                 "with --allow-missing, for figures that are not compared with published ones."
             )
-        return f"{known}, which has no more."
+        return f"{known}; the others are missing there."
 
 
 def _families() -> list[str]:

@@ -7,8 +7,8 @@ import numpy as np
 
 from gsmap.utils.errors import InputError
 
-VERSION = "v1.0-trainval"
-FORMAT = 1
+VERSION = "v1.0-trainval"  # folder of the tables, as in nuScenes
+FORMAT = 1  # version of the generator's output
 TRAIN_LOCATIONS = ("singapore-onenorth", "singapore-hollandvillage", "singapore-queenstown")
 VAL_LOCATIONS = ("boston-seaport",)
 MAX_TRAIN_SCENES = 700

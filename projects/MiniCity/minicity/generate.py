@@ -61,16 +61,16 @@ def plan_scenes(config: MiniCityConfig) -> list[SceneTask]:
         (splits.val, config.num_val, VAL_LOCATIONS),
     ):
         for i, name in enumerate(names[: count * config.passes]):
-            pass_index, route = divmod(i, count)  # `route` is the number of the street
-            location = locations[route % len(locations)]
+            pass_index, street = divmod(i, count)
+            location = locations[street % len(locations)]
             is_new = pass_index >= config.passes - config.new_passes
             has_old_paint = config.repainted > 0 and not is_new
             task = SceneTask(
                 name=name,
                 index=len(tasks),
                 location=location,
-                index_in_town=route // len(locations),
-                route=names[route],
+                index_in_town=street // len(locations),
+                route=names[street],  # the scene of the first pass of this street
                 pass_index=pass_index,
                 expansion=f"{location}{BEFORE}" if has_old_paint else location,
             )
@@ -193,7 +193,7 @@ def _partial_folder(root: Path) -> Iterator[Path]:
     partial.mkdir(exist_ok=True)
     handle = os.open(partial, os.O_RDONLY | os.O_NOFOLLOW)
     try:
-        # None on a disk without locks, where only an empty folder is known to be unused.
+        # None on a disk without locks. There, a folder with files may be in use by another process.
         locked = try_lock(handle)
         is_used = locked is False or (locked is None and any(partial.iterdir()))
         if is_used:

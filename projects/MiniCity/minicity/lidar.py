@@ -11,6 +11,7 @@ BEAMS = 32
 COLUMNS = 720
 LOWEST_RAD, HIGHEST_RAD = np.deg2rad(-30.0), np.deg2rad(9.0)
 RANGE_M = 75.0
+_NEAREST_M = 0.3  # nearer hits do not count
 RANGE_NOISE_M = 0.015
 
 
@@ -65,14 +66,18 @@ def _entry_distances(origin: Array, directions: Array, boxes: Array) -> Array:
     edge = np.roll(start, -1, axis=1) - start  # to the next corner. (n, 4, 2)
     dx = directions[:, 0, None, None]
     dy = directions[:, 1, None, None]
-    cross = dx * edge[None, ..., 1] - dy * edge[None, ..., 0]
-    cross = np.where(np.abs(cross) < 1e-12, 1e-12, cross)
+    direction_cross_edge = dx * edge[None, ..., 1] - dy * edge[None, ..., 0]
+    is_parallel = np.abs(direction_cross_edge) < 1e-12
+    direction_cross_edge = np.where(is_parallel, 1e-12, direction_cross_edge)
     # A ray meets the line of an edge where reach * direction = start + share * edge. The cross
     # product of both sides with the edge gives `reach`, with the direction it gives `share`.
-    area = start[None, ..., 0] * edge[None, ..., 1] - start[None, ..., 1] * edge[None, ..., 0]
-    reach = area / cross
-    share = (start[None, ..., 0] * dy - start[None, ..., 1] * dx) / cross  # 0 to 1 on the edge
-    hit = (reach > 0.3) & (share >= 0) & (share <= 1)
+    start_cross_edge = (
+        start[None, ..., 0] * edge[None, ..., 1] - start[None, ..., 1] * edge[None, ..., 0]
+    )
+    reach = start_cross_edge / direction_cross_edge
+    start_cross_direction = start[None, ..., 0] * dy - start[None, ..., 1] * dx
+    share = start_cross_direction / direction_cross_edge  # 0 to 1 on the edge
+    hit = (reach > _NEAREST_M) & (share >= 0) & (share <= 1)
     return np.where(hit, reach, np.inf).min(axis=2)
 
 

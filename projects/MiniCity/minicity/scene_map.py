@@ -172,6 +172,7 @@ def zebra(side_a: Array, side_b: Array, stripe_m: float = 0.5, gap_m: float = 0.
     lengths_b = arc_lengths(side_b)
     total = float(lengths_a[-1])
     count = max(1, int((total - 0.3) / (stripe_m + gap_m)))
+    # The stripes, with gaps between them, are centred between the kerbs.
     first = (total - count * (stripe_m + gap_m) + gap_m) / 2
     stripes = []
     for k in range(count):
@@ -179,7 +180,8 @@ def zebra(side_a: Array, side_b: Array, stripe_m: float = 0.5, gap_m: float = 0.
         shares = np.array([start, start + stripe_m]) / total
         edge_a = _points_at_shares(side_a, lengths_a, shares)
         edge_b = _points_at_shares(side_b, lengths_b, shares)
-        stripes.append(np.concatenate([edge_a, edge_b[::-1]]))  # there on a, back on b
+        # An outline goes along side a and returns along side b.
+        stripes.append(np.concatenate([edge_a, edge_b[::-1]]))
     return stripes
 
 

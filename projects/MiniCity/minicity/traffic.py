@@ -32,6 +32,7 @@ PAINTS: list[Color] = [
     (70, 150, 200),
 ]
 REACH_M = 75.0  # largest distance of traffic from the drive of the ego vehicle
+_LONGEST_SCENE_S = 20  # the paths of other vehicles suffice for this time
 SWING_M = 6.0  # distance in which the phase of a swing grows by 1 radian
 PASS_START_M = 3.0  # largest shift of the start of a pass, forwards or backwards
 
@@ -131,13 +132,15 @@ def plan_ego(town: Town, scene: int, duration_s: float, rng: np.random.Generator
         lanes = road.lanes()
         lane = lanes[int(rng.integers(len(lanes)))]
         speed = float(rng.uniform(low=5.0, high=13.0))
-        length = speed * duration_s + 8.0
+        length = speed * duration_s + 8.0  # with a path of 8 m after the drive
         lane_m = float(arc_lengths(lane.center)[-1])
         latest = max(lane_m - 6.0, 0.0)
+        # With probability 0.6, the drive ends near the junction at the end of the lane or beyond
+        # it. Otherwise it starts anywhere on the lane.
         earliest = max(0.0, latest - length - 10.0) if rng.random() < 0.6 else 0.0
         start = float(rng.uniform(low=earliest, high=latest))
         path = follow_lanes(town, lane, length_m=start + length, rng=rng)
-        if arc_lengths(path)[-1] >= start + length - 4.0:
+        if arc_lengths(path)[-1] >= start + length - 4.0:  # 4 m after the drive are enough
             return Drive(
                 path=path,
                 speed=speed,
@@ -294,11 +297,12 @@ def _moving_vehicles(
             continue
         arc_m = float(rng.uniform(low=0, high=40))
         lane_m = float(arc_lengths(lane.center)[-1])
+        # All vehicles of a lane have one speed, so they keep their distances, or they stand.
         driving_speed = rng.uniform(low=4, high=12)
         speed = float(rng.choice([0.0, driving_speed], p=[0.25, 0.75]))
         while arc_m < lane_m:
             drive = Drive(
-                path=follow_lanes(town, lane, length_m=arc_m + speed * 20, rng=rng),
+                path=follow_lanes(town, lane, length_m=arc_m + speed * _LONGEST_SCENE_S, rng=rng),
                 speed=speed,
                 start_m=arc_m,
                 swing_m=0.1,
@@ -318,33 +322,52 @@ def _parked_vehicles(
     Args:
         town: The town.
         track: Positions of the ego vehicle in metres. (T, 2)
-        density: Traffic relative to dense traffic, in (0, 1]; more places are then in use.
+        density: Traffic relative to dense traffic, in (0, 1].
+        rng: Source of all random choices.
+    """
+    actors = _cars_on_shoulders(town, track, density=density, rng=rng)
+    for park in town.carparks:
+        if not _is_near(park.slots[:, :2], track):
+            continue
+        for slot in park.slots:  # x, y, heading
+            if rng.random() < 0.65:
+                car = _random_vehicle(rng, f"p{len(actors)}", only_cars=True)
+                actors.append(_actor_at_rest(car, slot[:2], yaw=slot[2]))
+    return actors
+
+
+def _cars_on_shoulders(
+    town: Town, track: Array, density: float, rng: np.random.Generator
+) -> list[Actor]:
+    """Cars on wide shoulders near a track.
+
+    Args:
+        town: The town.
+        track: Positions of the ego vehicle in metres. (T, 2)
+        density: Traffic relative to dense traffic, in (0, 1]. In denser traffic, more places are in
+            use.
         rng: Source of all random choices.
     """
     actors: list[Actor] = []
     for road in town.roads:
         section = road.section
-        if not _is_near(road.center[::6], track):
+        if not _is_near(road.center[::6], track):  # every sixth point is enough
             continue
+        # Cars on the left shoulder of a road with opposite traffic face backwards.
         left_turn = np.pi if section.backward else 0.0
         for offset, width, turn in (
             (section.right_m + 1.15, section.right_shoulder_m, 0.0),
             (section.left_m - 1.15, section.left_shoulder_m, left_turn),
         ):
             arc_m = float(rng.uniform(low=4, high=12))
-            while width > 2 and arc_m < road.length_m - 12:
+            if width <= 2:  # no room for a car
+                continue
+            while arc_m < road.length_m - 12:
                 if rng.random() < 0.55 * density + 0.15:
                     car = _random_vehicle(rng, f"p{len(actors)}", only_cars=True)
                     yaw = road.direction(arc_m) + turn
                     actors.append(_actor_at_rest(car, road.point(arc_m, offset), yaw=yaw))
-                arc_m += 6.2
-    for park in town.carparks:
-        if not _is_near(park.slots[:, :2], track):
-            continue
-        for slot in park.slots:
-            if rng.random() < 0.65:
-                car = _random_vehicle(rng, f"p{len(actors)}", only_cars=True)
-                actors.append(_actor_at_rest(car, slot[:2], yaw=slot[2]))
+                arc_m += 6.2  # length of a place
     return actors
 
 

@@ -177,7 +177,7 @@ def test_a_pattern_of_any_folders_is_looked_for_once():
     [
         ([i * (2**61 - 1) for i in range(3)], "more than 60 bits"),
         ([(0, 2**61 - 1)], "more than 60 bits"),
-        ([(1.5, 2.5)], "more than 60 bits"),
+        ([(1.5, 2.5)], "a tuple with a floating-point number"),
         ([(-1,) * 9], "a key has 9 parts"),
     ],
 )

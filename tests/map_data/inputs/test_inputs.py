@@ -234,7 +234,7 @@ def test_two_images_of_a_camera_with_one_name_are_refused(tmp_path):
         cv2.imwrite(str(tmp_path / folder / "0.png"), np.zeros((90, 160, 3), np.uint8))
     content = {"cameras": {"front": LEVEL | {"images": "*/0.png"}}}
     (tmp_path / "calibration.yaml").write_text(yaml.safe_dump(content))
-    with pytest.raises(ValueError, match=r"'front' .*two of its images .* have one name"):
+    with pytest.raises(ValueError, match=r"'front' .*two of its images .* have equal names"):
         open_input(tmp_path)
 
 

@@ -210,7 +210,7 @@ def test_a_model_with_a_map_can_be_copied():
     ("settings", "message"),
     [
         ({"bev": None, "queries": None}, "prior needs bev, queries or both"),
-        ({"cell_m": 1.5}, r"prior\.cell_m is 1\.5: BEV cells of 5 m must be a multiple of it"),
+        ({"cell_m": 1.5}, r"prior\.cell_m is 1\.5: the side of BEV cells, 5 m, must be a multiple"),
         ({"cell_m": 15.0}, r"prior\.cell_m is 15"),
         ({"test_memory": "never"}, "memory of a prior must be one of"),
         ({"test_rule": {"name": "newest"}}, "rule of a prior must be one of"),

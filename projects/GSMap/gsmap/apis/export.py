@@ -65,8 +65,9 @@ class ExportedDetector(nn.Module):
             )
         if model.temporal is not None and model.temporal.elements is not None:
             raise InputError(
-                "temporal.elements works behind the network and has no ONNX operators: set "
-                "model.temporal.elements=None (temporal=None without other memory)."
+                "temporal.elements updates the detections after the network and has no ONNX "
+                "operators: set model.temporal.elements=None, or model.temporal=None if the model "
+                "has no other memory."
             )
         if model.prior is not None and not model.prior.reads_window:
             raise InputError(
@@ -123,7 +124,7 @@ class ExportedDetector(nn.Module):
         Returns:
             Fields of the elements in the order of ``output_names``, and the new memory by name.
         """
-        # a tensor of four axes is normalised and padded image by image
+        # The preprocessor normalises and pads each image of a tensor with four axes by itself.
         batch = self.model.data_preprocessor({"inputs": {"img": images}})
         images = batch["inputs"]["imgs"]
         all_levels = self.model.extract_img_feats(images[None])
@@ -427,8 +428,9 @@ def largest_differences(
     Args:
         found: Elements of the first prediction.
         expected: Elements of the second prediction.
-        unfolded: Class indices whose points may be in another order. Where two orders are nearly
-            equally short, rounding determines which one ``unfold_classes`` selects.
+        unfolded: Class indices of ``unfold_classes``, whose points are reordered to a short path.
+            Where two orders are nearly equally short, rounding determines which one is selected, so
+            the order of points does not count for these classes.
 
     Returns:
         The largest difference of a score, and the largest distance in metres of an element from the
@@ -490,7 +492,7 @@ def _operator_translations() -> dict[Any, Any]:
 
 
 def _describe_export_error(error: BaseException) -> str:
-    """Message of the first cause of a failed export."""
+    """Message of the error that caused all others in a failed export."""
     while error.__cause__ is not None:
         error = error.__cause__
     if isinstance(error, GsmapError):  # raised by the model, for example for a number of cameras

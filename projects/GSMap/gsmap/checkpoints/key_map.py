@@ -39,7 +39,7 @@ def _has_default_markers(key_map: KeyMap) -> bool:
 
 
 def is_upstream(keys: Iterable[str]) -> bool:
-    """Whether state keys have the format of the earlier systems."""
+    """Whether state keys have the format of upstream, the code of the models' authors."""
     prefixes = tuple({key_map.upstream_prefix for key_map in key_maps()})
     return any(key.startswith(prefixes) for key in keys)
 
@@ -58,4 +58,5 @@ def find_key_map(keys: Iterable[str]) -> KeyMap:
     for key_map in key_maps():
         if key_map.is_marked(keys, upstream=upstream):
             return key_map
+    # The last maps have no markers and match any key, so there are no keys.
     raise InputError("the checkpoint holds no weights.")

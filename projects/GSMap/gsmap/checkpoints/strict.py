@@ -10,7 +10,7 @@ from gsmap.utils.errors import InputError
 
 
 class AddsWeights:
-    """Mixin for a module with weights that the module it extends does not have.
+    """Mixin for a module that adds weights to a model. Checkpoints without them can be loaded.
 
     Attributes:
         neutral_keys: Prefixes, relative to the module, of the state keys of additional weights.
@@ -72,10 +72,11 @@ def adapt_state(
             state[prefix + key] = value
     if fit is not None:
         fit(state)
+    # Absent keys are either allowed to be absent (untrained keys, batch counters) or missing.
     absent = expected.keys() - state.keys()
     untrained: list[str] = []
     for keys in neutral:
-        if keys <= absent:
+        if keys <= absent:  # if only a part of the set is absent, this part counts as missing
             untrained += keys
     untrained.sort()
     missing = {key for key in absent if not key.endswith("num_batches_tracked")}

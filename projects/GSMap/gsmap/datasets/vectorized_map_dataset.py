@@ -43,8 +43,8 @@ class VectorizedMapDataset(BaseDataset):
         data_root: Folder that image and LiDAR paths are relative to.
         pipeline: Transforms or their configs.
         classes: Expected class names of the file in label order; None for any.
-        grid: Expected ``x_range`` and ``y_range`` of the file in metres, among the arguments of
-            `BEVGrid`; None for any.
+        grid: Arguments of `BEVGrid`. Its ``x_range`` and ``y_range`` in metres are the expected
+            ones of the file; None for any.
         split: Expected split of the file; None for any.
         frame: Expected annotation frame of the file, ``lidar`` or ``ego``; None for any.
         dim: Coordinates per point of the ground truth, 2 or 3; None for the number in the file.
@@ -120,7 +120,7 @@ class VectorizedMapDataset(BaseDataset):
             y_range = extent.y_range
         self.cameras = None if cameras is None else tuple(cameras)
         self.broken_samples = broken_samples
-        self.broken_tokens: dict[str, str] = {}
+        self.broken_tokens: dict[str, str] = {}  # error of each skipped sample, by token
         # Values in memory, which replace the values of the annotation file:
         self.images_in_memory: Mapping[str, np.ndarray] = {}  # BGR images by camera, (H, W, 3)
         self.can_bus_in_memory: np.ndarray | None = None  # vehicle signals, (18,)
@@ -317,11 +317,15 @@ class VectorizedMapDataset(BaseDataset):
             idx: Index of the sample.
 
         Returns:
-            Dictionary with the keys of mmdet3d's multi-view pipelines (``images``,
-            ``lidar_points``, ``lidar_sweeps``, ``timestamp``), the keys of the packed metainfo,
-            ``dim``, ``map_instances``, which are the elements at full resolution with ``dim``
-            coordinates per point in metres, and ``map_heights``, the heights of the n points of
-            each element in metres, (n,), or None for a file without heights.
+            Dictionary with these keys:
+
+            * ``images``, ``lidar_points``, ``lidar_sweeps`` and ``timestamp``, as in mmdet3d's
+              multi-view pipelines;
+            * the keys of the packed metainfo, and ``dim``;
+            * ``map_instances``: the elements at full resolution, with ``dim`` coordinates per point
+              in metres;
+            * ``map_heights``: the heights of the n points of each element in metres, (n,), or None
+              for a file without heights.
 
         Raises:
             BrokenSampleError: If the sample lacks a camera of ``cameras``.
@@ -330,7 +334,7 @@ class VectorizedMapDataset(BaseDataset):
         sample = self.annotations[entry["row"]]
         dim = self._metainfo["dim"]
         instances = sample.instances
-        heights = None
+        heights = None  # kept separately, because the points may lose their z below
         if instances is not None and self.annotations.meta.dim == 3:
             heights = [instance.points[:, 2] for instance in instances]
         ground_truth = None
@@ -401,6 +405,7 @@ class VectorizedMapDataset(BaseDataset):
 
         before = None
         after = None
+        # Rows need not be in the order of time, so the signs of the differences decide.
         for neighbour_row in (row - 1, row + 1):
             if not 0 <= neighbour_row < len(self.annotations):
                 continue

@@ -52,8 +52,8 @@ class KeepMaximum(WriteRule):
 
     def update(self, states: States, values: Floats) -> States:
         """Update cells that are in view. (S, C, n), (C, n) -> (S, C, n)"""
-        seen = (values * 255).astype(np.uint8)
-        return np.maximum(states, seen[None])
+        predicted = (values * 255).astype(np.uint8)
+        return np.maximum(states, predicted[None])
 
     def read(self, states: States) -> Floats:
         """Convert states to values in [0, 1]. (S, C, ...) -> (C, ...)"""
@@ -93,11 +93,11 @@ class LastSeen(WriteRule):
 
     def update(self, states: States, values: Floats) -> States:
         """Update cells that are in view. (S, C, n), (C, n) -> (S, C, n)"""
-        seen = self.empty + np.float32(self.gain) * values
-        new = np.maximum(states, seen[None])
+        raised = self.empty + np.float32(self.gain) * values  # 100 for a miss
+        new = np.maximum(states, raised[None])
         # As in HRMapNet's public code, a p so small that 100 + 30 p is rounded to 100 is a miss.
-        is_miss = seen[None] <= self.empty
-        new -= is_miss
+        is_miss = raised[None] <= self.empty
+        new -= is_miss  # subtracts 1: a lower cell, which the maximum has set to 100, becomes 99
         return np.clip(new, self.lowest, self.highest).astype(np.uint8)
 
     def read(self, states: States) -> Floats:
@@ -181,7 +181,7 @@ def rule_from_settings(settings: Any, rules: Mapping[str, type] = RULES) -> Any:
         ValueError: If the rule is unknown or its settings are invalid.
     """
     if not isinstance(settings, dict) or settings.get("name") not in list(rules):
-        raise InputError(f"the rule must have a name of {sorted(rules)}.")
+        raise InputError(f"the rule must have a name that is one of {sorted(rules)}.")
     kind = rules[settings["name"]]
     numbers = {name: value for name, value in settings.items() if name != "name"}
     expected = set(rule_settings(kind(), rules)) - {"name"}

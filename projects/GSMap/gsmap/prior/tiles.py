@@ -25,10 +25,11 @@ _WASTED_BYTES = 64 << 20
 
 
 class TileStore:
-    """Tiles by their place, with a limit of memory.
+    """Tiles by their column and row in the global frame (`TileKey`), with a limit of memory.
 
-    When the limit is reached, the least recently used tile leaves memory. If it has changed since
-    it was read, it is compressed and written to a temporary file.
+    A tile is an array of cell states, whose meaning the rule of the prior defines. When the limit
+    is reached, the least recently used tile leaves memory. If it has changed since it was read, it
+    is compressed and written to a temporary file.
 
     Args:
         shape: Shape of a tile.
@@ -48,12 +49,14 @@ class TileStore:
         self._spill = _SpillFile()
 
     def open(self, mapped: mmap.mmap, path: Path, places: dict[TileKey, TilePlace]) -> None:
-        """Replace the content by the content of a file.
+        """Read tiles from a file from now on.
+
+        The tiles in memory stay. So the store must be empty, or the file must hold its content.
 
         Args:
             mapped: Content of the file.
             path: Name of the file, for messages.
-            places: Place of each tile in the file.
+            places: Position and checksum of each tile in the file.
         """
         if self._mapped is not None:
             self._mapped.close()
@@ -64,7 +67,7 @@ class TileStore:
         self._spill.clear()
 
     def keys(self) -> set[TileKey]:
-        """Places of all tiles, in memory or not."""
+        """Columns and rows of all tiles, in memory or not."""
         return {*self._file_places, *self._spill.places, *self._tiles}
 
     @property
@@ -73,7 +76,10 @@ class TileStore:
         return len(self._tiles)
 
     def get(self, key: TileKey) -> Tile | None:
-        """Return a tile, or None for a tile without states. The caller must not store the tile."""
+        """Return a tile, or None if nothing was written to it.
+
+        The caller must not keep the tile, because later changes may go to a new array.
+        """
         tile = self._tiles.get(key)
         if tile is None:
             tile = self._load(key)
@@ -84,7 +90,10 @@ class TileStore:
         return tile
 
     def get_to_write(self, key: TileKey, empty: int) -> Tile:
-        """Return a tile that the caller changes at once; a new one has ``empty`` everywhere."""
+        """Return a tile for the caller to change before the next call.
+
+        A tile that does not exist yet is created, with ``empty`` everywhere.
+        """
         tile = self.get(key)
         if tile is None:
             tile = np.full(self.shape, empty, dtype=np.uint8)
@@ -93,7 +102,7 @@ class TileStore:
         return tile
 
     def packed_tiles(self) -> Iterator[tuple[TileKey, bytes]]:
-        """Iterate over all tiles, compressed, in the order of their places."""
+        """Iterate over all tiles, compressed, in the order of their columns, then rows."""
         for key in sorted(self.keys()):
             yield key, self._packed(key)
 
@@ -117,7 +126,7 @@ class TileStore:
 
     def _stored(self, key: TileKey) -> tuple[bytes, int]:
         """Compressed states and checksum of a tile in the temporary file or the prior's file."""
-        if key in self._spill.places:
+        if key in self._spill.places:  # newer than the tile in the prior's file
             return self._spill.read(key)
         assert self._mapped is not None
         offset, length, crc = self._file_places[key]
@@ -154,8 +163,8 @@ class _SpillFile:
     def __init__(self) -> None:
         self.places: dict[TileKey, TilePlace] = {}
         self._file: IO[bytes] | None = None
-        self._end = 0
-        self._used_bytes = 0
+        self._end = 0  # size of the file in bytes
+        self._used_bytes = 0  # size of the current tiles in it, without replaced ones
         self._process = os.getpid()
 
     def write(self, key: TileKey, content: bytes) -> None:
@@ -165,7 +174,8 @@ class _SpillFile:
         if replaced_bytes > max(_WASTED_BYTES, self._used_bytes):
             self._compact()
         if key in self.places:
-            self._used_bytes -= self.places[key][1]
+            _, old_length, _ = self.places[key]
+            self._used_bytes -= old_length
         self._append(key, content)
 
     def read(self, key: TileKey) -> tuple[bytes, int]:
@@ -186,7 +196,7 @@ class _SpillFile:
         self._used_bytes = 0
 
     def _require_process(self) -> None:
-        """Require the process that made the prior: a fork shares its position in the file."""
+        """Raise an error in a forked process, whose reads would move the position of both."""
         if self._process != os.getpid():
             raise WorkError(
                 "a map prior with changes belongs to the process that made it: save it, and load "
@@ -208,7 +218,7 @@ class _SpillFile:
         old_file = self._file
         old_places = self.places
         assert old_file is not None
-        self._file = None
+        self._file = None  # so that `clear` leaves the old file open
         self.clear()
         for key, (offset, length, _) in old_places.items():
             old_file.seek(offset)

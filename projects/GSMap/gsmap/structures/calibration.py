@@ -72,7 +72,8 @@ def calibration_arrays(
                 return np.zeros(NUM_CAN_BUS)
             raise InputError(
                 f"sample {meta.get('token')!r} has no {key!r} in its metainfo: pack it in the "
-                "pipeline; lidar2ego is a record's ego_from_frame (docs/custom_data.md)."
+                "pipeline; lidar2ego comes from ego_from_frame of the sample's record "
+                "(docs/custom_data.md)."
             )
         value = np.asarray(meta[key], dtype=np.float64)
         return without_history(value) if key == "can_bus" else value

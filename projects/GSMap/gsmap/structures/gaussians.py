@@ -50,10 +50,10 @@ class GaussianSpace:
         max_scale_m: Largest sigma in metres.
         init_scales_m: Sigma of the initial Gaussian of a query, along and across the direction of
             travel, in metres.
-        activation: Function from an entry s to sigma, with s_0 for which s = 0 gives the initial
-            sigma: ``"sigmoid"``: min + (max - min) sigmoid(s + s_0); ``"softplus"``: min +
-            softplus(s + s_0); ``"exp"``: min + exp(s + s_0). The last two are clamped to the
-            largest sigma.
+        activation: Function from an entry s of a reference to sigma. ``"sigmoid"`` is
+            min + (max - min) sigmoid(s + s_0), ``"softplus"`` is min + softplus(s + s_0), and
+            ``"exp"`` is min + exp(s + s_0). The last two are clamped to the largest sigma. The
+            offset s_0 is such that s = 0 gives the initial sigma.
         literal_covariance: Use S = diag(sigma^2) as printed in GSMap Eq. 3, so that the standard
             deviations are the squares of sigma.
 
@@ -167,8 +167,8 @@ class GaussianSpace:
         matrix :math:`R(\theta) D R(\theta)^T` is equal for theta and theta + pi, which describe one
         Gaussian. Both are exactly the identity for the initial Gaussian of a query.
 
-        Each operation is a launch on a GPU, six times per frame, so products of constants are
-        computed beforehand.
+        The method runs once for each of the six decoder layers of a frame. To save operations, each
+        of which is a launch on a GPU, products of constants are computed beforehand.
 
         Args:
             reference: References of the decoder. (..., D)
@@ -203,10 +203,10 @@ class GaussianSpace:
             return torch.cat(entries, dim=-1).unflatten(-1, (2, 2))
         # Theta is the angle from the direction of travel, and a and b are the stretches along both
         # axes. The entries of the result are the products (a cos, a sin, b cos, b sin), each with a
-        # constant factor. Row i of the constant matrix has the factors with which product i enters
-        # the entries (xx, xy, yx, yy).
+        # constant factor. A constant matrix, whose rows belong to the products and whose columns
+        # belong to the entries (xx, xy, yx, yy), has these factors.
         turn = _cos_and_sin(theta, factor=1.0, shift_rad=0.0)
-        products = (stretch[..., :, None] * turn[..., None, :]).flatten(-2)
+        products = (stretch[..., :, None] * turn[..., None, :]).flatten(-2)  # (..., 4)
         first = [(1, 0, 0, 0), (0, 0, x_per_y, 0)]
         second = [(0, 0, 0, 1), (0, -y_per_x, 0, 0)]
         # The axis of a is the direction of travel: x for the first order, y for the second one.

@@ -33,8 +33,9 @@ def is_closed(points: Points) -> bool:
 def arc_lengths(points: Points) -> NDArray[np.float64]:
     """Compute the distance along a polyline from its first point to each point, in the plane.
 
-    Heights do not count, as in shapely, with which the public code of the methods resamples lines.
-    So a line with z and its projection to the plane are resampled at equal (x, y).
+    Heights do not count. The released code of the published methods resamples lines by shapely,
+    which ignores heights as well. So a line with z and its projection to the plane are resampled at
+    equal (x, y).
 
     Args:
         points: Vertices in metres. (n, D)
@@ -150,8 +151,10 @@ def resample_all(
         return resampled
     # All polylines get the length n of the longest: the last vertex is repeated.
     place = np.minimum(np.arange(counts.max()), counts[:, None] - 1)  # in the polyline, (N, n)
-    vertex = place + offsets[:-1, None]
-    vertices = points[vertex.clip(0)]  # (N, n, D); -1 belongs to a polyline without vertices
+    vertex = place + offsets[:-1, None]  # row of `points`
+    # Without vertices, the place is -1, and the row is that of another polyline or -1. The row may
+    # be any valid one, because such a polyline keeps its zeros below.
+    vertices = points[vertex.clip(0)]  # (N, n, D)
     steps = np.linalg.norm(np.diff(vertices[..., :2], axis=1), axis=-1)
     along = np.zeros(vertex.shape)
     np.cumsum(steps, axis=1, out=along[:, 1:])
@@ -260,16 +263,20 @@ def shortest_orders(lines: Points, least_gain_m: float = 1e-3) -> NDArray[np.int
         rows = orders[active]
         # Distances between the points at all pairs of places in the order, (m, P, P).
         paths = apart[active[:, None, None], rows[:, :, None], rows[:, None]]
-        paths = np.pad(paths, ((0, 0), (1, 1), (1, 1)))  # no step before the start, after the end
-        step = paths.diagonal(1, 1, 2)  # from the point before to each point, (m, P + 1)
+        # A row and a column of zeros on each side: the steps before the start and after the end of
+        # a line have no length. Place i of the order then has the index i + 1 in `paths`.
+        paths = np.pad(paths, ((0, 0), (1, 1), (1, 1)))
+        step = paths.diagonal(1, 1, 2)  # to place i from the place before it, (m, P + 1)
         # A reversal of the points i to j replaces the steps to point i and from point j by the
         # steps from the point before i to j, and from i to the point after j.
         replaced = step[:, :-1, None] + step[:, None, 1:]
-        gain = replaced - paths[:, :-2, 1:-1] - paths[:, 1:-1, 2:]
+        before_i_to_j = paths[:, :-2, 1:-1]
+        i_to_after_j = paths[:, 1:-1, 2:]
+        gain = replaced - before_i_to_j - i_to_after_j
         gain[is_ring[active], 0] = 0.0  # the ends stay
         gain[is_ring[active], :, -1] = 0.0
         gain = np.triu(gain, 1).reshape(len(active), -1)  # pairs with i < j
-        best = gain.argmax(1)  # i * P + j
+        best = gain.argmax(1)  # flat index i * P + j
         improves = gain[np.arange(len(active)), best] > least_gain_m
         active = active[improves]
         first, last = np.divmod(best[improves, None], size)
@@ -327,9 +334,11 @@ def clip_to_box(
     has_length = step.any(axis=-1)
     start = points[:-1][has_length]
     step = step[has_length]
-    edges = np.array([x_range, y_range]).T[:, None]  # lower edges, then upper edges
+    edges = np.array([x_range, y_range]).T[:, None]  # lower edges in x and y, then upper edges
+    # Share of each segment at which it crosses the lines of the lower and the upper edges in x and
+    # y, infinite if it is parallel to an edge.
     with np.errstate(divide="ignore", invalid="ignore"):
-        cuts = (edges - start[:, :2]) / step[:, :2]  # (2, n, 2), infinite if parallel to an edge
+        cuts = (edges - start[:, :2]) / step[:, :2]  # (2, n, 2)
     # A segment on the line of an edge gives 0 / 0. Such an edge does not cut it.
     along_edge = (step[:, :2] == 0) & np.isnan(cuts)
     cuts = np.where(along_edge, [[[-np.inf]], [[np.inf]]], cuts)
@@ -348,10 +357,12 @@ def clip_to_box(
     ends = [0, *breaks.tolist(), len(hits)]
     pieces = []
     for a, b in pairwise(ends):
+        # The start of the first segment of the piece, and the ends of all of its segments.
         piece = np.concatenate([first[a : a + 1], last[a:b]])
         pieces.append(piece)
     starts_inside = hits[0] == 0 and enter[0] == 0
     ends_inside = hits[-1] == len(start) - 1 and leave[-1] == 1
+    # The last piece of a ring goes on with the first one, if both meet inside the rectangle.
     if len(pieces) > 1 and starts_inside and ends_inside and is_closed(points):
         last_piece = pieces.pop()
         pieces[0] = np.concatenate([last_piece, pieces[0][1:]])

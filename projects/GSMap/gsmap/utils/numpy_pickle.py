@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+# Short names of plain dtypes: booleans, integers, floats, complex numbers, and strings.
 _CODE = re.compile(r"b1|[iu][1248]|f[248]|c8|c16|[SU][1-9]\d{0,3}")
 _STATE_PARTS = {int, str, type(None)}  # types of the entries of the state of a plain dtype
 _MAX_DIMS = 8
@@ -48,7 +49,7 @@ class CheckedDtype:
             if is_plain and state == numpy_state:
                 self.dtype = candidate
                 return
-        raise pickle.UnpicklingError(f"it changes the dtype {self.dtype} in a way of its own")
+        raise pickle.UnpicklingError(f"it changes the dtype {self.dtype} otherwise than numpy does")
 
 
 class CheckedArray(np.ndarray):
@@ -57,14 +58,14 @@ class CheckedArray(np.ndarray):
     def __new__(cls, *arguments: Any) -> "CheckedArray":
         """Create an empty array; arguments raise an ``UnpicklingError``."""
         if arguments:
-            raise pickle.UnpicklingError("it makes an array in a way of its own")
+            raise pickle.UnpicklingError("it makes an array otherwise than numpy does")
         return super().__new__(cls, shape=(0,), dtype=np.int8)
 
     def __setstate__(self, state: Any) -> None:  # type: ignore[override]
         try:
             _version, shape, checked, fortran, data = state
         except (TypeError, ValueError):
-            raise pickle.UnpicklingError("the state of an array has other parts") from None
+            raise pickle.UnpicklingError("the state of an array does not have five parts") from None
         if type(checked) is not CheckedDtype or not isinstance(data, bytes):
             raise pickle.UnpicklingError("an array holds something else than plain values")
         is_shape = isinstance(shape, tuple) and all(type(n) is int and n >= 0 for n in shape)
@@ -92,7 +93,7 @@ class CheckedArray(np.ndarray):
 def _array(kind: Any, *_placeholder: Any) -> CheckedArray:
     """Replacement of ``_reconstruct``."""
     if kind is not CheckedArray:
-        raise pickle.UnpicklingError("it makes an array of a class of its own")
+        raise pickle.UnpicklingError("it makes an array of another class than numpy.ndarray")
     return CheckedArray()
 
 
@@ -113,7 +114,7 @@ def _scalar(dtype: Any, data: Any) -> Any:
 def _encode(text: Any, encoding: Any) -> bytes:
     """Replacement of ``_codecs.encode``, with which older pickles store bytes."""
     if not isinstance(text, str) or encoding != "latin1":
-        raise pickle.UnpicklingError(f"it encodes as {encoding!r}")
+        raise pickle.UnpicklingError(f"it encodes bytes as {encoding!r} instead of latin1")
     return text.encode("latin1")
 
 

@@ -28,7 +28,8 @@ LAUNCHER = "GSMAP_LAUNCHER"  # environment variable with the process ID of torch
 _interpreter_flags = util._args_from_interpreter_flags  # type: ignore[attr-defined]
 
 
-# Linux's function for signals at the death of a parent; loaded early, as a fork may hold locks
+# Linux's function for signals at the death of a parent. It is loaded here, because loading takes
+# locks, and in a forked process these may be held by threads that do not exist there.
 _PRCTL: Callable[..., Any] | None = None
 if sys.platform == "linux":
     _PRCTL = ctypes.CDLL(None).prctl
@@ -111,7 +112,7 @@ def _end_with_parent() -> None:
 
 
 def _stop_worker(number: int, _frame: object) -> None:
-    """Interrupt the current task, whose clean-up runs, and start no other task."""
+    """Interrupt the current task by an exception, so that it cleans up, and start no other task."""
     _Worker.must_stop = True
     if _Worker.is_working:  # between tasks, a result is being sent and must be complete
         raise SystemExit(128 + number)
@@ -176,8 +177,8 @@ def ordered_map(
             if isinstance(error, BrokenProcessPool):
                 raise WorkError(
                     "a worker process died: most likely for want of memory (run again with fewer "
-                    "--workers), or because the program that called this cannot be imported anew "
-                    "(put the call under if __name__ == '__main__')."
+                    "--workers), or because a worker cannot import the program that called this "
+                    "without running it (put the call under if __name__ == '__main__')."
                 ) from error
             if isinstance(error, TimeoutError):
                 raise WorkError(
@@ -191,8 +192,9 @@ def ordered_map(
 
 @contextmanager
 def delay_signals() -> Iterator[None]:
-    """Context that delays signals; a process that is starting would print a traceback.
+    """Context that delays SIGINT and SIGTERM to its end.
 
+    Otherwise a signal would reach a worker process that is starting, which would print a traceback.
     The signal mask applies to this thread and to new processes. Another thread may receive the
     signal, and Python would run the handler in the main thread at once, so handlers are delayed as
     well.

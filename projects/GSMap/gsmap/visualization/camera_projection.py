@@ -45,9 +45,9 @@ def project_segments(
     last_values = _frustum_values(last, size_px)  # (5, n)
     first_outside = first_values < 0
     last_outside = last_values < 0
-    # Where a segment crosses a plane, its value is 0 at this fraction of the way from the first end
-    # to the last one. The segment is visible from the last plane at which it enters the frustum to
-    # the first one at which it leaves.
+    # A segment crosses a plane where the left side of the inequality is 0: at this fraction of the
+    # way from the first end to the last one. The segment is visible from the last plane at which it
+    # enters the frustum to the first one at which it leaves.
     crosses = first_outside != last_outside
     change = np.where(crosses, first_values - last_values, 1.0)  # 1 avoids a division by 0
     fraction = np.where(crosses, first_values / change, 0.0)

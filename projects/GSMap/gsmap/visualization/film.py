@@ -98,21 +98,21 @@ def write_drive_film(
             f"{annotations} has no scene {scene!r}: give one of its {len(scenes)}, such as "
             f"{scenes[0]!r}."
         )
-    drives = {}
+    frames_by_result = {}
     for name, result_path in results.items():
         result_frames = drive_frames(Path(result_path), file, file.meta.classes)
-        drives[name] = [frame for frame in result_frames if frame.scene == scene]
+        frames_by_result[name] = [frame for frame in result_frames if frame.scene == scene]
     row_of_token = {token: row for row, token in enumerate(file.column("token"))}
     # All results have the samples of the drive.
-    first_drive = next(iter(drives.values()))
-    rows = [row_of_token[frame.token] for frame in first_drive[:max_frames]]
+    first_frames = next(iter(frames_by_result.values()))
+    rows = [row_of_token[frame.token] for frame in first_frames[:max_frames]]
     all_times_ns = file.column("timestamp_ns")
     times_ns = [all_times_ns[row] for row in rows]
     root = Path(annotations).parent if data_root is None else data_root
     pictures = _draw_frames(
         file,
         rows=rows,
-        drives=drives,
+        frames_by_result=frames_by_result,
         root=root if images else None,
         score_thr=score_thr,
         width_px=width_px,
@@ -124,7 +124,7 @@ def write_drive_film(
 def _draw_frames(
     file: AnnotationFile,
     rows: Sequence[int],
-    drives: Mapping[str, Sequence[DriveFrame]],
+    frames_by_result: Mapping[str, Sequence[DriveFrame]],
     root: Path | None,
     score_thr: float,
     width_px: int,
@@ -134,7 +134,7 @@ def _draw_frames(
     Args:
         file: Annotation file.
         rows: Indices of the samples of the drive.
-        drives: Frames of each result, by its name.
+        frames_by_result: Frames of the drive for each result, by the name of the result.
         root: Folder that image paths are relative to, or None to leave cameras out.
         score_thr: Smallest score of a drawn prediction, in [0, 1].
         width_px: Width of the pictures in pixels.
@@ -145,10 +145,10 @@ def _draw_frames(
     for index, row in enumerate(rows):
         sample = file[row]
         panels = []
-        for name, frames in drives.items():
+        for name, frames in frames_by_result.items():
             panels.append(_result_panel(name, frame=frames[index], score_thr=score_thr))
         elements_over_cameras = panels[0].elements
-        first_frames = next(iter(drives.values()))
+        first_frames = next(iter(frames_by_result.values()))  # all have the ground truth
         panels.append(BEVPanel("Ground truth", first_frames[index].truth))
         cameras = []
         if root is not None:

@@ -39,7 +39,9 @@ from mapdata.unix_times import span_of
 
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
 _RATE_HZ = 10.0  # rate of the images if a calibration file has no rate_hz
-_MOST_ANY = 2  # largest number of ``**`` in a pattern; each multiplies the time by the depth
+# Largest number of ``**`` in a pattern. Each multiplies the time of the search by the depth of the
+# folders.
+_MOST_ANY = 2
 _MOST_SUFFIXES = 5  # number of suffixes that a message names
 
 
@@ -86,6 +88,7 @@ def read_image_folder(
         if poses is not None and pose_at is not None:
             frames, pose_notes = _frames_with_poses(frames, poses=poses, pose_at=pose_at)
             notes += pose_notes
+        # Images without distortion are cached below a digest, which depends on this key.
         target_key = set_rectification_targets(rig, trained or {})
         scene = folder.resolve().name
         samples = rig_samples(scene, rig, frames=frames, pose_at=pose_at)
@@ -115,7 +118,10 @@ def _read_timing(content: Mapping[str, Any]) -> tuple[float | None, int]:
 
 
 def _digest(file: Path, frames: Sequence[RigFrame], target_key: bytes) -> str:
-    """Digest of a calibration file, of the images of frames, and of the key of a rectification."""
+    """Digest of a calibration file, the images of frames, and the key of the rectification targets.
+
+    The key is the result of `set_rectification_targets`.
+    """
     digest = hashlib.sha256(file.read_bytes() + target_key)
     for frame in frames:
         for path, _ in frame.images.values():
@@ -154,7 +160,10 @@ def _find_images(
             f"{hint if suffixes else ''}"
         )
     if len({path.stem for path in images}) < len(images):
-        raise InputError(f"two of its images at {place} have one name: rename one")
+        raise InputError(
+            f"two of its images at {place} have equal names (apart from folder and suffix): rename "
+            "one"
+        )
     notes = []
     if suffixes:
         notes.append(
@@ -195,8 +204,9 @@ def _group_images(
     if all(len(paths) == 1 for paths in images.values()):
         single_images = {}
         time_of = {}
-        for name, (path,) in images.items():
-            single_images[name] = (path.relative_to(folder).as_posix(), 0)
+        for name, paths in images.items():
+            path = paths[0]
+            single_images[name] = (path.relative_to(folder).as_posix(), 0)  # at time 0
             time_of[path.stem] = 0
         return [RigFrame(token=f"{scene}_0", time_ns=0, images=single_images)], time_of, []
 
@@ -205,6 +215,7 @@ def _group_images(
     rate = rate_hz or _RATE_HZ
     first_images = next(iter(images.values()))
     time_of = {}
+    # Path and time in nanoseconds of each camera's image, by the name without suffix.
     images_by_stem: dict[str, dict[str, tuple[str, int]]] = {}
     for i, path in enumerate(first_images):
         time_of[path.stem] = round(i * 1e9 / rate)
@@ -274,7 +285,9 @@ def _usage_notes(
         counts.update(frame.images.keys())
     notes = []
     for name, paths in images.items():
-        if not counts[name] == len(paths) == len(frames):
+        all_are_used = counts[name] == len(paths)
+        all_have_one = counts[name] == len(frames)
+        if not (all_are_used and all_have_one):
             notes.append(
                 f"camera {name!r}: {counts[name]} of {format_count(len(paths), 'image')} used, for "
                 f"{format_count(len(frames), 'sample')}; the others have no partner among the "
@@ -324,7 +337,7 @@ def _rectify_images(
     for record in sample.cameras:
         camera = camera_of[record.name]
         source = root / record.path
-        suffix = "" if source.suffix.lower() == ".jpg" else ".jpg"
+        suffix = "" if source.suffix.lower() == ".jpg" else ".jpg"  # all are written as JPEG
         record.path = f"{file_name(record.name)}/{file_name(source.name)}{suffix}"
         if (target / record.path).is_file():
             continue

@@ -12,6 +12,8 @@ import numpy as np
 from gsmap.utils.errors import InputError
 from gsmap.utils.numpy_pickle import CHECKED, CheckedArray, CheckedDtype
 
+# Substitutes of functions and classes, by their name in a pickle. The substitutes of containers
+# take no arguments, so they can only create empty ones.
 _STAND_INS: dict[str, Callable[..., Any]] = {
     **CHECKED,
     "collections.OrderedDict": lambda: {},
@@ -58,7 +60,8 @@ class _PlainUnpickler(pickle._Unpickler):
     def _top(self, *kinds: type) -> Any:
         """Top of the stack; ``UnpicklingError`` if its type is not one of ``kinds``."""
         if type(self.stack[-1]) not in kinds:
-            raise pickle.UnpicklingError(f"it changes a {type(self.stack[-1]).__name__}")
+            kind = type(self.stack[-1]).__name__
+            raise pickle.UnpicklingError(f"it adds content to a {kind}, which cannot have it")
         return self.stack[-1]
 
     def _set_state(self) -> None:
@@ -88,7 +91,7 @@ class _PlainUnpickler(pickle._Unpickler):
         self.append(bytearray(self.read(size)))  # read() returns at most the rest of the file
 
     def _refuse(self) -> None:
-        raise pickle.UnpicklingError("it makes objects as plain data needs not")
+        raise pickle.UnpicklingError("it makes objects, which plain data does not need")
 
     dispatch: ClassVar[dict[int, Any]] = {
         **pickle._Unpickler.dispatch,
@@ -119,10 +122,10 @@ def _key(value: Any) -> Hashable:
         if not isinstance(part, _KEYS):
             raise pickle.UnpicklingError(f"a key is a {type(value).__name__}")
     for part in parts:
-        is_wide = isinstance(part, int) and part.bit_length() > _KEY_BITS
-        is_float_of_tuple = len(parts) > 1 and isinstance(part, float)
-        if is_wide or is_float_of_tuple:
-            raise pickle.UnpicklingError(f"a key is a number of more than {_KEY_BITS} bits")
+        if isinstance(part, int) and part.bit_length() > _KEY_BITS:
+            raise pickle.UnpicklingError(f"a key has a number of more than {_KEY_BITS} bits")
+        if isinstance(part, float) and len(parts) > 1:
+            raise pickle.UnpicklingError("a key is a tuple with a floating-point number")
     if len(parts) > _KEY_PARTS:
         raise pickle.UnpicklingError(f"a key has {len(parts)} parts")
     return value
@@ -181,7 +184,9 @@ def load_plain_pickle(path: str | Path) -> Any:
         if file.read(1):
             raise pickle.UnpicklingError("more follows its end")
         if _count(value, {}) > _VALUES_PER_BYTE * file.tell():
-            raise pickle.UnpicklingError("it repeats its own parts beyond any use")
+            raise pickle.UnpicklingError(
+                "it repeats its parts so often that the content is far larger than the file"
+            )
     except _DAMAGE as error:
         raise InputError(
             f"{path} cannot be read as a pickle of plain data: {error}. Nothing of it was run: "

@@ -68,7 +68,9 @@ class Camera:
 
     def _value(self, name: str, row: int) -> Any:
         if not 0 <= row < self.image_rows:
-            raise InputError(f"camera {self.name!r} has {self.image_rows} images, not row {row}")
+            raise InputError(
+                f"camera {self.name!r} has {self.image_rows} images, so no row {row} (from 0 on)"
+            )
         return self._table[self._column(name)][row].as_py()
 
     @property
@@ -106,7 +108,9 @@ class Camera:
         return global_from_imu @ pose_of(self.metadata["camera_to_imu_se3"])
 
     def image_path(self, row: int, root: Path, scene: str) -> str:
-        """Path of an image below the data root; an image in the table is written there.
+        """Path of an image below the data root.
+
+        The table has either the path or the image itself, which is then written to a file.
 
         Args:
             row: Row of the image.
@@ -114,7 +118,7 @@ class Camera:
             scene: Name of the log.
 
         Raises:
-            ValueError: If the table has no image, or something else, in this row.
+            ValueError: If the table has neither a path nor a valid image in this row.
         """
         data = self._value("data", row)
         where = f"camera {self.name!r}"
@@ -170,7 +174,7 @@ class Log:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.name = folder.name
-        self._sync = self._read(SYNC)
+        self._sync = self._read(SYNC)  # time of each frame, and rows in the tables of its sensors
         self.metadata = metadata_of(self._sync)
 
     def _read(self, name: str, columns: list[str] | None = None) -> pa.Table:
@@ -243,7 +247,7 @@ class Log:
         for camera in self._all_cameras:
             reason = camera.fault
             if not reason and camera.key not in self._sync.column_names:
-                reason = f"{SYNC} has no column of it"
+                reason = f"{SYNC} has no column for it"
             if reason:
                 reasons[camera.name] = reason
         return reasons
@@ -256,7 +260,7 @@ class Log:
         return sorted(names - cameras - {Path(SYNC).stem, _MAP.stem, _EGO})
 
     def frames(self) -> Iterator[tuple[int, dict[str, int | None]]]:
-        """Yield the time in nanoseconds, and the row of each camera's table, of each frame."""
+        """Yield the time of each frame in nanoseconds, and the row of its image by camera."""
         with explain_errors(self.folder / SYNC, REMEDY):
             times = self._sync["sync.timestamp_us"].to_pylist()
             rows = {}

@@ -40,7 +40,7 @@ def read_messages(
 
     Raises:
         ValueError: If the content does not begin or end like an Arrow file, or has a batch without
-            rows that is not a seal.
+            rows that is not a seal. The caller adds the name of the file to the message.
     """
     size = content.size
     if size < len(_START) + _TAIL_BYTES or content[: len(_START)].to_pybytes() != _START:
@@ -60,11 +60,12 @@ def read_messages(
     footer_size = int.from_bytes(size_field, byteorder="little")
     if not ending.endswith(_END) or footer_size != len(ending) - _TAIL_BYTES:
         raise InputError("it ends too early")
-    if seal is not None:  # its message has no rows of the file
+    if seal is not None:  # the last message is the seal, which has no rows
         batches.pop()
         ends.pop()
     if any(len(batch) == 0 for batch in batches):
-        raise InputError("it has an empty part")  # for example a seal with a damaged key
+        # For example, a seal whose key is damaged is not recognised as one.
+        raise InputError("it has an empty part")
     return reader.schema, batches, seal, ends
 
 

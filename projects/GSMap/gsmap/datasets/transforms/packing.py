@@ -68,7 +68,8 @@ class PackMapInputs(BaseTransform):
         """Stack images with channels first. V x (H, W, 3) -> (V, 3, H, W)"""
         images = results["img"]
         if results.get("image_steps"):
-            # This is a strided view. The data preprocessor makes it contiguous on the GPU.
+            # The images are still uint8 as decoded. The data preprocessor applies the recorded
+            # steps on the GPU, and makes this strided view contiguous there.
             return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2)
         height, width = images[0].shape[:2]
         stacked = np.empty((len(images), 3, height, width), dtype=images[0].dtype)

@@ -158,8 +158,8 @@ def change_figures(
     A found change is correct if half of its length lies within `NEAR_M` of true changes of its map,
     class and kind. A true change must be found if it is in view. This means that at least
     `SHORTEST_M` of a line, or half of the outline of an area, is in the range of at least
-    `MIN_VIEWS` samples. It is found if half of its
-    length in view lies within `NEAR_M` of found changes of its map, class and kind.
+    `MIN_VIEWS` samples. A true change is found if half of its length in view lies within `NEAR_M`
+    of found changes of its map, class and kind.
 
     Args:
         found: Changes found by a model.
@@ -186,7 +186,7 @@ def change_figures(
             f"{found_file} has a change on the map {unknown[0]!r}, and the samples are on "
             f"{sorted(views)!r:.200}: give the annotation file of its drives."
         )
-    targets = _targets(truth, views)
+    targets = _targets(truth, views)  # the true changes that must be found
     strict = _Comparison.from_changes(found, truth, targets=targets, same_kind=True)
     loose = _Comparison.from_changes(found, truth, targets=targets, same_kind=False)
     figures: dict[str, float] = {}
@@ -267,6 +267,7 @@ def _targets(truth: Sequence[MapChange], views: Mapping[str, Views]) -> dict[Map
             continue
         points = change.samples()
         in_view = points[views[change.map_name].count(points) >= MIN_VIEWS]
+        # The points are `STEP_M` apart, so numbers of points stand for lengths.
         least_points = len(points) / 2 if is_closed(change.points) else SHORTEST_M / STEP_M
         if len(in_view) >= max(least_points, 1):
             targets[change] = in_view
@@ -306,9 +307,11 @@ def _confidence_limit(
         if _may_match(target, change, same_kind):
             is_near = shapely.dwithin(points, shapely.LineString(change.points), NEAR_M)
             best[is_near] = np.maximum(best[is_near], change.confidence)
-    # Half of the points, rounded up, have at least the confidence of rank `half`.
+    # The target is found if half of its points, rounded up, are near changes that count. At the
+    # confidence of rank `half`, in falling order, this is just the case.
     half = -(-len(best) // 2)
-    return float(np.sort(best)[::-1][half - 1])
+    falling_confidences = np.sort(best)[::-1]
+    return float(falling_confidences[half - 1])
 
 
 def _may_match(change: MapChange, other: MapChange, same_kind: bool) -> bool:

@@ -139,17 +139,17 @@ class HardChamferConfig(ChamferConfig):
 
 def _lines(elements: MapElements, config: ChamferConfig, resample: bool) -> kernels.Lines:
     """Convert the elements of one sample to the form of the kernels."""
-    points = elements.with_coordinates(config.dim).points
+    points = elements.with_coordinates(config.dim).points  # (M, dim)
     offsets = elements.offsets
     if resample:
-        rows = kernels.resample_lines(
+        coordinates = kernels.resample_lines(
             np.ascontiguousarray(points), offsets=offsets, num_points=config.num_points
         )
         offsets = np.arange(len(elements) + 1) * config.num_points
     else:
-        rows = np.zeros((3, len(points)))
-        rows[: config.dim] = points.T
-    return rows, offsets, elements.labels
+        coordinates = np.zeros((3, len(points)))  # z stays 0 if distances are in the plane
+        coordinates[: config.dim] = points.T
+    return coordinates, offsets, elements.labels
 
 
 def _line(lines: kernels.Lines, index: int) -> FloatArray:
@@ -251,7 +251,9 @@ def _nearest(sample: Sample, config: ChamferConfig) -> tuple[IntArray, FloatArra
 
 def _match(sample: Sample, config: ChamferConfig) -> FrameMatches:
     """Match the predictions of one sample with its ground truth."""
-    token, predictions, ground_truth = sample
+    token = sample.token
+    predictions = sample.predictions
+    ground_truth = sample.ground_truth
     check_pair(predictions, ground_truth, classes=config.classes, token=token)
     num_classes = len(config.classes)
     try:

@@ -179,7 +179,7 @@ def match_raster(
     rows = ranked_predictions(
         predictions, num_classes=num_classes, min_score=MIN_SCORE, max_num=MAX_PREDICTIONS
     )
-    gt_index = np.flatnonzero(ground_truth.labels >= 0)
+    gt_index = np.flatnonzero(ground_truth.labels >= 0)  # label -1 is no class
     pred_labels = predictions.labels[rows]
     gt_labels = ground_truth.labels[gt_index]
     pred_masks = rasterize(predictions.select(rows), config)
@@ -207,7 +207,7 @@ def match_raster(
 
 
 def _mean(values: Iterable[float]) -> float:
-    """Compute the mean of the values that are defined."""
+    """Compute the mean of the values other than ``UNDEFINED``, -1; it is -1 without such values."""
     defined = [value for value in values if value != UNDEFINED]
     return float(np.mean(defined)) if defined else UNDEFINED
 

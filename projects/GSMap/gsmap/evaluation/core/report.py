@@ -128,8 +128,9 @@ def format_table(report: MetricReport) -> str:
         lines += _group_lines(report, group)
     absent = [name for name, ranked in report.detections.items() if not ranked.num_gts]
     some_are_absent = 0 < len(absent) < len(report.detections)
-    if some_are_absent and not report.sample_aps:  # AP per sample counts their predictions
-        lines.append(f"without ground truth, and in no mean: {', '.join(absent)}")
+    # In an AP that is a mean over samples, predictions of an absent class count.
+    if some_are_absent and not report.sample_aps:
+        lines.append(f"without ground truth, left out of the means: {', '.join(absent)}")
     mean_ap = report.metrics[f"{report.name}/mAP"]
     lines.append(f"mAP_{report.name} = {mean_ap:.6f}")
     return "\n".join(lines)
@@ -175,7 +176,7 @@ def _group_lines(report: MetricReport, group: str) -> list[str]:
         for cell, title in zip(cells, titles, strict=False):  # the row of means has AP alone
             line += cell.rjust(max(len(title), 6) + 2)
         lines.append(line)
-    last_class_line = lines[-2]
+    last_class_line = lines[-2]  # before the line of the means
     lines.insert(1, "-" * len(last_class_line))  # below the titles
     return lines
 

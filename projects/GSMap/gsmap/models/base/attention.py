@@ -177,12 +177,12 @@ class BEVDeformableAttention(SamplingAttention):
         tokens = feats.flatten(2).transpose(1, 2)  # (B, H * W, C)
         locations = self.locations(query, reference, shape=shape, frames=frames)
         weights = self.weights(query)
-        # Projection and sampling commute. With few samples, projecting last is faster, unless a
-        # fused kernel samples.
-        num_reads = weights.numel() * _CORNERS
-        num_cells = tokens[..., 0].numel() * self.num_heads
+        # Projection and sampling commute. Projecting last is faster if the heads read fewer cells
+        # than they would otherwise project, unless a fused kernel samples.
+        num_cells_read = weights.numel() * _CORNERS
+        num_cells_projected = tokens[..., 0].numel() * self.num_heads
         is_fused = has_kernel(tokens) or has_compiled_op(tokens)
-        if num_reads < num_cells and not is_fused:
+        if num_cells_read < num_cells_projected and not is_fused:
             sampled = self._sample_then_project(tokens, shape, locations=locations, weights=weights)
         else:
             value = self.values(tokens)
@@ -211,9 +211,10 @@ class BEVDeformableAttention(SamplingAttention):
     ) -> Tensor:
         """Sample the unprojected map, then project the sample of each head. (B, Q, C)"""
         cells, cell_weights = bilinear_cells(locations, weights, shape)
-        sample = torch.arange(len(tokens), device=tokens.device).view(-1, 1, 1, 1)
-        table = at_least_float32(tokens).reshape(-1, tokens.shape[-1])
-        rows = sample * tokens.shape[1] + cells  # `table` has the cells of all samples in turn
+        batch_index = torch.arange(len(tokens), device=tokens.device).view(-1, 1, 1, 1)
+        # `table` has the cells of the first map of the batch, then of the second one, and so on.
+        table = at_least_float32(tokens).reshape(-1, tokens.shape[-1])  # (B * H * W, C)
+        rows = batch_index * tokens.shape[1] + cells
         sampled = sum_rows(table, rows, cell_weights)
         # The projection of a weighted sum of cells has the bias times the sum of their weights,
         # which is less than 1 for samples at the border of the map.

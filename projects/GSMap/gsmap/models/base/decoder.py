@@ -168,6 +168,7 @@ class MapDecoderLayer(BaseModule):
         if self.guidance is not None:
             query_pos = self.guidance.position(query_pos, reference)
             frames = self.guidance.frames(reference, bev_feats)
+        # The self-attention and the feed-forward network add their residual themselves.
         attended = self.self_attn(query, query_pos, attn_mask)
         query = self.norms[0](attended)
         sampled = self.cross_attn(query + query_pos, reference, bev_feats, frames)
@@ -246,7 +247,8 @@ class MapDecoder(BaseModule):
             references: Refined references. (B, N * P, D)
         """
         points = self.by_instance(self.point_states(state))
-        return Decoded(points, self.by_instance(references), points.mean(2))
+        instances = points.mean(2)
+        return Decoded(points, self.by_instance(references), instance_states=instances)
 
     def by_instance(self, values: Tensor) -> Tensor:
         """Split values of points by instance. (B, N * P, ...) -> (B, N, P, ...)"""

@@ -145,6 +145,7 @@ class MapHead(LossHead):
             classification_branch(embed_dims, len(self.classes)) for _ in range(num_layers)
         )
         self.loss_cls = MODELS.build(loss_cls)
+        # A config removes an inherited loss by setting it to None.
         self.losses = modules_by_name([MODELS.build(loss) for loss in losses if loss])
         self.aux_heads = modules_by_name(
             [build_part(aux_head, embed_dims=embed_dims) for aux_head in aux_heads]
@@ -334,9 +335,11 @@ class MapHead(LossHead):
             between=between,
         )
         outputs = []
+        # A decoder may use the branches of one layer for several outputs.
         for index, decoded in zip(self.decoder.branches, layers, strict=True):
             scores = at_least_float32(self.cls_branches[index](decoded.instance_states))
             outputs.append(self.predictions(scores, decoded=decoded, bev_feats=feats))
+        # Each hook removes the queries that it has appended, the last appended ones first.
         for hook in reversed(hooks):
             outputs = hook.outputs(self, outputs)
         return outputs

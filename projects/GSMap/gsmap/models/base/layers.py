@@ -83,7 +83,7 @@ def resnet_stages(
 
 
 def resize_map(feats: Tensor, shape: Sequence[int]) -> Tensor:
-    """Resize a feature map bilinearly, with fixed centres of the corner cells.
+    """Resize a feature map bilinearly. The centres of the corner cells keep their place.
 
     Args:
         feats: Feature map. (B, C, H, W)

@@ -11,13 +11,13 @@ from gsmap.structures.tensors import tensor_versions
 
 
 class FoldedBackbone:
-    """Runs a backbone; in inference, a copy whose batch norms are folded into its convolutions.
+    """Runs a backbone. In inference, it runs a copy with batch norms folded into convolutions.
 
     With fixed statistics a batch norm is a scale and a shift per channel, so the weights of the
     convolution before it can include them. The copy is made on first use and again after a weight
-    has changed. Training drops it. The backbone itself, and so every checkpoint, is unchanged. Only
-    ResNets are folded, because mmcv's function assumes that each norm follows the convolution that
-    was registered before it.
+    has changed. A call in training drops the copy. The backbone itself is unchanged, and so is
+    every checkpoint. Only ResNets are folded, because mmcv's function assumes that each norm
+    follows the convolution that was registered before it.
     """
 
     def __init__(self) -> None:

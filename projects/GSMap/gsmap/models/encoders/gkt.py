@@ -114,10 +114,12 @@ class GeometryKernelAttention(nn.Module):
         logits = self.attention_weights(query).float().unflatten(-1, (self.num_heads, -1))
         weights = logits.softmax(-1)  # (B, Q, heads, S)
         visible = projection.visible
-        pairs = visible
+        pairs = visible  # pairs of a camera and a cell that attends to it, (B, V, Q)
         if self.released_cells:
             pairs = visible[:1].expand_as(visible)
         shape = (height, width)
+        # `sample_kernels` has tensors of fixed sizes, with all pairs. Without its Triton kernel
+        # (`has_kernel`), it is cheaper to compute the visible pairs alone.
         if self.fixed_sizes or has_kernel(value):
             maps = value.unflatten(-1, (self.num_heads, -1))
             head_sums = sample_kernels(

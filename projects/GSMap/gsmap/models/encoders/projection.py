@@ -39,8 +39,8 @@ def pillar_points(
     Returns:
         Homogeneous points (x, y, z, 1) in metres, cells row by row. (Q, Z, 4)
     """
-    # Fractions first, then metres, in float32: the positions of kernels are rounded, so the order
-    # of operations changes results.
+    # Fractions first, then metres, in float32. `GeometryKernelAttention` rounds the projections to
+    # pixels, so another order of operations could select other pixels.
     cols = torch.linspace(0.5, grid.width - 0.5, grid.width, device=device) / grid.width
     rows = torch.linspace(0.5, grid.height - 0.5, grid.height, device=device) / grid.height
     heights = torch.linspace(0.5 / num_heights, 1 - 0.5 / num_heights, num_heights, device=device)

@@ -66,6 +66,7 @@ class GaussianReference(PointReference, AddsWeights):
             points_per_state=points_per_state,
         )
         self.space = GaussianSpace(grid, **space)
+        # Statistics of predictions count the sigmas at this lower bound.
         self.metainfo = {"min_scale_m": self.space.floor_m}
         entries = 3 * points_per_state
         self.gaussian_init = nn.Linear(embed_dims, entries)

@@ -49,6 +49,7 @@ class ErrorReference(GaussianReference):
     def __init__(self, grid: BEVGrid, embed_dims: int = 256, **kwargs: Any) -> None:
         super().__init__(grid, embed_dims, **kwargs)
         self.error_space = GaussianSpace(grid, min_scale_m=0.05, max_scale_m=20.0, activation="exp")
+        # Statistics of predictions count the sigmas at this lower bound.
         self.metainfo = {"min_scale_m": self.error_space.floor_m}
         self.error_branches = nn.ModuleList(
             layers.mlp(embed_dims + GAUSSIAN_FEATURES, embed_dims, 2) for _ in self.branches

@@ -98,7 +98,8 @@ class LineMapDecoder(nn.Module):
     def forward(self, bev_feats: Tensor) -> LineMaps:
         """Predict at the resolution of the BEV features. (B, C, H, W) -> (B, ..., H, W) each"""
         first, _, last = self.stage_maps(bev_feats)
-        # one for classes, one for embeddings, and one for directions unless shared
+        # Features for the classes, the embeddings and, unless they share a block with the
+        # embeddings, the directions. The last entry always serves the directions.
         blocks = [block(first, last) for block in self.joined]
         semantic_branch, embedding_branch, direction_branch = self.maps
         return LineMaps(

@@ -72,9 +72,9 @@ class ViewTransformEncoder(CameraEncoder):
 
     For each camera, a fully connected network transforms the pixels of a feature channel to a
     top-down camera map, with weights shared by all channels. The camera map has 2/3 of the length
-    and width of the BEV and begins ahead of the camera, by an eighth of its length. A BEV cell
-    takes the maximum over all camera maps. Intrinsics are not used, so the weights fit one set of
-    cameras and one image size.
+    and width of the BEV. It begins ahead of the camera, at a distance of an eighth of the length of
+    the camera map. A BEV cell takes the maximum over all camera maps. Intrinsics are not used, so
+    the weights fit one set of cameras and one image size.
 
     Args:
         grid: Extent of the map, in metres.
@@ -105,10 +105,10 @@ class ViewTransformEncoder(CameraEncoder):
         super().__init__(init_cfg)
         self.grid = grid.rasterized(bev_pixel_m)
         self.released_units = released_units
-        self.view_pixel_m = bev_pixel_m / 0.6  # side of a cell of a camera map
+        self.view_pixel_m = bev_pixel_m / 0.6  # side of a cell of a camera map: 5/3 of a BEV cell
         self.feature_size = (image_size[0] // stride, image_size[1] // stride)
         num_rows, num_columns = forward_size(self.grid)
-        # 2/3 of the size of the BEV, in cells that are 5/3 as long.
+        # 2/3 of the size of the BEV, in cells that are 5/3 as long: 2/3 divided by 5/3 is 2/5.
         self.view_size = (2 * num_rows // 5, 2 * num_columns // 5)
         if min(self.feature_size + self.view_size) < 1:
             raise InputError(
@@ -213,7 +213,7 @@ class ViewTransformEncoder(CameraEncoder):
 def sample_maps(maps: Tensor, positions: Tensor) -> Tensor:
     """Sample maps bilinearly.
 
-    As in the released code, values at and behind the last row or column are 0.
+    As in the released code, values at the last row or column and beyond it are 0.
 
     Args:
         maps: Maps. (n, C, h, w)

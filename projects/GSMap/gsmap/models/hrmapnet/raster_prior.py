@@ -73,12 +73,15 @@ class RasterPrior(PriorModule, AddsWeights):
             (``"scene"``), or none (``"none"``).
         train_drop: Probability that a sample of a training reads an empty map, so that the model
             also works without one; 0 as published.
-        neutral_start: Start parts that have no effect (``residual`` of ``bev``, ``zero_init`` of
-            ``queries``), so that the prior can be trained from the checkpoint of a model without
-            one. False starts random parts, as published.
+        neutral_start: Initialise the weights so that the prior has no effect (``residual`` of
+            ``bev``, ``zero_init`` of ``queries``). Then it can be trained from the checkpoint of a
+            model without a prior. False initialises random weights, as published.
 
     Attributes:
-        num_channels: Channels M of the map in each BEV cell.
+        window: Grid of the map around the vehicle that a frame reads and writes, h x w cells.
+        cells: Grid of the BEV features, H x W cells.
+        scale: Number of cells of the map along the side of a BEV cell.
+        num_channels: Channels M of the map in each BEV cell: all classes in all of its map cells.
 
     Raises:
         ValueError: If head, encoder or a setting does not fit.
@@ -104,8 +107,8 @@ class RasterPrior(PriorModule, AddsWeights):
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(head, cell_m=cell_m, init_cfg=init_cfg)
-        cells = getattr(encoder, "grid", None)
-        if not isinstance(cells, BEVGrid) or encoder.num_levels != 1:
+        bev_grid = getattr(encoder, "grid", None)
+        if not isinstance(bev_grid, BEVGrid) or encoder.num_levels != 1:
             raise InputError(
                 f"{type(encoder).__name__} can have no prior, which needs a BEV encoder of one "
                 "level of images with cells of a fixed size."
@@ -115,12 +118,13 @@ class RasterPrior(PriorModule, AddsWeights):
         if not 0 <= train_drop < 1:
             raise InputError(f"prior.train_drop must be in [0, 1), got {train_drop}.")
         self.train_drop = train_drop
-        self.scale = self.window.height // cells.height
-        size = (self.scale * cells.height, self.scale * cells.width)
+        self.scale = self.window.height // bev_grid.height
+        size = (self.scale * bev_grid.height, self.scale * bev_grid.width)
+        # The scale is 0 if the cells of the map are larger than the BEV cells.
         if not self.scale or size != (self.window.height, self.window.width):
             raise InputError(
-                f"prior.cell_m is {cell_m:g}: BEV cells of {cells.pixel_size_m[0]:g} m must be a "
-                "multiple of it."
+                f"prior.cell_m is {cell_m:g}: the side of BEV cells, {bev_grid.pixel_size_m[0]:g} "
+                "m, must be a multiple of it."
             )
         self.coder = head.coder
         self.num_channels = len(self.classes) * self.scale**2
@@ -130,7 +134,7 @@ class RasterPrior(PriorModule, AddsWeights):
         self.train_rule = _build_rule(train_rule, default="keep_maximum")
         self.test_rule = _build_rule(test_rule, default="last_seen")
         self.test_memory = test_memory
-        self.cells = cells
+        self.cells = bev_grid
         embed_dims = head.embed_dims
         shared = {"embed_dims": embed_dims, "num_channels": self.num_channels}
         self.bev: PriorBEVFusion | None = None
@@ -139,12 +143,13 @@ class RasterPrior(PriorModule, AddsWeights):
             self.bev = build_part(
                 bev,
                 type="PriorBEVFusion",
-                grid=cells,
+                grid=bev_grid,
                 residual=neutral_start,
                 **heights,
                 **shared,
             )
         self.queries: PriorQueries | None = None
+        # Positional encoding of BEV cells for the queries, if the layer of ``bev`` has none.
         self.positions: LearnedPositionalEncoding | None = None
         if queries is not None:
             self.queries = build_part(
@@ -152,7 +157,7 @@ class RasterPrior(PriorModule, AddsWeights):
             )
             if self.bev is None or self.bev.layer is None:
                 self.positions = LearnedPositionalEncoding(
-                    embed_dims // 2, cells.height, cells.width
+                    embed_dims // 2, bev_grid.height, bev_grid.width
                 )
         bev_is_neutral = self.bev is None or self.bev.output_conv is not None
         queries_are_neutral = self.queries is None or self.queries.zero_init
@@ -224,13 +229,16 @@ class RasterPrior(PriorModule, AddsWeights):
         cells = F.pixel_unshuffle(torch.stack(windows), self.scale)  # (B, M, H, W) on the host
         device = outputs["bev_feats"].device
         calibration = stack_calibration(metas, self.calibration, device)
-        host = [cells]
+        host_tensors = [cells]
         if self.queries is not None:
-            host += self._select_keys(cells)
-        uploaded = upload(host, device)
-        keys = dict(zip((KEYS, VALID), uploaded[1:], strict=False))
-        fused = self.fuse_cells(outputs, uploaded[0], calibration, img_shape=img_shape)
-        return fused | keys
+            host_tensors += self._select_keys(cells)
+        cells, *keys = upload(host_tensors, device)
+        fused = self.fuse_cells(outputs, cells, calibration, img_shape=img_shape)
+        if self.queries is not None:
+            numbers, is_valid = keys
+            fused[KEYS] = numbers
+            fused[VALID] = is_valid
+        return fused
 
     def fuse_window(
         self,
@@ -297,9 +305,9 @@ class RasterPrior(PriorModule, AddsWeights):
             outputs: Outputs of `fuse` or `fuse_window`.
         """
         if self.queries is None:
-            return PriorHook(None, None)
+            return PriorHook(None, None)  # it only keeps the predictions
         cells = outputs[CELLS].flatten(2).transpose(1, 2)  # (B, H * W, M)
-        numbers = outputs[KEYS]  # (B, K)
+        numbers = outputs[KEYS]  # row-major indices of the cells, (B, K)
         values = cells.gather(1, numbers[..., None].expand(-1, -1, cells.shape[-1]))
         positions = self._cell_positions(cells)[numbers]  # (B, K, C)
         return PriorHook(self.queries, MapKeys(values, positions, is_valid=outputs[VALID]))
@@ -357,7 +365,11 @@ class RasterPrior(PriorModule, AddsWeights):
         return bool(torch.rand(()) < self.train_drop)
 
     def _select_keys(self, cells: Tensor) -> list[Tensor]:
-        """Numbers of the known cells of each sample, and which are no padding. 2 x (B, K)"""
+        """Select the cells of each sample in which the map has a value above the threshold.
+
+        Returns:
+            Row-major indices of the cells (B, K), and False where an index is padding (B, K).
+        """
         assert self.queries is not None
         stride = self.queries.stride
         is_known = torch.zeros(len(cells), self.cells.height, self.cells.width, dtype=torch.bool)
@@ -387,7 +399,7 @@ def _build_rule(settings: Mapping[str, Any] | None, default: str) -> WriteRule:
     """Build a rule of writing.
 
     Args:
-        settings: Its name as ``name``, and its settings, or None.
+        settings: Name of the rule as ``name``, and settings of the rule; or None.
         default: Name of the rule if ``settings`` has none.
     """
     arguments = {"name": default, **(settings or {})}

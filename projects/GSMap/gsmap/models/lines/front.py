@@ -40,7 +40,7 @@ def centres(shapes: Sequence[tuple[int, int]], device: torch.device) -> Tensor:
         device: Device of the points.
 
     Returns:
-        Centres map after map, row by row. (all cells, 2)
+        Centres of the cells of the first map row by row, then of the next maps. (all cells, 2)
     """
     points = []
     for height, width in shapes:

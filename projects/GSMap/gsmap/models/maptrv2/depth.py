@@ -35,10 +35,11 @@ def depth_bins(depth_m: Tensor, stride: int, depth_range: tuple[float, float, fl
     # A pixel without a return is infinitely far, beyond all bins.
     returns = torch.where(blocks == 0, torch.inf, blocks)
     nearest = returns.amin((-3, -1))  # (..., h, w)
-    # Position in bins, counted from one bin before the first: bin i is from i + 1 to i + 2.
+    # Number of bins from one bin before the first one, as in the released code. A depth in bin i
+    # has a position from i + 1 to i + 2.
     position = (nearest - (low - step)) / step
     valid = (position >= 1) & (position < num_depth_bins(depth_range) + 1)
-    # The index of the bin is the whole part less 1, which is -1 for a position of 0.
+    # The position 0 of blocks without a target becomes the index -1.
     return torch.where(valid, position, 0).long() - 1
 
 

@@ -59,13 +59,13 @@ def pack_lines(lines: list[Lines]) -> LinePredictions:
     references = []
     logits = []
     for class_lines in lines:
-        point_logits = class_lines.point_logits
-        pivot = point_logits[..., PIVOT, None] - point_logits[..., 1 - PIVOT, None]
-        ends = torch.ones_like(pivot[:, :, :1])
-        pivot = torch.cat([ends, pivot[:, :, 1:-1], ends], dim=2)  # (B, n, p, 1)
-        reference = torch.cat([class_lines.points, pivot], dim=-1)  # (B, n, p, 3)
+        point_logits = class_lines.point_logits  # of a pivot and of no pivot, (B, n, p, 2)
+        pivot_logit = point_logits[..., PIVOT, None] - point_logits[..., 1 - PIVOT, None]
+        ends = torch.ones_like(pivot_logit[:, :, :1])
+        pivot_logit = torch.cat([ends, pivot_logit[:, :, 1:-1], ends], dim=2)  # (B, n, p, 1)
+        reference = torch.cat([class_lines.points, pivot_logit], dim=-1)  # (B, n, p, 3)
         num_missing = longest - reference.shape[2]
-        # Pivots have logits > 0, so `decode` drops the filling with logit -1.
+        # Rows of -1 fill shorter lines. Their logit is not > 0, so `decode` drops them.
         references.append(F.pad(reference, (0, 0, 0, num_missing), value=-1.0))
         logits.append(class_lines.logits)
     return LinePredictions(
@@ -92,8 +92,8 @@ class PivotHead(LineHead):
     """
 
     transforms = ("FormatPivotTargets",)
-    targets = "pivots"
-    level_weights = (0.4, 0.8, 1.6, 2.4)
+    targets = "pivots"  # for error messages
+    level_weights = (0.4, 0.8, 1.6, 2.4)  # of the losses of class masks, by BEV level
 
     def __init__(
         self,
@@ -121,9 +121,10 @@ class PivotHead(LineHead):
             **kwargs,
         )
         self.reference = PivotReference(grid)
-        feature_dims = 2 * self.point_dims
+        feature_dims = 2 * self.point_dims  # one vector for u and one for v
         self.point_branches = nn.ModuleList()
-        self.kind_branches = nn.ModuleList()
+        self.kind_branches = nn.ModuleList()  # kinds of points: pivots and others
+        # Two loops, because the order of creation determines the random initial weights.
         for _ in classes:
             self.point_branches.append(mlp(embed_dims, embed_dims, embed_dims, feature_dims))
         for _ in classes:
@@ -140,11 +141,12 @@ class PivotHead(LineHead):
 
         Args:
             layer: Lines of each class from one decoder layer.
-            mean: Mean feature of the map's coordinates. (D,)
+            mean: Mean over the map of the D features of its coordinates (`coordinate_feature`).
+                (D,)
         """
         lines = []
         for label, class_lines in enumerate(layer):
-            feature = self.point_branches[label](class_lines.states).float()
+            feature = self.point_branches[label](class_lines.states).float()  # (B, n, p, 2 D)
             points = (feature.unflatten(-1, (2, -1)) @ mean).sigmoid()  # (B, n, p, 2)
             predicted_lines = Lines(
                 logits=class_lines.logits.float(),

@@ -1,6 +1,7 @@
 """Mapping between the state keys of the released PivotNet and of this project.
 
-The texts in `rules_of` are pairs ``released=here`` of the rest of the keys, or one name for both.
+`rules_of` takes the common prefix of released keys, the common prefix of the keys here, and a text.
+Each word of the text continues both prefixes: ``released=here``, or one name for both.
 """
 
 import torch
@@ -51,7 +52,8 @@ PIVOTNET = KeyMap(
     ),
     unused={
         **CLASS_WEIGHTS,
-        # settings: order of the concatenated cameras, class weights of another loss
+        # Settings of the release: order of the concatenated cameras, and class weights of a loss
+        # that is not used here.
         BEV + "image_order": torch.arange(6),
         "post_processor.criterion.collinear_pt_weight": torch.tensor((0.2, 1.0)),
     },

@@ -26,7 +26,10 @@ class StreamMapNetEncoderLayer(BEVEncoderLayer):
         self.mirrored = mirrored
 
     def centres(self, grid: BEVGrid, device: torch.device) -> Tensor:
-        """Return the reference of each cell's self-attention, [0, 1] over the map. (H, W, 2)"""
+        """Reference points (x, y) of the self-attention of the cells, [0, 1] over the map.
+
+        (H, W, 2)
+        """
         centres = super().centres(grid, device)
         return centres.flip(0) if self.mirrored else centres
 
@@ -76,7 +79,7 @@ class StreamMapNetEncoder(BEVQueryEncoder):
         return {"bev_feats": bev_feats.flip(2)}
 
     def project(self, img_from_frame: Tensor, img_shape: tuple[int, int]) -> PillarProjection:
-        """Project the pillars of all cells into every camera, beginning at the largest y.
+        """Project the pillars of all cells into every camera. Row 0 of the cells has the largest y.
 
         Args:
             img_from_frame: Transforms from the map frame in metres to pixels. (B, V, 4, 4)

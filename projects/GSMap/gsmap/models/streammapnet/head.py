@@ -59,7 +59,8 @@ class StreamMapNetHead(MapHead):
         num_queries = sum(group.num for group in self.query_groups)
         self.instance_embedding = nn.Embedding(num_queries, self.embed_dims)
         branch = nn.Linear(self.embed_dims, len(self.classes))
-        self.cls_branches = nn.ModuleList([branch] * len(self.cls_branches))
+        self.cls_branches = nn.ModuleList([branch] * len(self.cls_branches))  # one shared module
+        # By default all queries are kept, also those with points far beyond the map.
         coder_settings: PartConfig = {"max_num": self.query_groups[0].num, "margin_m": None}
         coder_settings |= coder or {}
         self.coder = BestClassCoder(grid=self.grid, **coder_settings)

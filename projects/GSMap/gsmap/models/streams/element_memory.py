@@ -15,7 +15,7 @@ from gsmap.structures.line_update import update_from_known_lines
 from gsmap.structures.past import Past
 from gsmap.utils.errors import InputError
 
-PREFIX = "element_"  # of the names of the elements' tensors in the memory of a stream
+PREFIX = "element_"  # prefix of the names of these tensors in the memory of a stream
 
 
 @MODELS.register_module()
@@ -131,19 +131,19 @@ class ElementMemory:
         Returns:
             Tensors by name. (B, max_num, ...) each
         """
-        frames: dict[str, list[Tensor]] = {}
+        padded_by_name: dict[str, list[Tensor]] = {}
         for detections in results:
             is_confident = detections.scores_3d >= self.min_score
             labels = detections.labels_3d[is_confident]
             gaussians = _select(detected_gaussians(detections), is_confident)
             padded = labels.new_full((self.num,), -1)
             padded[: len(labels)] = labels
-            frames.setdefault("labels", []).append(padded)
+            padded_by_name.setdefault("labels", []).append(padded)
             for name, values in gaussians._asdict().items():
                 padded = values.new_zeros((self.num, *values.shape[1:]))
                 padded[: len(values)] = values
-                frames.setdefault(name, []).append(padded)
-        return {f"{PREFIX}{name}": torch.stack(values) for name, values in frames.items()}
+                padded_by_name.setdefault(name, []).append(padded)
+        return {f"{PREFIX}{name}": torch.stack(values) for name, values in padded_by_name.items()}
 
 
 def detected_gaussians(detections: InstanceData) -> Gaussians:

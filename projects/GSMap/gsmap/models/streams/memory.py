@@ -29,7 +29,7 @@ _SINGLE_PRECISION_PREFIXES = ("references", "targets", PREFIX)
 
 @dataclass
 class BatchMemory:
-    """Encoder outputs of a batch, the memory recalled for it, and the memory to store after it.
+    """Encoder outputs of a batch, the memory recalled for them, and the detections to store.
 
     Args:
         outputs: Outputs of the encoder, in which ``bev_feats`` (B, C, H, W) are fused with the
@@ -133,12 +133,12 @@ class StreamMemory(BaseModule):
     def new_stream(self) -> MapStream:
         """Create an empty memory of one scene for the caller, bound to this model."""
         stream = MapStream(self.max_gap_s)
-        stream.claim(self)  # raises an error if another model uses it later
+        stream.claim(self)  # `using` of another model then raises an error
         return stream
 
     @contextmanager
     def using(self, stream: Scenes) -> Iterator[None]:
-        """Use a stream of the caller instead of the model's streams in this context.
+        """Use a memory of the caller instead of the model's memory in this context.
 
         Args:
             stream: Memory that `new_stream` or `new_scenes` has created.

@@ -68,11 +68,11 @@ def edge_weights(line: Floats) -> Floats:
 class FormatPolylineTargets(BaseTransform):
     """Add VectorMapNet's targets to ``gt_instances_3d``, computed from ``map_instances``.
 
-    The targets are ``keypoints`` (K, 4), box corners in pixels of the canvas, ``keypoint_tokens``
-    (K, 4), and ``tokens`` and ``token_weights`` (K, T), filled with 0 for shorter lines. Targets of
-    a preceding `FormatMapTargets` are not changed. Without it, the transform also adds
-    ``labels_3d`` (K,), the simplified lines ``pts`` (K, P, 2) in metres, filled with the last
-    point, and ``num_pts`` (K,).
+    The targets are ``keypoints`` (K, 4), box corners in pixels of the canvas; ``keypoint_tokens``
+    (K, 4), the numbers of the pixels of these corners; and ``tokens`` and ``token_weights`` (K, T),
+    filled with 0 for shorter lines. Targets of a preceding `FormatMapTargets` are not changed.
+    Without it, the transform also adds ``labels_3d`` (K,), the simplified lines ``pts`` (K, P, 2)
+    in metres, filled with the last point, and ``num_pts`` (K,).
 
     Args:
         pixel_m: Side of a pixel in metres, as in the `Canvas` of the head.
@@ -132,6 +132,7 @@ class FormatPolylineTargets(BaseTransform):
             instances.pts = torch.from_numpy(pad_lines(lines_m)).float()
             instances.num_pts = torch.tensor(counts, dtype=torch.int64)
         instances.keypoints = torch.from_numpy((corners * canvas.size).reshape(-1, 4)).float()
+        # Pixel numbers from 0: unlike in `tokens`, no token 0 ends the sequence of four.
         instances.keypoint_tokens = torch.from_numpy(corners * canvas.steps).long().flatten(1)
         instances.tokens = stack_rows(tokens).long()
         instances.token_weights = stack_rows(weights).float()

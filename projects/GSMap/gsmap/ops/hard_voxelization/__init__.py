@@ -39,7 +39,9 @@ def hard_voxelize(
     # A group is the run of points of one cell in the sorted order.
     _, group, counts = sorted_cells.unique_consecutive(return_inverse=True, return_counts=True)
     starts = counts.cumsum(0) - counts
-    firsts, by_first = order[starts].sort()  # groups in the order of their first points
+    # As the sort is stable, the first point of a group in the cloud is also its first one in the
+    # sorted order. Groups are ordered by these first points.
+    firsts, by_first = order[starts].sort()
     rank = torch.empty_like(by_first)  # number of the voxel of each group: inverse of `by_first`
     rank[by_first] = torch.arange(len(by_first), device=points.device)
     voxel = rank[group]  # voxel of each sorted point

@@ -225,7 +225,10 @@ def curves(results: Sequence[ScoredResult], style: MapStyle) -> list[dict[str, A
 def reliability_curves(
     results: Sequence[ScoredResult], truth: Mapping[str, MapElements], style: MapStyle
 ) -> list[dict[str, Any]]:
-    """Create a panel per class: the shares of errors within intervals of the law of each result.
+    """Create a panel per class: the share of errors within each central interval.
+
+    The intervals are central intervals of the law of the result, that is, of the distribution that
+    its errors are assumed to have (normal or Laplace).
 
     Args:
         results: Any number of results; results without Gaussians have no curve.
@@ -253,6 +256,7 @@ def reliability_curves(
                 shares.append(_format_value(share))
                 points.append(curve)
             title = f"{axis_name}, in the interval of 68.3 % ({' | '.join(laws)} law)"
+            # The page shows the entry "ap" behind the label, as it does for the other curves.
             lines.append({"label": title, "ap": shares, "points": points})
         if any(any(line["points"]) for line in lines):
             panels.append({"metric": "Gaussians", "class": label, "lines": lines})
@@ -281,7 +285,8 @@ def _reliability(
         return UNDEFINED, []
     errors = of_class.errors[:, axis]
     sigmas = of_class.sigmas[:, axis]
-    half_width = half_widths(law, COVERED)[0]
+    one_sigma_level = COVERED[0]  # 68.3 %
+    half_width = half_widths(law, [one_sigma_level])[0]
     share = float((errors <= half_width * sigmas).mean())
     points = np.stack([LEVELS, reliability(errors, sigmas, law)], axis=1)
     return share, points.round(3).tolist()
