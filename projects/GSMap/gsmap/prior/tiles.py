@@ -17,7 +17,8 @@ from gsmap.utils.errors import WorkError
 
 Tile = NDArray[np.uint8]
 _LEVEL = 1  # compression level of zlib; higher levels save little on sparse rasters
-# After this number of bytes was read from a mapped file, the pages of the file leave memory.
+# After this number of bytes was read from a mapped file, its pages are released from memory, which
+# a large file would fill otherwise.
 _MAPPED_BYTES = 32 << 20
 # The temporary file is written again without replaced tiles if they take more bytes than this, and
 # more bytes than the other tiles.

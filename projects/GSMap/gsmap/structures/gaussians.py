@@ -207,10 +207,10 @@ class GaussianSpace:
         # belong to the entries (xx, xy, yx, yy), has these factors.
         turn = _cos_and_sin(theta, factor=1.0, shift_rad=0.0)
         products = (stretch[..., :, None] * turn[..., None, :]).flatten(-2)  # (..., 4)
-        first = [(1, 0, 0, 0), (0, 0, x_per_y, 0)]
-        second = [(0, 0, 0, 1), (0, -y_per_x, 0, 0)]
-        # The axis of a is the direction of travel: x for the first order, y for the second one.
-        rows = [*first, *second] if along_x else [*second, *first]
+        x_rows = [(1, 0, 0, 0), (0, 0, x_per_y, 0)]  # for the stretch along x
+        y_rows = [(0, 0, 0, 1), (0, -y_per_x, 0, 0)]  # for the stretch along y
+        # The stretch a, whose products come first, is along the direction of travel.
+        rows = [*x_rows, *y_rows] if along_x else [*y_rows, *x_rows]
         return (products @ constant(products, rows)).unflatten(-1, (2, 2))
 
     def _initial_scales(self, like: Tensor) -> Tensor:

@@ -204,7 +204,8 @@ def equivalent_orders(
         rolls = rng.choice(count, slots, replace=False)
     twice = np.concatenate([points, points[1:]])  # a second lap, so that no distance wraps around
     along = arc_lengths(twice)
-    starts = along[-rolls % count, None]  # distance of the first point of each order
+    # Distance of the first point of each order, which is `rolls` vertices before the ring's start.
+    starts = along[-rolls % count, None]
     distances = starts + np.linspace(0.0, along[count], num_points)
     columns = [np.interp(distances, along, column) for column in twice.T]
     orders[: len(rolls)] = np.stack(columns, axis=-1)

@@ -239,7 +239,8 @@ def raster_report(matches: MatchTable, config: RasterConfig) -> MetricReport:
     metrics: dict[str, float] = {}
     num_present = 0
     for label, (name, ranked) in enumerate(detections.items()):
-        num_present += ranked.num_gts > 0
+        if ranked.num_gts > 0:
+            num_present += 1
         figures[name] = _class_figures(ranked, matches.class_iou(label))
         for key, value in figures[name].items():
             metrics[f"{name}/{key}"] = value

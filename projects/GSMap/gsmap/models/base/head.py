@@ -101,6 +101,7 @@ class MapHead(LossHead):
         **settings: Any,
     ) -> None:
         super().__init__(init_cfg)
+        # A setting that a map model adds may stand for a config of `point_queries`.
         point_queries = resolve_added_settings(settings).get("point_queries", point_queries)
         self.grid = grid
         self.classes = tuple(classes)
@@ -134,13 +135,7 @@ class MapHead(LossHead):
                 f"points: leave out {', '.join(settings) or 'point_queries'}."
             )
         self.instance_embedding = nn.Embedding(num_instances, 2 * embed_dims)
-        self.pts_embedding: nn.Module | None = None
-        if point_queries is not None:
-            self.pts_embedding = build_part(
-                point_queries, num_points=num_points, embed_dims=embed_dims
-            )
-        elif self.decoder.point_queries:
-            self.pts_embedding = PointTable(num_points, embed_dims)
+        self.pts_embedding = self._build_point_embedding(point_queries)
         self.cls_branches = nn.ModuleList(
             classification_branch(embed_dims, len(self.classes)) for _ in range(num_layers)
         )
@@ -155,6 +150,17 @@ class MapHead(LossHead):
         self.assigner = MapAssigner(match_costs)
         self.coder = self.build_coder(coder or {})
         self.check_parts()
+
+    def _build_point_embedding(self, config: PartConfig | None) -> nn.Module | None:
+        """Build the embeddings of points; None for a decoder with instance queries."""
+        if config is not None:
+            embedding: nn.Module = build_part(
+                config, num_points=self.num_points, embed_dims=self.embed_dims
+            )
+            return embedding
+        if self.decoder.point_queries:
+            return PointTable(self.num_points, self.embed_dims)
+        return None
 
     @classmethod
     def target_settings(cls, settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -136,7 +136,8 @@ class GeometryKernelAttention(nn.Module):
             summed = self._sum_pairs(
                 value.float(), shape=shape, uv=projection.uv, pairs=pairs, weights=weights
             )
-        count = visible.sum(1).clamp(min=1)  # (B, Q)
+        # The number of cameras is that of the sample itself, also with `released_cells`. (B, Q)
+        count = visible.sum(1).clamp(min=1)
         return self.output_proj(summed / count[..., None])
 
     def _sum_pairs(

@@ -261,7 +261,7 @@ class RasterPrior(PriorModule, AddsWeights):
         cells = F.pixel_unshuffle(window, self.scale)
         fused = self.fuse_cells(outputs, cells, calibration, img_shape=img_shape)
         if self.queries is not None:
-            stride = self.queries.stride
+            stride = self.queries.stride  # every `stride`-th cell along both axes is a key
             numbers = torch.arange(self.cells.height * self.cells.width, device=window.device)
             numbers = numbers.view(self.cells.height, self.cells.width)[::stride, ::stride]
             largest = cells[:, :, ::stride, ::stride].amax(1).flatten(1)  # (B, K)

@@ -43,7 +43,7 @@ class PivotReference(Reference):
         """
         is_dropped = references[..., 2] <= 0
         index = torch.arange(is_dropped.shape[1], device=is_dropped.device)
-        sort_keys = index + is_dropped * len(index)  # pivots first, both in their order
+        sort_keys = index + is_dropped * len(index)  # pivots first, then the others, in order
         order = sort_keys.argsort(dim=-1)
         num_pivots = (~is_dropped).sum(dim=-1)
         last_pivot = num_pivots[:, None] - 1
