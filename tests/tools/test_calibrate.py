@@ -78,7 +78,9 @@ def test_a_checkpoint_keeps_what_is_fitted_and_its_model_has_it(files, tmp_path,
     monkeypatch.setattr(
         "sys.argv", [*words[:2], str(target), *words[3:-1], str(tmp_path / "again.pth")]
     )
-    with pytest.raises(ValueError, match="is calibrated already: give the checkpoint that it"):
+    with pytest.raises(
+        ValueError, match="is calibrated already: give the checkpoint it was made from"
+    ):
         calibrate()
 
 

@@ -193,7 +193,7 @@ def test_the_config_in_a_runs_folder_says_seed_and_data_and_is_not_run(
         f"import pathlib; pathlib.Path({str(marker)!r}).touch()": "only assignments",
         f"randomness = dict(seed=open({str(marker)!r}, 'w'))": r"calls of open\(\)",
         "_base_ = 'evil.py'\nrandomness = dict(seed='x')": "must be a number, got 'x'",
-        None: r"holds no 2\*/vis_data/config.py, which tools/train.py writes",
+        None: r"config of its run, 2\*/vis_data/config.py, which tools/train.py writes",
     }
     for number, (attack, message) in enumerate(attacks.items()):
         folder = with_config(tmp_path / f"bad{number}", attack)
