@@ -143,7 +143,7 @@ WITH_MEMORY = {
     [
         (
             {"test_dataloader": {"sampler": {"type": "DefaultSampler"}}},
-            r"test_dataloader\.sampler is 'DefaultSampler', .*several ranks .* to 'StreamTest",
+            r"test_dataloader\.sampler is 'DefaultSampler', .*several ranks, .* to 'StreamTest",
         ),
         ({"val_dataloader": {"batch_size": 1}}, r"val_dataloader\.sampler is None"),
         (
