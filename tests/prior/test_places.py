@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from methods.hrmapnet.prior_cases import CLASSES, frames, pose_at
+from prior_cases import CLASSES, frames, pose_at
 
 from gsmap.prior import GaussianPrior, KeepMaximum, LastSeen, MapPrior, PriorSettings
 from gsmap.prior.places import GivenMaps, Place, PlaceMaps

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from methods.hrmapnet.prior_cases import CLASSES
 from mmdet3d.registry import MODELS
+from prior_cases import CLASSES
 from processes import run_tool
 
 from gsmap.engine.launch import read_config

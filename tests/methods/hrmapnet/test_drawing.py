@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from methods.hrmapnet.prior_cases import CLASSES
+from prior_cases import CLASSES
 
 from gsmap.models.hrmapnet.drawing import draw_elements
 from gsmap.structures.classes import AREA_CLASSES

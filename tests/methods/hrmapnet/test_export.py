@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 from export_cases import POINTS_M, SCORES, shake
-from methods.hrmapnet.prior_cases import CLASSES, frames, prior_model
+from methods.hrmapnet.prior_cases import prior_model
 from model_cases import IMAGE_SHAPE, NUM_CAMS
+from prior_cases import CLASSES, frames
 
 from gsmap.apis.export import export_onnx, largest_differences
 from gsmap.apis.onnx_inferencer import OnnxInferencer

@@ -3,8 +3,9 @@
 import pytest
 import torch
 from head_cases import HEAD, C, N, P, bev, build_head
-from methods.hrmapnet.prior_cases import PRIOR, frames
+from methods.hrmapnet.prior_cases import PRIOR
 from model_cases import build_small, make_images, small_config
+from prior_cases import frames
 
 HRMAPNET = {**HEAD, "type": "HRMapNetHead"}
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import torch
 from inferencer_cases import make_config, make_samples
-from methods.hrmapnet.prior_cases import CLASSES, pose_at
 from mmengine.config import ConfigDict
+from prior_cases import CLASSES, pose_at
 
 from gsmap.apis.map_inferencer import MapInferencer
 from gsmap.prior import LastSeen, MapPrior, PriorSettings

@@ -5,8 +5,9 @@ import copy
 import numpy as np
 import pytest
 import torch
-from methods.hrmapnet.prior_cases import CLASSES, PRIOR, frames, pose_at, prior_model
+from methods.hrmapnet.prior_cases import PRIOR, prior_model
 from model_cases import build_small, make_images
+from prior_cases import CLASSES, frames, pose_at
 
 from gsmap.models.hrmapnet import raster_prior
 from gsmap.models.hrmapnet.raster_prior import CELLS, KEYS, VALID

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 from head_cases import GSMAP, HEAD, build_head
-from methods.hrmapnet.prior_cases import pose_at
 from mmengine.structures import InstanceData
 from model_cases import build_small, make_images, make_samples, straight_elements
+from prior_cases import pose_at
 
 from gsmap.apis.export import ExportedDetector
 from gsmap.models.priors.element_fusion import ElementFusion
