@@ -5,7 +5,15 @@ import pytest
 import torch
 from prior_cases import CLASSES, frames, pose_at
 
-from gsmap.prior import GaussianPrior, KeepMaximum, LastSeen, MapPrior, PriorSettings
+from gsmap.prior import (
+    ElementPrior,
+    ElementRule,
+    GaussianPrior,
+    KeepMaximum,
+    LastSeen,
+    MapPrior,
+    PriorSettings,
+)
 from gsmap.prior.places import GivenMaps, Place, PlaceMaps
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
@@ -85,6 +93,20 @@ def test_a_gaussian_prior_is_drawn_in_the_cells_of_a_window_and_not_written():
     assert (columns == 14).all()  # x of 2.5 to 3.75 m
     assert not window[:2].any()
     with pytest.raises(ValueError, match="has Gaussians, which a model can only read"):
+        GivenMaps([prior], CLASSES, grid=WINDOW, update=True)
+
+
+def test_a_prior_of_elements_is_drawn_and_not_written():
+    line = np.array([[3.0, -20.0], [3.0, 20.0]])
+    elements = MapElements.from_polylines([line], [2], scores=[0.75])
+    prior = ElementPrior(PriorSettings(CLASSES, "town"), elements, ElementRule(line_width_m=1.25))
+    window = GivenMaps([prior], CLASSES, grid=WINDOW).read(place())
+    assert window.shape == raster().shape
+    rows, columns = (window[2] > 0.5).nonzero().unbind(-1)
+    assert rows.tolist() == list(range(8, 40))  # y of -20 to 20 m, cells of 1.25 m
+    assert (columns == 14).all()  # x of 2.5 to 3.75 m
+    assert not window[:2].any()
+    with pytest.raises(ValueError, match="has elements, which a model reads only"):
         GivenMaps([prior], CLASSES, grid=WINDOW, update=True)
 
 
