@@ -19,7 +19,7 @@ MIN_VIEWS = 5
 _NEW_GROUND_M = 30.0  # ground farther than this from all elements of the old map is new
 _PRIOR_VIEWS = 2.0  # frames against a change that are assumed before any frame is counted
 _MAP_SIGMA_M = 0.2  # standard deviation of the error of the old map, common to all frames
-_MIN_SIGMAS = 3.0  # a shift is significant from this number of standard errors
+_MIN_SIGMAS = 5.0  # a shift is significant from this number of standard errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +113,7 @@ class Shift:
         return cls(mean_m, std_m=max(by_variances, by_scatter) ** 0.5)
 
     def exceeds(self, smallest_m: float) -> bool:
-        """Whether the shift is at least a distance, and at least three standard errors."""
+        """Whether the shift is at least a distance, and at least five standard errors."""
         return abs(self.mean_m) >= max(smallest_m, _MIN_SIGMAS * self.std_m)
 
     def probability(self, smallest_m: float) -> float:

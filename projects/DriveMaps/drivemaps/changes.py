@@ -55,10 +55,10 @@ def find_changes(
       the old map may not cover the ground.
     * Moved: a part of a line of the old map beside which the maps of the passes have a line, on one
       side and at a mean distance of at least 0.5 m, or an area of the old map whose centre moved by
-      at least 0.75 m. The shift must also be at least three standard errors.
+      at least 0.75 m. The shift must also be at least five standard errors.
 
-    Lines of the old map with a score below 0.35 are neither removed nor moved, and lines of a pass
-    with a score below 0.4 are not added. They still show that a line is not new, or not gone.
+    Lines of the old map with a score below 0.4 are neither removed nor moved, and lines of a pass
+    with a score below 0.6 are not added. They still show that a line is not new, or not gone.
 
     The confidence of a removed or moved element is multiplied by its score in the old map, as an
     element that never was there cannot be removed.

@@ -33,8 +33,8 @@ from drivemaps.line_matching import (
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 from gsmap.structures.polylines import arc_lengths
 
-_MIN_OLD_CONFIDENCE = 0.35  # smallest confidence of an old line that is removed or moved
-_MIN_NEW_CONFIDENCE = 0.4  # smallest confidence of a line that is added
+_MIN_OLD_CONFIDENCE = 0.4  # smallest confidence of an old line that is removed or moved
+_MIN_NEW_CONFIDENCE = 0.6  # smallest confidence of a line that is added
 _MIN_LENGTH_M = 8.0  # shorter changed parts are ignored, unless they are whole lines
 _MIN_MOVE_M = 0.5  # a vertex has moved if it is shifted by at least this
 _MIN_FRAMES = 3  # smallest number of matched frames that can show that a part has moved
