@@ -30,7 +30,7 @@ def calibrated_records(
     times.
 
     Args:
-        records: Records, as `from_records` takes them.
+        records: Records, as `mapdata.custom.from_records` takes them.
         file: Calibration file, YAML or JSON.
         meta: Annotation frame, and height of the road in it.
         root: Folder that image paths are relative to.
@@ -43,8 +43,11 @@ def calibrated_records(
         ValueError: If the file is malformed, a camera is not in it, a camera has a key that the
             file defines, or a record has no pose near its time.
     """
+    # Images of each camera. Their size is used if the calibration file has no ``size_px``.
     images: dict[str, list[Path]] = {}
-    time_of: dict[str, int] = {}  # by the name of the image without its suffix
+    # Time of each image by its name without the suffix, by which a file of poses may refer to it.
+    # If several cameras have images of one name, the time of the last of them is taken.
+    time_of: dict[str, int] = {}
     for number, record in enumerate(records):
         with explain_errors(f"record {_name_of(record, number)!r}", "correct it"):
             for camera in record["cameras"]:
@@ -124,7 +127,9 @@ def _in_frame(sample: MapSample, record: Mapping[str, Any], meta: AnnotationMeta
     if ego_from_frame is None:
         mount = Mount(meta.frame, ground_z_m=ground_z_m)
     else:
+        # This copy of the sample only serves to compute where the annotation frame is mounted.
         sample_with_mount = replace(sample, ego_from_frame=np.asarray(ego_from_frame, np.float64))
         ground = ground_from_frame(sample_with_mount, meta.frame, ground_z_m=ground_z_m)
         mount = Mount(meta.frame, ground_z_m=ground_z_m, ground_from_frame=ground)
+    # From the frame "ego" of the given sample to the annotation frame
     return change_frame(sample, "ego", mount)

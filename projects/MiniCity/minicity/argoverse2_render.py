@@ -32,8 +32,8 @@ from minicity.lighting import random_lighting
 from minicity.renderer import SceneRenderer
 
 VIEW_M = 50.0  # distance from the track of the vehicle to the edges of the ground
-# Edge of a ground pixel in metres, times the width of the image in pixels. Wider images get a finer
-# ground: ground pixels have an edge of 6.25 cm for images of 800 columns.
+# Length of the ground in metres that has as many pixels as an image has columns. So wider images
+# get a finer ground: for images of 800 columns, a ground pixel has an edge of 6.25 cm.
 GROUND_PIXELS_PER_IMAGE_PIXEL = 0.0625 * 800
 JPEG_QUALITY = 90
 

@@ -56,8 +56,9 @@ class SceneTask:
         index_in_town: Number of the street within the town, equal in all passes of the street.
         route: Name of the first scene on this street, whose random numbers choose the drive.
         pass_index: Number of earlier passes of the street.
-        expansion: Name of the file of the map expansion: the location, or another name if the
-            scene is driven before the streets are repainted.
+        expansion: Name of the map expansion file that describes the streets at the time of the
+            drive. If streets are repainted after the drive, it is the location with the suffix
+            ``.before``, otherwise the location alone.
     """
 
     name: str

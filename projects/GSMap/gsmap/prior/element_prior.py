@@ -107,13 +107,13 @@ class ElementPrior:
         content = path.read_bytes()
         if not content:
             raise InputError(f"{path} is empty: copy or build it again.")
-        found, rule, places = read_header(content, path, magic=ELEMENT_MAGIC)
+        found, rule, entries = read_header(content, path, magic=ELEMENT_MAGIC)
         if settings is not None:
             settings.require_equal(found, str(path))
         polylines: list[FloatArray] = []
         labels: list[int] = []
         scores: list[float] = []
-        for offset, length, crc in places.values():
+        for offset, length, crc in entries.values():
             packed = content[offset : offset + length]
             stored, lines = _unpack(packed, crc=crc, path=path)
             polylines += lines

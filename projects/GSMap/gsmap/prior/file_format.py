@@ -1,8 +1,8 @@
 """File of a prior of any kind: a header, compressed tiles and an index.
 
 The file begins with the magic number, the version and the length of the header, all little-endian.
-The header is JSON in UTF-8. Compressed tiles (zlib) follow, then the index with the place, offset,
-length and checksum of each tile. A footer of fixed size ends the file.
+The header is JSON in UTF-8. Compressed tiles (zlib) follow, then the index with the column, row,
+offset, length and checksum of each tile. A footer of fixed size ends the file.
 """
 
 import json
@@ -26,8 +26,8 @@ from gsmap.utils.files import fetch_advice
 VERSION = 1
 TileKey = tuple[int, int]
 """Column and row of a tile in the global frame."""
-TilePlace = tuple[int, int, int]
-"""Offset and length in bytes, and checksum, of a compressed tile."""
+TileEntry = tuple[int, int, int]
+"""Offset in the file and length, both in bytes, and checksum of a compressed tile."""
 FARTHEST_TILE = 2**30
 """Largest column or row of a tile."""
 RASTER_MAGIC = b"\x89GSPRIOR"
@@ -77,9 +77,9 @@ def write_tiles(
 
     Args:
         file: Empty file.
-        settings: Classes, place and cells.
+        settings: Classes, cells, and name of the global frame.
         rule: Rule of the stored states.
-        tiles: Place and compressed states of each tile.
+        tiles: Column and row, and compressed states, of each tile.
         magic: First bytes of the kind of file.
     """
     entry = rule_settings(rule, _KINDS[magic].rules)
@@ -99,7 +99,7 @@ def write_tiles(
 
 def read_header(
     content: mmap.mmap | bytes, path: Path, magic: bytes = RASTER_MAGIC
-) -> tuple[PriorSettings, Any, dict[TileKey, TilePlace]]:
+) -> tuple[PriorSettings, Any, dict[TileKey, TileEntry]]:
     """Read and check everything but the tiles of an untrusted file.
 
     Args:
@@ -108,7 +108,7 @@ def read_header(
         magic: First bytes of the kind of file.
 
     Returns:
-        Settings, rule and the place of each tile in the file.
+        Settings, rule, and offset, length and checksum of each tile.
 
     Raises:
         ValueError: If the file is no valid prior.
@@ -140,8 +140,8 @@ def read_header(
     if zlib.crc32(header) != header_crc or zlib.crc32(index) != index_crc:
         raise InputError(f"{path} is damaged: a checksum is wrong; copy or build it again.")
     settings, rule = _parse_header(header, path=path, rules=kind.rules)
-    places = _parse_index(index, path=path, start=header_end, end=offset)
-    return settings, rule, places
+    entries = _parse_index(index, path=path, start=header_end, end=offset)
+    return settings, rule, entries
 
 
 def _cut(path: Path) -> InputError:
@@ -162,31 +162,33 @@ def _parse_header(
             raise InputError("classes must be a list.")
         rule = rule_from_settings(values.pop("rule"), rules)
         return PriorSettings(**values), rule
-    # A TypeError is raised for a list in place of a name, a RecursionError for deeply nested JSON.
+    # A TypeError is raised for a list instead of a name, a RecursionError for deeply nested JSON.
+    # An `InputError` is a ValueError, so the two above get the path of the file here, too.
     except (ValueError, TypeError, RecursionError) as error:
         text = str(error).rstrip(".")
         raise InputError(f"{path} is damaged: {text}; build it again.") from error
 
 
-def _parse_index(index: bytes, path: Path, start: int, end: int) -> dict[TileKey, TilePlace]:
+def _parse_index(index: bytes, path: Path, start: int, end: int) -> dict[TileKey, TileEntry]:
     """Check the index; tiles lie between the bytes ``start`` and ``end``."""
     rows = np.frombuffer(index, dtype=_INDEX)
-    first = rows["offset"]
-    # Bytes between the start of a tile and the index. Offsets are unsigned: not below 0.
-    longest = end - np.minimum(first, end)
-    inside = (first >= start) & (first <= end) & (rows["length"] <= longest)
+    offsets = rows["offset"]
+    # Bytes between the start of a tile and the index. Offsets are unsigned integers, so without the
+    # minimum the difference would wrap around to a huge number for an offset beyond the end.
+    longest = end - np.minimum(offsets, end)
+    inside = (offsets >= start) & (offsets <= end) & (rows["length"] <= longest)
     tile_columns = np.abs(rows["column"].astype(np.int64))
     tile_rows = np.abs(rows["row"].astype(np.int64))
     inside &= (tile_columns <= FARTHEST_TILE) & (tile_rows <= FARTHEST_TILE)
-    places = {}
+    entries = {}
     for column, row, offset, length, crc in rows.tolist():
-        places[column, row] = (offset, length, crc)
-    if not inside.all() or len(places) != len(rows):
+        entries[column, row] = (offset, length, crc)
+    if not inside.all() or len(entries) != len(rows):
         raise InputError(
             f"{path} is damaged: its index names tiles outside of the file or twice; build it "
             "again."
         )
-    return places
+    return entries
 
 
 def unpack_tile(content: bytes, crc: int, num_bytes: int, path: Path | str) -> bytearray:

@@ -108,11 +108,11 @@ class GaussianPrior:
         content = path.read_bytes()
         if not content:
             raise InputError(f"{path} is empty: copy or build it again.")
-        file_settings, rule, places = read_header(content, path, magic=GAUSSIAN_MAGIC)
+        file_settings, rule, entries = read_header(content, path, magic=GAUSSIAN_MAGIC)
         if settings is not None:
             settings.require_equal(file_settings, str(path))
         prior = cls(file_settings, rule)
-        for key, (offset, length, crc) in places.items():
+        for key, (offset, length, crc) in entries.items():
             packed = content[offset : offset + length]
             stored = _unpack(packed, crc=crc, path=path)
             _check_stored(stored, settings=file_settings, path=path)

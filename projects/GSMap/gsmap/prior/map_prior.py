@@ -91,7 +91,7 @@ class MapPrior:
         try:
             mapped = _map_file(path)
             try:
-                found, rule, tile_places = read_header(mapped, path)
+                found, rule, tile_entries = read_header(mapped, path)
                 if settings is not None:
                     settings.require_equal(found, str(path))
             except BaseException:
@@ -102,7 +102,7 @@ class MapPrior:
                 owner.close()
             raise
         prior = cls(found, rule, memory_bytes=memory_bytes)
-        prior._tiles.open(mapped, path=path, places=tile_places)
+        prior._tiles.open(mapped, path=path, entries=tile_entries)
         prior._owner = owner
         prior._owned_path = path.resolve() if update else None
         return prior
@@ -131,8 +131,8 @@ class MapPrior:
                 # From here on, tiles are read from the new file. A device or a pipe cannot be read.
                 if path.is_file():
                     mapped = _map_file(path)
-                    _, _, tile_places = read_header(mapped, path)
-                    self._tiles.open(mapped, path, places=tile_places)
+                    _, _, tile_entries = read_header(mapped, path)
+                    self._tiles.open(mapped, path, entries=tile_entries)
             finally:
                 if owner is not None:
                     owner.close()

@@ -12,7 +12,7 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmap.prior.file_format import TileKey, TilePlace, unpack_tile
+from gsmap.prior.file_format import TileEntry, TileKey, unpack_tile
 from gsmap.utils.errors import WorkError
 
 Tile = NDArray[np.uint8]
@@ -43,13 +43,13 @@ class TileStore:
         self._most_tiles = max(1, memory_bytes // self._tile_bytes)
         self._tiles: OrderedDict[TileKey, Tile] = OrderedDict()
         self._changed: set[TileKey] = set()
-        self._file_places: dict[TileKey, TilePlace] = {}
+        self._file_entries: dict[TileKey, TileEntry] = {}
         self._mapped: mmap.mmap | None = None
         self._path = Path()
         self._mapped_bytes = 0
         self._spill = _SpillFile()
 
-    def open(self, mapped: mmap.mmap, path: Path, places: dict[TileKey, TilePlace]) -> None:
+    def open(self, mapped: mmap.mmap, path: Path, entries: dict[TileKey, TileEntry]) -> None:
         """Read tiles from a file from now on.
 
         The tiles in memory stay. So the store must be empty, or the file must hold its content.
@@ -57,19 +57,19 @@ class TileStore:
         Args:
             mapped: Content of the file.
             path: Name of the file, for messages.
-            places: Position and checksum of each tile in the file.
+            entries: Offset, length and checksum of each tile in the file.
         """
         if self._mapped is not None:
             self._mapped.close()
         self._mapped = mapped
         self._path = path
-        self._file_places = places
+        self._file_entries = entries
         self._changed.clear()
         self._spill.clear()
 
     def keys(self) -> set[TileKey]:
         """Columns and rows of all tiles, in memory or not."""
-        return {*self._file_places, *self._spill.places, *self._tiles}
+        return {*self._file_entries, *self._spill.entries, *self._tiles}
 
     @property
     def num_in_memory(self) -> int:
@@ -110,7 +110,7 @@ class TileStore:
     def close(self) -> None:
         """Release all tiles and the file."""
         self._tiles.clear()
-        self._file_places = {}
+        self._file_entries = {}
         self._changed.clear()
         self._spill.clear()
         if self._mapped is not None:
@@ -127,10 +127,10 @@ class TileStore:
 
     def _stored(self, key: TileKey) -> tuple[bytes, int]:
         """Compressed states and checksum of a tile in the temporary file or the prior's file."""
-        if key in self._spill.places:  # newer than the tile in the prior's file
+        if key in self._spill.entries:  # newer than the tile in the prior's file
             return self._spill.read(key)
         assert self._mapped is not None
-        offset, length, crc = self._file_places[key]
+        offset, length, crc = self._file_entries[key]
         content = self._mapped[offset : offset + length]
         self._mapped_bytes += length
         if self._mapped_bytes > _MAPPED_BYTES and hasattr(mmap, "MADV_DONTNEED"):
@@ -140,7 +140,7 @@ class TileStore:
 
     def _load(self, key: TileKey) -> Tile | None:
         """Read a tile that is not in memory."""
-        if key not in self._spill.places and key not in self._file_places:
+        if key not in self._spill.entries and key not in self._file_entries:
             return None
         content, crc = self._stored(key)
         states = unpack_tile(content, crc=crc, num_bytes=self._tile_bytes, path=self._path)
@@ -162,7 +162,7 @@ class _SpillFile:
     """Temporary file of compressed tiles, without a name, which the system removes."""
 
     def __init__(self) -> None:
-        self.places: dict[TileKey, TilePlace] = {}
+        self.entries: dict[TileKey, TileEntry] = {}
         self._file: IO[bytes] | None = None
         self._end = 0  # size of the file in bytes
         self._used_bytes = 0  # size of the current tiles in it, without replaced ones
@@ -174,15 +174,15 @@ class _SpillFile:
         replaced_bytes = self._end - self._used_bytes
         if replaced_bytes > max(_WASTED_BYTES, self._used_bytes):
             self._compact()
-        if key in self.places:
-            _, old_length, _ = self.places[key]
+        if key in self.entries:
+            _, old_length, _ = self.entries[key]
             self._used_bytes -= old_length
         self._append(key, content)
 
     def read(self, key: TileKey) -> tuple[bytes, int]:
         """Return a tile and its checksum."""
         self._require_process()
-        offset, length, crc = self.places[key]
+        offset, length, crc = self.entries[key]
         assert self._file is not None
         self._file.seek(offset)
         return self._file.read(length), crc
@@ -192,7 +192,7 @@ class _SpillFile:
         if self._file is not None:
             self._file.close()
         self._file = None
-        self.places = {}
+        self.entries = {}
         self._end = 0
         self._used_bytes = 0
 
@@ -210,18 +210,18 @@ class _SpillFile:
             self._file = tempfile.TemporaryFile()  # noqa: SIM115
         self._file.seek(self._end)
         self._file.write(content)
-        self.places[key] = (self._end, len(content), zlib.crc32(content))
+        self.entries[key] = (self._end, len(content), zlib.crc32(content))
         self._end += len(content)
         self._used_bytes += len(content)
 
     def _compact(self) -> None:
         """Write the current tiles to a new temporary file."""
         old_file = self._file
-        old_places = self.places
+        old_entries = self.entries
         assert old_file is not None
         self._file = None  # so that `clear` leaves the old file open
         self.clear()
-        for key, (offset, length, _) in old_places.items():
+        for key, (offset, length, _) in old_entries.items():
             old_file.seek(offset)
             self._append(key, old_file.read(length))
         old_file.close()

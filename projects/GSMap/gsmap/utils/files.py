@@ -42,7 +42,7 @@ _DAY_S = 24 * 3600.0
 _DEVICES = Path("/dev")
 _STREAMS = Path("/dev/fd"), Path("/proc/self/fd")  # links to the open files of a process
 _REGISTERED_FOLDERS: set[Path] = set()  # by `register_folder`
-_HOLDER = re.compile(r"(process \d+ on \S+ since [\d: -]+)?")  # content that `lock_folder` writes
+_HOLDER = re.compile(r"(process \d+ on \S+ since [\d: -]+)?")  # content of a lock file
 _DIGEST_ENDING = re.compile(r"-[0-9a-f]{16}\Z")  # ending of names that `file_name` has changed
 # Exceptions of `zipfile` for a damaged archive
 DAMAGED_ZIP = (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError)
@@ -81,7 +81,8 @@ def file_names(foreign: Iterable[str], endings: Sequence[str] = ("",)) -> dict[s
         The safe name of each name.
     """
     names = {name: file_name(name) for name in foreign}
-    # A changed name may coincide with another file, so names are changed until no name changes.
+    # A changed name may coincide with another file, so all names are checked again after a change.
+    # A name with its digest stays as it is. So each name changes at most once, and the loop ends.
     while True:
         uses: Counter[str] = Counter()
         for name in names.values():
@@ -138,7 +139,7 @@ def add_path_to_errors(path: Path) -> Iterator[None]:
 
 
 def register_folder(path: Path) -> Path:
-    """Register a folder whose name a command chooses, and return it.
+    """Register a folder whose name is chosen by a command, not by the user, and return it.
 
     Afterwards `atomic_write` raises ``ValueError`` if a link would lead a file out of the folder.
     """
@@ -184,7 +185,9 @@ def atomic_write(path: str | Path, mode: Literal["w", "wb"] = "w") -> Iterator[I
             file.flush()
             if not special:
                 os.fsync(file.fileno())
-                forget_output(path)  # the command may read the new file
+                # A command must not read a file that it will replace (`inputs.declare_files`). The
+                # new file may be read.
+                forget_output(path)
                 os.replace(partial_file, path)
     except Exception as raised:
         # A system error about the temporary file, or without a path, gets the path that the caller
@@ -511,13 +514,15 @@ def _remove(path: Path) -> None:
 def _is_special(path: Path) -> bool:
     """Whether a path is a device, a pipe or a socket, which a file must not replace.
 
-    Links to them count only in ``/dev`` and in the folders of open files.
+    A link to one of them counts only if the link is in ``/dev`` or in a folder of open files. Links
+    elsewhere may be replaced.
     """
     follow = path.parent in (_DEVICES, *_STREAMS)
     try:
         mode = path.stat(follow_symlinks=follow).st_mode
     except OSError:
         return False
-    # A regular file behind a link in /dev, such as /dev/stdout, is not replaced either.
-    is_replaceable = stat.S_ISREG(mode) and path.parent != _DEVICES
-    return not (is_replaceable or stat.S_ISDIR(mode) or stat.S_ISLNK(mode))
+    if stat.S_ISREG(mode):
+        # A link in /dev, such as /dev/stdout, counts as special even if it leads to a regular file.
+        return path.parent == _DEVICES
+    return not stat.S_ISDIR(mode) and not stat.S_ISLNK(mode)

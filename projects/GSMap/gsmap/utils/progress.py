@@ -29,7 +29,8 @@ class Progress(tqdm):
             kwargs |= _EVERY_MINUTE
             kwargs |= {"desc": title, "bar_format": _FORMAT, "file": _Lines(sys.stderr)}
         else:
-            # The bar moves the cursor by control characters, which `PrintableStream` would escape.
+            # A bar moves the cursor by control characters. They must not be escaped, as they are if
+            # `terminal.escape_output` has replaced sys.stderr.
             kwargs.setdefault("file", unescaped_stream(sys.stderr))
         super().__init__(*args, **kwargs)
 

@@ -222,7 +222,7 @@ def _records(
 def _cameras(
     log: Log, rows: Mapping[str, int], global_from_axle: np.ndarray, root: Path
 ) -> list[dict[str, Any]]:
-    """List the cameras of a frame, as `from_records` takes them.
+    """List the cameras of a frame, as `mapdata.custom.from_records` takes them.
 
     The transforms to the cameras include the motion of the vehicle between the two times.
 

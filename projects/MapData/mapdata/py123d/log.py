@@ -139,7 +139,9 @@ class Camera:
 
     @property
     def calibration(self) -> dict[str, Any]:
-        """Name, size, intrinsics and distortion of the camera, as `from_records` takes them.
+        """Name, size, intrinsics and distortion of the camera.
+
+        The keys are those of `mapdata.custom.from_records`.
 
         Raises:
             ValueError: If a value is missing.

@@ -88,7 +88,7 @@ class Map:
         self.labels.append(label)
 
     def around(self, point: np.ndarray, radius_m: float) -> list[dict[str, Any]]:
-        """Elements near a point in the plane, as `from_records` takes them.
+        """Elements near a point in the plane, as `mapdata.custom.from_records` takes them.
 
         Args:
             point: Position in the global frame, in metres. (2,)

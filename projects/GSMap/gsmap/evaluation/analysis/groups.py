@@ -43,14 +43,15 @@ class Groups:
     def draw_copies(self, tokens: Sequence[str]) -> tuple[IntArray, FloatArray]:
         """Return one resample per group, which has the samples of this group once and no others.
 
-        The interface is `bootstrap.Weights`.
+        Thus, the AP in a resample (`bootstrap.resampled_figures`) is the AP of a group. The method
+        implements the interface `bootstrap.Weights`, and its name is from there: nothing is drawn.
 
         Args:
             tokens: Tokens of the samples. (S,)
 
         Returns:
-            Index of the group of each sample (S,), and number of copies of each group in each
-            resample, the identity matrix (G, G).
+            Index of the group of each sample (S,), and number of copies in each resample (rows) of
+            each group (columns), the identity matrix. (G, G)
 
         Raises:
             ValueError: If the group of a sample is unknown.
@@ -135,7 +136,8 @@ def _conditions(description: object) -> str:
 def ap_by_group(reports: Sequence[MetricReport], groups: Groups) -> dict[str, dict[str, float]]:
     """Compute every AP over the samples of each group alone.
 
-    The AP of a group equals the AP of a file with its samples. Matches are computed once.
+    An evaluation of a file that has only the samples of a group gives the same AP. Predictions are
+    not matched again: the matches of the reports are used.
 
     Args:
         reports: Reports of all metrics over all samples.

@@ -124,7 +124,8 @@ class BiFPN(BaseModule):
         self.size = (int(size[0]), int(size[1]))
         self.inputs = nn.ModuleList(_projection(inputs, channels) for inputs in in_channels)
         self.coarser = _projection(in_channels[-1], channels)
-        # Further projections of the levels but the finest, for the path back of the first round.
+        # The first round takes these second projections on its path from fine to coarse levels. The
+        # finest level has none.
         self.again = nn.ModuleList(_projection(inputs, channels) for inputs in in_channels[1:])
         self.rounds = nn.ModuleList(BiFPNRound(channels) for _ in range(num_rounds))
 

@@ -1,6 +1,7 @@
 """State keys of the released GeMap and their names here.
 
-The texts in `rules_of` are pairs ``released=here`` of the rest of the keys, or one name for both.
+`rules_of` takes the common prefix of released keys, the common prefix of the keys here, and a text.
+Each word of the text continues both prefixes: ``released=here``, or one name for both.
 """
 
 import torch

@@ -46,7 +46,8 @@ class LineMapLosses:
 
         Args:
             maps: Predictions of a batch.
-            numbers: Instance number of each pixel in each class, 0 for none. (B, classes, H, W)
+            numbers: Instance number of each pixel in each class, 0 for none. No two instances of a
+                sample have the same number, also if their classes differ. (B, classes, H, W)
             directions: Index, 1 to K, of the forward and of the backward direction of each pixel, 0
                 for none. (B, 2, H, W)
 
@@ -55,11 +56,13 @@ class LineMapLosses:
         """
         background = (numbers == 0).all(dim=1, keepdim=True)
         classes = torch.cat([background, numbers > 0], dim=1)  # (B, 1 + classes, H, W)
+        # A scalar on the device of `numbers`
         weight = constant(numbers, self.pos_weight, torch.float)
         semantic = F.binary_cross_entropy_with_logits(
             maps.semantic, classes.to(maps.semantic), pos_weight=weight
         )
-        instances = numbers.amax(dim=1)  # a pixel has at most one line over all classes (B, H, W)
+        # A pixel has a line in at most one class, so the maximum is the number of this line.
+        instances = numbers.amax(dim=1)  # (B, H, W)
         pull_terms = []
         push_terms = []
         for i, embedding in enumerate(maps.embedding):
@@ -120,5 +123,7 @@ def direction_loss(logits: Tensor, directions: Tensor) -> Tensor:
     counts = F.one_hot(directions, num_classes).sum(dim=1).movedim(-1, 1)  # (B, 1 + K, H, W)
     target = counts.to(logits) / 2
     is_line = 1 - target[:, :1]
+    # As in the released code of HDMapNet, the softmax over the channels is followed by a binary
+    # cross-entropy of each channel.
     loss = F.binary_cross_entropy(logits.softmax(dim=1), target, reduction="none")
     return (loss * is_line).sum() / (is_line.sum() * num_classes).clamp(min=1)

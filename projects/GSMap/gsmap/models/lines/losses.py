@@ -89,7 +89,7 @@ class LineLosses:
             The result of `pairs` for each case, on the device.
 
         Raises:
-            FloatingPointError: If a cost is not a number.
+            FloatingPointError: If a cost is not finite. The method `pairs` checks the costs.
         """
         costs_by_case = []
         values: list[Tensor] = []
@@ -123,6 +123,9 @@ class LineLosses:
 
         Returns:
             A NamedTuple of tensors on the CPU.
+
+        Raises:
+            FloatingPointError: If a cost is not finite.
         """
         raise NotImplementedError
 

@@ -134,10 +134,11 @@ class RenderedDiceLoss(MapLoss):
 
 @MODELS.register_module()
 class SelfDirectionLoss(MapLoss):
-    """One minus the cosine between consecutive edges of a prediction (MapVR Eq. 4).
+    """One minus the cosine between consecutive edges of a prediction.
 
     It penalises folded predictions, because a loss of rasters alone permits folds. Both edges of a
-    pair receive a gradient. The angle at the first vertex of a ring is not penalised.
+    pair receive a gradient. The angle at the first vertex of a ring is not penalised. MapVR Eq. 4
+    adds the cosines themselves, but minimising them would reward folds.
 
     Args:
         loss_weight: Weight of the loss.
@@ -151,6 +152,5 @@ class SelfDirectionLoss(MapLoss):
 
     def values(self, pairs: MatchedPairs) -> Tensor:
         """One minus the cosine at each inner vertex of M matched pairs. (M, P - 2)"""
-        # Differs from MapVR Eq. (4), which adds the cosines: minimising them would reward folds.
         edges = pairs.pred_pts_m.diff(dim=1)
         return turns(edges[:, :-1], edges[:, 1:])

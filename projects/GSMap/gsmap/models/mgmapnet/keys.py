@@ -1,7 +1,8 @@
 """Mapping between the state keys of the released MGMapNet and of this project.
 
-The texts in `rules_of` are pairs ``released=here`` of the rest of the keys, or one name for both.
-`zeros` lists keys of the release that have no effect there, and no counterpart here.
+`rules_of` takes the common prefix of released keys, the common prefix of the keys here, and a text.
+Each word of the text continues both prefixes: ``released=here``, or one name for both. `zeros`
+lists keys of the release that have no effect there, and no counterpart here.
 """
 
 from gsmap.checkpoints.key_rules import KeyMap, rules_of, zeros

@@ -147,13 +147,14 @@ class Propagation(FlowHook):
     def __init__(self, memory: QueryMemory, past: Past) -> None:
         self.memory = memory
         self.past = past
-        # Grouped by instance, with P rows for each state of points and one for a state of the
-        # instance. (B, K, rows, ...)
+        # Remembered queries, transformed to the current frame. Each of their tensors has the shape
+        # (B, K, rows, ...): P rows if the tensor describes points, one if it describes instances.
         self.propagated: Queries | None = None
         self.last: Queries | None = None  # after the last layer
         self.num_queries = 0  # number N of instance queries of all groups
         self.best_inds: Tensor | None = None  # indices of the queries to remember (B, K)
-        # Matched targets of all queries of the first group, 0 without a match. (B, N, P, 2 or 3)
+        # Target of each query of the first group, 0 for a query without a match.
+        # (B, queries of this group, P, 2 or 3)
         self.target_pts: Tensor | None = None
 
     def refine(self, head: FlowHead, layer: int, refined: Tensor) -> Tensor:

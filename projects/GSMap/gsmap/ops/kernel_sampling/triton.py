@@ -28,8 +28,9 @@ ROUNDING = tl.constexpr(12582912.0)
 def _nearest(position, size):
     """Clamp coordinates in pixels to the map, and round them half to even. (ROWS,)
 
-    Without a shift by half a pixel, as in the released code of GKT: pixel 0 reaches from -0.5 to
-    0.5. With bilinear interpolation it reaches from 0 to 1, and its centre is 0.5.
+    As in the released code of GKT, the centre of pixel i is at the coordinate i, so pixel 0 reaches
+    from -0.5 to 0.5. Bilinear interpolation uses another convention: the centre of pixel i is at
+    i + 0.5, so pixel 0 reaches from 0 to 1.
     """
     position = tl.minimum(tl.maximum(position, 0.0), size - 1.0)
     return ((position + ROUNDING) - ROUNDING).to(tl.int32)
@@ -148,8 +149,8 @@ def forward_kernel(
                         pixel = tl.load(value + channel_offsets, mask=mask, other=0.0).to(
                             tl.float32
                         )
-                        # The product passes on a NaN weight of a pixel outside of the map;
-                        # tl.where would drop it.
+                        # As in `bilinear_cells`, a pixel outside of the map has the weight 0. A NaN
+                        # weight remains NaN in this product, but tl.where would replace it by 0.
                         total += pixel * (corner_weight * inside.to(tl.float32))[:, None]
                 else:
                     pixel_index = _nearest(at_y, height) * width + _nearest(at_x, width)

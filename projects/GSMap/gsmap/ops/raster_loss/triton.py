@@ -150,15 +150,17 @@ def sums_kernel(
     p = tl.load(preds + n * pixels + index, mask=ok, other=0.0)
     t = tl.load(targets + n * pixels + index, mask=ok, other=0.0)
     excess = (weight - 1) * t
-    # The sums in the order of the reference: w |p - t|, w p, 1 - SSIM, w t, w - 1, windows with
-    # part of the target, windows with part of either mask, where w = 1 + excess.
+    # With w = 1 + excess, the sums are in the order of the reference: w |p - t|, w p, 1 - SSIM,
+    # w t, w - 1, number of windows with part of the target, number of windows with part of either
+    # mask.
     out = sums + (n * tl.num_programs(0) + tl.program_id(0)) * 7
     tl.store(out, tl.sum((1 + excess) * tl.abs(p - t)))
     tl.store(out + 1, tl.sum((1 + excess) * p))
     tl.store(out + 2, tl.sum(tl.where(ok, dissimilarity, 0.0)))
     tl.store(out + 3, tl.sum((1 + excess) * t))
     tl.store(out + 4, tl.sum(excess))
-    # The window covers part of the target where the blurred target is > 0.
+    # The two numbers have different thresholds, as in the reference: any part of the target counts,
+    # but the coverage by either mask must exceed `MIN_COVERAGE`.
     tl.store(out + 5, tl.sum((ok & (mean_t > 0)).to(tl.float32)))
     either = (mean_p > COVERAGE) | (mean_t > COVERAGE)
     tl.store(out + 6, tl.sum((ok & either).to(tl.float32)))
@@ -266,8 +268,8 @@ def gradient_kernel(
     # Gradient of the sums of w |p - t| and w p, without the factor w.
     slope = tl.load(grads + n * 7) * sign + tl.load(grads + n * 7 + 1)
     # Chain rule for SSIM, from the gradients with respect to p, p^2 and p t.
-    ssim = by_mean + 2 * p * by_square + t * by_product
-    total = (1 + (weight - 1) * t) * slope - tl.load(grads + n * 7 + 2) * ssim
+    ssim_slope = by_mean + 2 * p * by_square + t * by_product
+    total = (1 + (weight - 1) * t) * slope - tl.load(grads + n * 7 + 2) * ssim_slope
     tl.store(out + n * pixels + index, total, mask=index < pixels)
 
 
