@@ -106,7 +106,7 @@ def test_a_prior_of_elements_is_drawn_and_not_written():
     assert rows.tolist() == list(range(8, 40))  # y of -20 to 20 m, cells of 1.25 m
     assert (columns == 14).all()  # x of 2.5 to 3.75 m
     assert not window[:2].any()
-    with pytest.raises(ValueError, match="has elements, which a model reads only"):
+    with pytest.raises(ValueError, match="has elements, which a model can only read"):
         GivenMaps([prior], CLASSES, grid=WINDOW, update=True)
 
 
