@@ -68,7 +68,7 @@ def frame_cost(path: str, args: argparse.Namespace, cuda_graphs: bool = False) -
     model.eval()
     if cuda_graphs:
         return _replayed_frame_cost(model, inputs, samples=samples, args=args)
-    # In half precision, the backbone of a GPU has half weights; on a CPU, autocast is used.
+    # For half precision, the weights of the backbone are converted on a GPU; a CPU uses autocast.
     halved = args.fp16 and args.device != "cpu"
     if halved:
         model.halve_backbone()

@@ -125,7 +125,9 @@ def _peak_bytes(function: Callable[[], object], device: torch.device) -> int:
     Path("/proc/self/clear_refs").write_text("5")  # resets the peak
     before = _status_bytes("VmRSS")
     function()
-    libc.mallopt(M_MMAP_THRESHOLD, 32 * MIB)  # upper limit of glibc's automatic threshold
+    # From here on, malloc keeps freed tensors for reuse again, as in a normal run. The call above
+    # has ended glibc's automatic choice of the threshold, whose upper limit is this value.
+    libc.mallopt(M_MMAP_THRESHOLD, 32 * MIB)
     return max(_status_bytes("VmHWM") - before, 0)
 
 

@@ -53,7 +53,8 @@ class Result:
         figures: All figures of the test, by flat key; empty if the run is not done.
         costs: Iterations, million parameters, seconds per step and per tested sample, peak memory
             in MiB, as far as they are known; keys of ``_COSTS``.
-        record: Machine, load and commands; empty unless `execute` has run the run.
+        record: Machine, load and commands; empty if the run was not started by
+            `comparison.jobs.execute`.
         log: The training log; None if there is none.
     """
 
@@ -121,7 +122,7 @@ def _training_costs(log: RunLog, record: Mapping[str, Any]) -> dict[str, float]:
 
     Args:
         log: The training log.
-        record: Record of the run, with ``peak_mib`` if `execute` has measured its memory.
+        record: Record of the run, with ``peak_mib`` if its memory was measured.
     """
     steps = [entry["step"] for entry in log.train]
     _, seconds = log.series("time")
@@ -189,7 +190,7 @@ def check_one_test_set(results: Sequence[Result]) -> None:
 
 
 def evaluator_for(annotations: Path, changes: Mapping[str, Any]) -> MapEvaluator:
-    """Build both metrics for an annotation file, with its classes and range.
+    """Build AP_chamfer and AP_raster for an annotation file, with its classes and range.
 
     Args:
         annotations: The annotation file.

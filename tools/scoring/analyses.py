@@ -135,7 +135,7 @@ def uncertainty_report(args: argparse.Namespace, settings: MetricSettings) -> Me
 
 
 def read_resamples(args: argparse.Namespace) -> "Resamples | None":
-    """Read the scenes of the samples; None if no option needs intervals."""
+    """Read the scenes and create the resamples of them; None if no option needs intervals."""
     if args.bootstrap is None and not args.against:
         return None
     from gsmap.evaluation.analysis.bootstrap import Resamples

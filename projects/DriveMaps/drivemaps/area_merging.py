@@ -112,7 +112,7 @@ def _vote(
     rows_of_frame: defaultdict[int, list[int]] = defaultdict(list)
     for row, frame_index in enumerate(frames.tolist()):
         rows_of_frame[frame_index].append(row)
-    footprints = {}
+    footprints = {}  # range of each frame, as a polygon in the global frame
     for frame_index in rows_of_frame:
         footprints[frame_index] = drive.footprint(drive.frames[frame_index])
     edges = shapely.boundary([*areas, *footprints.values()])

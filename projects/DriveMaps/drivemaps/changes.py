@@ -45,7 +45,7 @@ def find_changes(
 ) -> Changes:
     """Find the elements of a place that were removed, added or moved.
 
-    A change concerns a whole area, or a part of a line that is at least 8 m long or the whole line.
+    A change concerns a whole area, a whole line, or a part of a line that is at least 8 m long.
 
     * Removed: an area or a part of a line of the old map that three quarters
       of the passes in view do not see.
@@ -57,8 +57,9 @@ def find_changes(
       side and at a mean distance of at least 0.5 m, or an area of the old map whose centre moved by
       at least 0.75 m. The shift must also be at least five standard errors.
 
-    Lines of the old map with a score below 0.4 are neither removed nor moved, and lines of a pass
-    with a score below 0.6 are not added. They still show that a line is not new, or not gone.
+    Lines of the old map with a score below 0.4 are never reported as removed or moved, but they
+    show that a line of a pass is not new. Lines of a pass with a score below 0.6 are never reported
+    as added, but they show that a line of the old map is still there.
 
     The confidence of a removed or moved element is multiplied by its score in the old map, as an
     element that never was there cannot be removed.

@@ -4,7 +4,8 @@ The working folder may hold files of unknown origin, such as a downloaded data s
 read settings there:
 
 * matplotlib reads ``matplotlibrc`` and numba reads ``.numba_config.yaml`` on import. Numba reads
-  it again when it compiles. The file may name a folder of compiled kernels, which are pickles.
+  it again when it compiles. The file may name a folder of compiled kernels. These are pickles,
+  which can run any code when they are loaded.
 * OpenCV prepends a folder to ``LD_LIBRARY_PATH`` and leaves an empty entry there. Because of the
   empty entry, all programs started later load libraries from the working folder first.
 
@@ -32,6 +33,7 @@ def _without_relative_files(module: ModuleType) -> Iterator[None]:
     exists = os.path.exists
 
     def absolute_path_exists(path: Any) -> bool:
+        # An integer is a file descriptor.
         is_relative = not isinstance(path, int) and not os.path.isabs(path)
         return not is_relative and exists(path)
 
@@ -109,9 +111,9 @@ _GUARDS: dict[str, _Guard] = {
 
 
 class SettingsGuard:
-    """Import finder that imports the libraries of this module under a guard.
+    """Import finder that imports the modules of ``_GUARDS`` under their guards.
 
-    The first entry of ``sys.meta_path``. Libraries that were imported before ``gsmap`` are not
+    It is the first entry of ``sys.meta_path``. Modules that were imported before ``gsmap`` are not
     guarded.
     """
 

@@ -25,7 +25,10 @@ Parser = Callable[[bytes], Any]
 
 @contextmanager
 def library_errors() -> Iterator[None]:
-    """Convert any error that rosbags or its parsers raise for a damaged bag to a ``ValueError``."""
+    """Convert any error that rosbags or its parsers raise for a damaged bag to a ``ValueError``.
+
+    Errors of the operating system, which have an error number, are raised unchanged.
+    """
     try:
         yield
     except MemoryError as error:
@@ -192,7 +195,7 @@ class RosBag:
         Raises:
             ValueError: If a file is damaged.
         """
-        begin_bag()
+        begin_bag()  # starts to count the decompressed bytes, which `import_bounded` limits
         self._types = RosTypes()
         self._is_ros1 = self.paths[0].suffix == ".bag"
         module = "rosbags.rosbag1" if self._is_ros1 else "rosbags.rosbag2"

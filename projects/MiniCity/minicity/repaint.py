@@ -133,7 +133,7 @@ def _repaint_road(road: Road, rng: np.random.Generator) -> Road | None:
         return replace(road, crossings=crossings)
     if kind == ADDED:
         return replace(road, crossings=[*road.crossings, added])
-    # The lanes beside the wider shoulder have more room.
+    # Lines are shifted towards the wider shoulder, where there is room; a shift > 0 is to the left.
     has_room_left = road.section.left_shoulder_m > road.section.right_shoulder_m
     return replace(road, shift_m=MOVE_M if has_room_left else -MOVE_M)
 
@@ -207,7 +207,7 @@ def _change(street: int, kind: str, class_name: str, points: Array) -> Change:
 
 
 def _subtract(spans: Spans, others: Spans) -> Spans:
-    """Parts of spans (start, end) that no other span covers."""
+    """Parts of spans (start, end) that no span of ``others`` covers."""
     parts = spans
     for other_start, other_end in others:
         remaining = []

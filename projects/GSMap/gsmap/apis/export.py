@@ -449,8 +449,8 @@ def largest_differences(
                 continue
             distances[i, j] = np.abs(line - expected_line).max()
             if found.labels[i] in unfolded:
-                # Points may be in another order: each is compared with the nearest of the other
-                # line, in both directions.
+                # Points may be in another order: each point of a line is compared with the nearest
+                # point of the other line, in both directions.
                 between_points = np.abs(line[:, None] - expected_line).max(-1)  # (P, P)
                 to_line = between_points.min(0).max()
                 from_line = between_points.min(1).max()
@@ -475,7 +475,11 @@ def _operator_translations() -> dict[Any, Any]:
         include_last_offset: bool,
         _padding_idx: int | None,
     ) -> Any:
-        """Weighted sums of rows in bags of one size, as in `sum_rows`, without a loop."""
+        """Weighted sums of rows of a table, in bags of one size, without a loop over the bags.
+
+        Deformable sampling (`gsmap.ops.deformable_sampling.sum_rows`) calls the operator in this
+        way.
+        """
         if mode != 0 or weights is None or include_last_offset:
             raise NotImplementedError("embedding_bag other than weighted sums in bags of one size")
         one = op.Constant(value_ints=[1])

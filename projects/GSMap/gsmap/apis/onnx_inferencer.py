@@ -170,7 +170,8 @@ class OnnxInferencer:
                   of the map, of ``prior_shape``, in [0, 1]; by default zeros.
                 * Models with memory also read ``scene``, ``timestamp_ns`` and ``lidar2global``
                   (4, 4), from the annotation frame to the world in metres.
-            stream: Drive of the sample, for a model with memory (`new_stream`); it is advanced.
+            stream: Memory of the drive of the sample, for a model with memory: a result of
+                `new_stream`, or of `new_scenes` for samples of several scenes. It is advanced.
 
         Returns:
             The elements, best first, with scores and, if the model predicts them, Gaussians.
@@ -265,7 +266,7 @@ class OnnxInferencer:
                 f"{self.path.name} remembers the frames of a drive: give the call its stream, "
                 "which new_stream() starts."
             )
-        stream.claim(self)
+        stream.claim(self)  # raises an error if the stream belongs to another model
         frame = Frame.from_meta(meta)
         (previous,) = stream.previous([frame])
         continues = previous is not None

@@ -31,9 +31,9 @@ class _Part(NamedTuple):
     """Part of a config under construction: settings with a ``type``, or an object of the runner.
 
     Attributes:
-        registry: Registry that builds the part; None for a part that the runner builds itself.
-        kind: Class of the part, or its name.
-        settings: Settings that the part is built from; None for a part of the runner.
+        registry: Registry that builds the part; None for a part that is built without one.
+        kind: Class of the part, or its name; None for an object of the runner.
+        settings: Settings that the part is built from; None without a registry.
     """
 
     registry: Registry | None
@@ -68,7 +68,8 @@ def reading_config(source: object) -> Iterator[None]:
         reason: BaseException = error
         if isinstance(error, ImportError) and error.__context__ is not None:
             reason = error.__context__  # mmengine's ImportError omits the cause
-        if "load gsmap config" in str(reason):  # mmengine has a fixed list of scopes
+        # mmengine reads ``scope::config`` in _base_ for a fixed list of scopes, without gsmap.
+        if "load gsmap config" in str(reason):
             reason = ValueError(
                 f"'gsmap::' is not read in _base_; write a path below {shipped_path('configs')} "
                 "instead"

@@ -12,7 +12,7 @@ from mmengine.model import is_model_wrapper
 from mmengine.runner import Runner
 from torch import Tensor
 
-_MAX_ROWS = 1000  # unread iterations
+_MAX_ROWS = 1000  # largest number of rows in the queue, one for each iteration
 
 
 class _Waiting:
@@ -71,7 +71,7 @@ class LateHistory(HistoryBuffer):
 
     @property
     def _count_history(self) -> Any:
-        """Number of scalars whose sum is each value of `HistoryBuffer`."""
+        """Counts of `HistoryBuffer`: each of its values is a sum of this number of scalars."""
         self._waiting.read()
         return self._counts
 
@@ -132,8 +132,9 @@ def keep_figures(hub: MessageHub, figures: Mapping[str, Any]) -> None:
 class MapRuntimeInfoHook(RuntimeInfoHook):
     """mmengine's hook without GPU synchronisation between log lines.
 
-    On a GPU, a loss that is not finite ends the run one iteration later. Losses that are still
-    unchecked at the end of an epoch or of the training are checked then.
+    The model checks its losses (``loss_check``). On a GPU, a loss that is not finite ends the run
+    one iteration later. Losses that are still unchecked at the end of an epoch or of the training
+    are checked then.
     """
 
     def after_train_iter(

@@ -92,7 +92,7 @@ def read_config(config: str | Path | Config, cfg_options: dict | None = None) ->
         import_modules_from_strings(["gsmap.registered"])
         import_modules_from_strings(**cfg.get("custom_imports", {"imports": []}))
     init_default_scope(cfg.get("default_scope", "mmdet3d"))
-    share_settings(cfg)
+    share_settings(cfg)  # copies settings of the head to the transforms that make its targets
     return cfg
 
 

@@ -52,8 +52,9 @@ class MapDetector(Base3DDetector):
         temporal: Settings of `StreamMemory`, for a model with memory of earlier frames.
         prior: Config of a module that reads maps of earlier frames (`RasterPrior`,
             `ElementFusion`).
-        fold_batch_norms: Run the image backbone without gradients as a copy whose batch norms are
-            folded into its convolutions. It is faster and needs a second copy of the weights.
+        fold_batch_norms: In inference, run a copy of the image backbone whose batch norms are
+            folded into its convolutions. This is faster, but the copy has its weights in memory a
+            second time.
         allow_untrained: Accept checkpoints without the weights of modules that start without
             effect, for example the Gaussians of GSMap in a checkpoint of MapTR. Trainings accept
             them, all other commands only on request. All other weights must be present, with the
@@ -198,7 +199,7 @@ class MapDetector(Base3DDetector):
         self.half_backbone = HalfBackbone()
 
     def extract_feat(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Any]:
-        """Outputs of the BEV encoder: ``bev_feats`` (B, C, H, W), and the inputs of its losses."""
+        """Outputs of the BEV encoder: ``bev_feats`` (B, C, H, W), and inputs of encoder losses."""
         with self._training_autocast() as in_half_precision:
             outputs = self._encode(batch_inputs, batch_data_samples)
         return tree_map_only(Tensor, _in_float32, outputs) if in_half_precision else outputs
@@ -210,7 +211,7 @@ class MapDetector(Base3DDetector):
             yield False
             return
         device = next(self.parameters()).device.type
-        # A recorded step must cast the weights at each replay.
+        # A recorded step must cast the weights at each replay, so autocast keeps no cast weights.
         caches = not is_recording(device)
         with torch.autocast(device, dtype=getattr(torch, self.autocast), cache_enabled=caches):
             yield True
@@ -287,7 +288,7 @@ class MapDetector(Base3DDetector):
         return scalars
 
     def _losses(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
-        """Losses of the head by name. A loss that is not a scalar is to be averaged."""
+        """Losses of the head by name; `loss` averages a loss that is not a scalar."""
         if self.step_graphs is not None:
             imgs = self.augment_images(batch_inputs["imgs"])
             metas = [sample.metainfo for sample in batch_data_samples]

@@ -73,9 +73,11 @@ class GaussianPrior:
 
     A Gaussian stands for a piece of a line. Its centre and its variance across the line are updated
     by every frame that has it in view: a Kalman filter in information form. Its standard deviation
-    along the line is half of the distance of neighbouring Gaussians. It also counts hits and
-    misses, as `HitMissCounts` does. Areas are stored as their outlines. All methods may be called
-    from several threads. All Gaussians are in memory.
+    along the line is half of the distance of neighbouring Gaussians. It also has counts of hits and
+    misses, which decay. A frame that has the Gaussian in view adds the score p of the line that
+    measures it, or p = 0 without such a line, to its hits, and 1 - p to its misses. Areas are
+    stored as their outlines. All methods may be called from several threads. All Gaussians are in
+    memory.
 
     Args:
         settings: Classes, place and tiles; the size of cells is not used.
@@ -282,7 +284,10 @@ class GaussianPrior:
         return GaussianMasks(masks[0], spread=masks[1])
 
     def _keys_in_view(self, frame: PlanarPose, grid: BEVGrid) -> list[TileKey]:
-        """Places of the tiles around the view of a frame, with a margin for lines that cross it."""
+        """Columns and rows of the tiles in view of a frame or at most a margin outside of the view.
+
+        The margin is for lines that cross the edge of the view.
+        """
         x0, x1 = grid.x_range
         y0, y1 = grid.y_range
         corners = frame.to_global(np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]))
@@ -407,13 +412,13 @@ class _Active:
 
     def scatter(self, tiles: dict[TileKey, Stored], tile_m: float) -> None:
         """Distribute the Gaussians to tiles, to whose content they are added."""
-        places = np.floor(self.means / tile_m).astype(np.int64)
+        tile_keys = np.floor(self.means / tile_m).astype(np.int64)  # column and row of each. (N, 2)
         # Versions of NumPy differ in the shape of the inverse, (N,) or (N, 1).
-        keys, key_indices = np.unique(places, axis=0, return_inverse=True)
+        keys, key_indices = np.unique(tile_keys, axis=0, return_inverse=True)
         key_indices = key_indices.ravel()
         stored = np.zeros(len(self.labels), _STORED)
         stored["label"] = self.labels
-        stored["position"] = self.means - tile_m * places
+        stored["position"] = self.means - tile_m * tile_keys
         stored["angle"] = np.arctan2(np.sin(self.angles), np.cos(self.angles))
         stored["variance"] = self.variances
         stored["hits"] = self.hits

@@ -197,7 +197,11 @@ class _SpillFile:
         self._used_bytes = 0
 
     def _require_process(self) -> None:
-        """Raise an error in a forked process, whose reads would move the position of both."""
+        """Raise an error in a forked process.
+
+        It shares the position in the file with the process that made the file, so a read in one
+        process would move the position in both.
+        """
         if self._process != os.getpid():
             raise WorkError(
                 "a map prior with changes belongs to the process that made it: save it, and load "

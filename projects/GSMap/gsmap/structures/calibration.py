@@ -47,8 +47,8 @@ def calibration_arrays(
 
     * ``img_from_frame`` and its inverse ``frame_from_img``: between metres in the annotation frame
       and (u * d, v * d, d, 1), with pixels u, v of the image of the network and depth d in metres.
-    * ``img_from_ground`` and its inverse ``ground_from_img``: with z as the height above the plane
-      z = 0 of the vehicle.
+    * ``img_from_ground`` and its inverse ``ground_from_img``: as above, but z of the annotation
+      frame is replaced by the height above the plane z = 0 of the vehicle, the ground.
     * ``cam_from_ground`` and ``ego_from_cam``: transforms in metres.
     * ``cam2img``, ``img_aug_matrix`` and ``can_bus``: fields of the metainfo. ``can_bus`` is
       processed by `without_history`, and zero if the sample lacks it.

@@ -14,8 +14,8 @@ class FrameView:
     Args:
         forward: Axis that points ahead: ``"y"`` (x is right) or ``"x"`` (y is left).
         ground: Ground plane z = a x + b y + c as (a, b, c), c in metres.
-        vehicle_m: Rear end, front end (along the forward axis) and width of the ego vehicle, in
-            metres.
+        vehicle_m: Coordinates of the rear end and the front end of the ego vehicle along the
+            forward axis, and its width, in metres.
         ego_ground_z_m: Height of the ground in the frame of the *vehicle*, in metres, from which
             ``with_mounting`` computes the ground plane.
     """

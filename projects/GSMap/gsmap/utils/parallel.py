@@ -94,8 +94,8 @@ class _Worker:
 
 def _start_worker(setup: Path) -> None:
     """Prepare a worker process, which ends with its parent."""
-    escape_output()
-    watch_files()
+    escape_output()  # prints no control characters
+    watch_files()  # raises an error if a pipe or an output of the command is read
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C for all
     signal.signal(signal.SIGTERM, _stop_worker)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})

@@ -143,8 +143,8 @@ class LoadLidarSweeps(LoadPointsFromMultiSweeps):
 class PointsToFrame(BaseTransform):
     """Transform points from the frame of the LiDAR to the annotation frame.
 
-    The transform must come after ``LoadLidarPoints`` and before ``LoadLidarSweeps``, which
-    transforms the points of earlier sweeps.
+    The transform must come after ``LoadLidarPoints`` and before ``LoadLidarSweeps``. The latter
+    adds the points of earlier sweeps, which it has already transformed to the annotation frame.
     """
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:

@@ -128,12 +128,13 @@ def write_tracks(
     config: ConsistencyConfig,
     about: Mapping[str, Any],
 ) -> None:
-    """Write results with the track of each element: ``track_id``, -1 below the smallest score.
+    """Write results in which each element has its track, the integer ``track_id``.
 
     Args:
         path: Path of the result file.
-        frames: Frames of all drives. Tracks are created by `make_tracks` where a frame has none;
-            they persist over the frames of a scene.
+        frames: Frames of all drives. Tracks are created by `tracks_of` where a frame has none;
+            they persist over the frames of a scene. An element whose score is not above
+            ``config.min_score`` then has the track -1.
         config: Rules of the tracks.
         about: Metadata of the results.
     """

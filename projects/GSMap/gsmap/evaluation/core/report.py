@@ -128,7 +128,8 @@ def format_table(report: MetricReport) -> str:
         lines += _group_lines(report, group)
     absent = [name for name, ranked in report.detections.items() if not ranked.num_gts]
     some_are_absent = 0 < len(absent) < len(report.detections)
-    # In an AP that is a mean over samples, predictions of an absent class count.
+    # In an AP that is a mean over samples, predictions of an absent class count, so that the class
+    # is not left out.
     if some_are_absent and not report.sample_aps:
         lines.append(f"without ground truth, left out of the means: {', '.join(absent)}")
     mean_ap = report.metrics[f"{report.name}/mAP"]

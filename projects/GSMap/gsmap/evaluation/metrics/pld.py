@@ -1,7 +1,7 @@
 """SOSPA, a distance of lines that respects the order of points, and PLD, a distance of maps.
 
-Lehocine et al., "Beyond Chamfer Distance", arXiv 2605.22578. Figures are equal to the evaluator of
-the paper (zenseact/SOSPA). Both distances are in [0, 1], and smaller is better.
+Lehocine et al., "Beyond Chamfer Distance", arXiv 2605.22578. The evaluator of the paper
+(zenseact/SOSPA) computes equal figures. Both distances are in [0, 1], and smaller is better.
 """
 
 from collections.abc import Sequence

@@ -36,7 +36,8 @@ class Reference:
 class RefinedReference(Reference):
     """References that decoder layers refine.
 
-    A query has n references: n = 1 for the query of a point, n = P for the query of an instance.
+    A reference has D entries. A query has n references: n = 1 for the query of a point, n = P for
+    the query of an instance.
 
     Attributes:
         coords: Number of coordinates of a point, which are the first entries of a reference: 2 or

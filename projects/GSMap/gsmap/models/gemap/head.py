@@ -26,7 +26,8 @@ class GeMapHead(MapHead):
         loss_euclidean: Settings of `EuclideanLoss`, or None to train without it.
         decoupled: Use the self-attention of GeMap in the layers instead of the configured one.
         one_to_many: Keep the further query groups, which GeMap does not have. The Euclidean loss of
-            many matches takes much memory. Set ``losses`` of such a group to leave it out.
+            their many matches takes much memory. To train a group without it, list the other losses
+            in ``losses`` of the group.
         kwargs: Further arguments of `MapHead`.
     """
 

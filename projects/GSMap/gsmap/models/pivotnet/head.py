@@ -39,7 +39,8 @@ class PivotReference(Reference):
             references: Points (from the front, from the left) with logits. (N, P, 3)
 
         Returns:
-            ``pts`` in metres, filled with the last pivot, (N, P, 2) and ``num_pts`` (N,).
+            ``pts``, the pivots in metres, with the last pivot repeated up to P points, (N, P, 2);
+            and ``num_pts``, the numbers of pivots, (N,).
         """
         is_dropped = references[..., 2] <= 0
         index = torch.arange(is_dropped.shape[1], device=is_dropped.device)
@@ -141,8 +142,8 @@ class PivotHead(LineHead):
 
         Args:
             layer: Lines of each class from one decoder layer.
-            mean: Mean over the map of the D features of its coordinates (`coordinate_feature`).
-                (D,)
+            mean: Mean over all cells of the map of the D features that encode the coordinates of a
+                cell (`LineHead.coordinate_feature`). (D,)
         """
         lines = []
         for label, class_lines in enumerate(layer):

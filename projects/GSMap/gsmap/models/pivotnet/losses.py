@@ -35,7 +35,7 @@ class TrueLines(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """Matched lines of a case."""
+    """Matched lines of a case, which is one class in one sample."""
 
     rows: Tensor  # indices of the predicted lines (M,)
     cols: Tensor  # indices of the annotated lines (M,)
@@ -52,7 +52,8 @@ class PivotLosses(LineLosses):
         mask: Weight of the masks of lines in matching and loss.
         semantic: Weight of the masks of whole classes in the loss.
         none_weight: Weight of predictions without a matched line in the class loss.
-        pivots: Weight of the matched pivots in the loss, and of the sequences in matching.
+        pivots: Weight of the matched pivots in the loss, and in matching, of the mean difference of
+            the pivots of a line and the points that are paired with them in order.
         collinear: Weight of the points between pivots in the loss.
         point_cls: Weight of the classification of points as pivots in the loss.
         end_weight: Additional weight of a line's ends among its pivots, in matching and loss.

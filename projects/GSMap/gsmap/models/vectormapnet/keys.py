@@ -2,7 +2,8 @@
 
 The first two arguments of `rules_of` are the prefixes of keys in the release and here. The text
 lists the rest of each key, as ``released=here`` or as one name that both have.
-`zeros` lists keys of the release that have no effect there, and no counterpart here.
+`zeros` lists keys of the release that have no effect there, and no counterpart here. The value of
+an unused key is written when weights are converted to the release; a key with None is not written.
 """
 
 import torch
@@ -68,6 +69,7 @@ VECTORMAPNET = KeyMap(
         "backbone.masked_embeds.weight": torch.zeros(()).expand(4, 128),
         **zeros(_ELEMENTS, {"transformer.level_embeds": (1, 256), "label_embed.weight": (3, 256)}),
     },
+    # prefixes, in the release and here, that identify the architecture
     markers=((_LINES, "map_head.generator."),),
     # aliases of the branch of index 0
     ignored_pattern=r"head\.det_net\.pre_branches\.(cls|reg)\.[1-9]",

@@ -20,7 +20,9 @@ from gsmap.ops._numba import FASTMATH, pixel_range, run_in_threads
 from gsmap.ops.polyline_raster.reference import DISTANCE_EPS, LENGTH_EPS
 
 FAR = np.float32(np.inf)
-REACH = -math.log(1e-8)  # largest D / softness that counts; farther pixels are 0 or 1
+# Largest D / softness that counts, with D the distance (or its square) of a pixel from an edge.
+# Farther pixels are 0 or 1.
+REACH = -math.log(1e-8)
 # Smallest x and y, and size of a pixel along x and y, of a raster in pixels. The centre of pixel
 # (row, col) is at (x, y) = (col, row), where the rasterizer released by Zhang et al. samples it.
 INTEGER_FRAME = (-0.5, -0.5, 1.0, 1.0)
@@ -39,6 +41,7 @@ def _visit_edge(start, end, index, frame, reach, eps, columns, distances, edge_i
     edge_x = float(end[0]) - x0
     edge_y = float(end[1]) - y0
     length = math.sqrt(edge_x * edge_x + edge_y * edge_y)
+    # The lower limit avoids a division by 0 for an edge of length 0 if `eps` is 0.
     length2 = max(edge_x * edge_x + edge_y * edge_y + eps, 1e-38)
     along_x = np.float32(edge_x / length2)
     along_y = np.float32(edge_y / length2)
@@ -154,7 +157,10 @@ def _clamped_distance(squared, min_distance):
 
 @njit(nogil=True, cache=True)
 def soft_forward(rings, polygons, reach, softness, min_distance, masks, first, last):
-    """Render the rings ``first`` to ``last - 1``: exp(-D / s), or sigmoid(+-D / s) for polygons.
+    """Render the rings ``first`` to ``last - 1``.
+
+    A pixel of a line is exp(-D / s). A pixel of a polygon is sigmoid(D / s) inside the ring and
+    sigmoid(-D / s) outside.
 
     Args:
         rings: Vertices of closed rings in pixels, float32. The ring of a line goes along the line
