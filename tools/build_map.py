@@ -233,7 +233,7 @@ def check_options(args: argparse.Namespace, ann: AnnotationFile) -> None:
             "--crs if poses are coordinates of a grid."
         )
     has_known_origin = len(unknown) < len(origins)
-    if {"osm", "geojson"} & set(args.formats) and has_known_origin:  # writes degrees
+    if {"osm", "geojson"} & set(args.formats) and has_known_origin:  # degrees are written
         import_extra("pyproj", "maps")
 
 
@@ -425,7 +425,7 @@ def place_of(ann: AnnotationFile, scenes: Iterable[str]) -> str:
     """Name of the map of drives.
 
     Raises:
-        ValueError: If they lie in different places, or do not exist.
+        ValueError: If the drives lie in different places, or do not exist.
     """
     chosen = set(scenes)
     places = set()
@@ -626,8 +626,8 @@ def merge_drives(
         Drives with their merged maps, and the processor time of merging in seconds.
     """
     has_poses = ann.meta.options.get("poses", True)
-    # File names are chosen for all drives of the file, so that a drive has the same name when other
-    # drives are selected.
+    # `file_names` gives each drive a safe file name. The names are chosen for all drives of the
+    # annotation file, so that a drive has the same name when other drives are selected.
     all_names = ann.column("map_name" if args.join else "scene")
     names = file_names(sorted({*all_names, *groups}), ("", _LON_LAT))
     if args.out:

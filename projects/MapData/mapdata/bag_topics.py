@@ -9,10 +9,12 @@ from gsmap.utils.errors import InputError
 IMAGES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
 INFO = "sensor_msgs/msg/CameraInfo"
 # Last parts of a topic of images that do not name a camera.
-_GENERIC = ("compressed", "raw", "image", "image_raw", "image_color", "image_mono", "image_rect",
-            "image_rect_color", "image_rect_raw")  # fmt: skip
+_GENERIC_ENDINGS = (
+    "compressed", "raw", "image", "image_raw", "image_color", "image_mono", "image_rect",
+    "image_rect_color", "image_rect_raw",
+)  # fmt: skip
 # Words in a topic that do not distinguish cameras.
-_WORDS = {
+_COMMON_WORDS = {
     "", "camera", "image", "img", "info", "camerainfo", "caminfo", "calibration", "raw", "color",
     "mono", "rect", "compressed",
 }  # fmt: skip
@@ -89,7 +91,7 @@ def image_topics(kinds: Mapping[str, str]) -> dict[str, str]:
             parts = topic.split("/")
             if kinds[topic] != image_kind or parts[-1] == "compressedDepth":
                 continue
-            while len(parts) > 2 and parts[-1] in _GENERIC:
+            while len(parts) > 2 and parts[-1] in _GENERIC_ENDINGS:
                 parts.pop()
             topic_of.setdefault("/".join(parts), topic)
     names = [base.rsplit("/", maxsplit=1)[-1] for base in topic_of]
@@ -152,7 +154,7 @@ def camera_topics(kinds: Mapping[str, str], listing: str) -> dict[str, tuple[str
 
 def _words(topic: str) -> list[str]:
     """Sorted words of a topic that distinguish cameras."""
-    return sorted(word for word in re.split(r"[/_]", topic.lower()) if word not in _WORDS)
+    return sorted(word for word in re.split(r"[/_]", topic.lower()) if word not in _COMMON_WORDS)
 
 
 def _candidate_infos(topic: str, infos: Sequence[str]) -> list[str]:

@@ -77,7 +77,7 @@ class FileOptions:
     def path_of(self, dataset: str, split: str) -> Path:
         """Path of a split's annotation file: ``gsmap_<dataset>_<split><tag>.arrow``.
 
-        Without a tag, the file name of a published split ends in its name.
+        Without a tag, the file name ends in ``_<split_name>`` if a published split is selected.
         """
         split_tag = f"_{self.split_name}" if self.split_name else ""
         tag = self.tag or split_tag

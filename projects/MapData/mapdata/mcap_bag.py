@@ -35,11 +35,15 @@ class McapConnection:
 
 
 def is_plain_ros2(path: Path) -> bool:
-    """Whether an MCAP file is left to rosbags: it has messages of ROS 2 only, or is damaged."""
+    """Whether rosbags reads an MCAP file: it has messages of ROS 2 only, or is damaged.
+
+    rosbags then reports the damage.
+    """
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
             return True
         file.seek(0)
+        # `library_errors` turns every error of the library into a ValueError.
         with library_errors():
             # `import_bounded` limits the memory that a module of mcap may decompress to.
             reader = import_bounded("mcap.reader").make_reader(file)
@@ -171,7 +175,10 @@ def _listed_type(connection: McapConnection) -> str:
 
 
 def _create_parser(connection: McapConnection, types: RosTypes) -> Parser:
-    """Create a function that parses the messages of a connection."""
+    """Create a function that parses the messages of a connection.
+
+    The caller adds the name of the topic to the message of an error.
+    """
     schema = connection.schema
     encoding = connection.encoding
     with library_errors():

@@ -16,7 +16,8 @@ class ConversionSummary:
         classes: Classes of map elements, in label order.
         samples: Number of samples by split.
         instances: Number of map elements by class.
-        problems: Number of omissions by their reason.
+        problems: Number of omissions by their reason. Samples without any map element are counted
+            here as well, although they are kept.
         examples: First places of the omissions, by their reason.
         notes: Further lines of the summary.
     """

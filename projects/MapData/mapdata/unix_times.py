@@ -17,7 +17,7 @@ def unix_time_ns(number: float, unit_ns: int | None = None) -> int | None:
     Args:
         number: Time since 1970.
         unit_ns: Unit of the time in nanoseconds. None detects seconds, milliseconds, microseconds
-            or nanoseconds; with at most one of these units, the time lies in the valid years.
+            or nanoseconds: a number is in the valid years in at most one of these units.
 
     Returns:
         The time in nanoseconds; None if it is not in the years 2000 to 2099.

@@ -73,12 +73,14 @@ def plane_footprints(camera: Camera, homography: Array) -> Footprints:
     # Upper edge of each row, in homogeneous coordinates of the ground. (3, H + 1)
     center = homography @ np.stack([column, rows - 0.5, np.ones(rows.shape)])
     beside = homography @ np.stack([column + 1, rows - 0.5, np.ones(rows.shape)])
-    # The third coordinate is the fall of a ray. With a bound on it, rays near and above the horizon
-    # end at a distance of a few kilometres instead of at infinity.
+    # The third coordinate is the vertical part of a ray, negative below the horizon. Rays near and
+    # above the horizon get the bound instead. They then end at a distance of a few kilometres: the
+    # height of the camera divided by the bound.
     hit = center[:2] / np.minimum(center[2], -4 * HORIZON_EPS)
     hit_beside = beside[:2] / np.minimum(beside[2], -4 * HORIZON_EPS)
     distance = np.linalg.norm(hit - camera.center[:2, None], axis=0)
-    # The horizon of a tilted camera lies at another row on each side: one end below it is enough.
+    # In a tilted camera, the horizon is at different rows on the left and right of the image. A row
+    # is visible if one of its two ends is below the horizon.
     ends = homography[2, 0] * np.array([0, camera.width - 1]) + homography[2, 2]
     vertical = (ends + homography[2, 1] * rows[:-1, None]).min(axis=1)
     return Footprints(

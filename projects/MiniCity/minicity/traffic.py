@@ -34,7 +34,7 @@ PAINTS: list[Color] = [
 REACH_M = 75.0  # largest distance of traffic from the drive of the ego vehicle
 _LONGEST_SCENE_S = 20  # the paths of other vehicles suffice for this time
 SWING_M = 6.0  # distance in which the phase of a swing grows by 1 radian
-PASS_START_M = 3.0  # largest shift of the start of a pass, forwards or backwards
+PASS_START_M = 3.0  # largest shift of the start of another drive along a path, to either side
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Drive:
 
 
 def follow_lanes(town: Town, first: Lane, length_m: float, rng: np.random.Generator) -> Array:
-    """Follow lanes from the head of a lane, with random turns at junctions.
+    """Follow lanes from the beginning of a lane, with random turns at junctions.
 
     Args:
         town: The town.
@@ -110,7 +110,7 @@ def follow_lanes(town: Town, first: Lane, length_m: float, rng: np.random.Genera
 def plan_ego(town: Town, scene: int, duration_s: float, rng: np.random.Generator) -> Drive:
     """Plan the ego vehicle's drive.
 
-    Scenes of one town start on different roads, often at junctions.
+    Scenes of one town start on different roads. Most drives reach a junction.
 
     Args:
         town: The town.
@@ -297,7 +297,7 @@ def _moving_vehicles(
             continue
         arc_m = float(rng.uniform(low=0, high=40))
         lane_m = float(arc_lengths(lane.center)[-1])
-        # All vehicles of a lane have one speed, so they keep their distances, or they stand.
+        # All vehicles of a lane stand, or they drive at one speed and so keep their distances.
         driving_speed = rng.uniform(low=4, high=12)
         speed = float(rng.choice([0.0, driving_speed], p=[0.25, 0.75]))
         while arc_m < lane_m:

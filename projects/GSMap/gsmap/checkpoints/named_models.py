@@ -155,7 +155,8 @@ def checkpoint_for(config: str | Path, checkpoint: str | Path | None) -> Path:
 
     Raises:
         FileNotFoundError: If the checkpoint does not exist.
-        ValueError: If ``checkpoint`` is None and ``config`` is not the name of a model.
+        ValueError: If ``checkpoint`` is None and ``config`` is a config without the name of a
+            model.
     """
     if checkpoint is not None:
         return find_checkpoint(checkpoint)

@@ -12,8 +12,8 @@ from gsmap.utils.errors import InputError
 
 # Key in a checkpoint's meta. The value is JSON, because the text of a config is run as code.
 MODEL_SETTINGS = "model_settings"
-# Settings that only training uses, such as initial weights. A checkpoint must not set them, because
-# some of them load files.
+# Settings that only training uses, such as initial weights. `check_settings` removes them from the
+# settings of a checkpoint, because some of them load files.
 TRAINING_SETTINGS = {
     "init_cfg", "pretrained", "equal_weights", "uniform_positions", "allow_untrained", "autocast",
     "compiled",

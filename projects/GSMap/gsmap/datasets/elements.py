@@ -18,7 +18,7 @@ def _array(values: Any) -> npt.NDArray[Any]:
 
 
 def _polylines(instances: Any) -> Any:
-    """Return ``pts`` (N, P, 2), or the first ``num_pts`` points of each element if it has them."""
+    """Return ``pts`` (N, P, 2); with ``num_pts``, a list of its lines cut to these lengths."""
     points = _array(instances["pts"])
     if "num_pts" not in instances:
         return points
@@ -68,7 +68,7 @@ def elements_of_predictions(instances: Any) -> MapElements:
             ``rotations`` in radians (N, P).
 
     Raises:
-        ValueError: If a point or a score is not finite.
+        ValueError: If a point or a score is not finite (raised by `MapElements`).
     """
     gaussians = {}
     for key in ("scales", "rotations"):

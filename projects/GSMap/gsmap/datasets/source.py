@@ -70,8 +70,9 @@ def _shift_up(height_m: float) -> np.ndarray:
     return rigid(np.eye(3), translation=(0, 0, height_m))
 
 
-# Transform from the annotation frame to (x ahead, y left, z up) above the rear axle, without the
-# height: the roof LiDAR of nuScenes and the vehicle frame of Argoverse 2. (4, 4)
+# Transform from each annotation frame to axes (x ahead, y left, z up) with their origin above the
+# rear axle, at the height of the frame. ``lidar`` is the roof LiDAR of nuScenes, and ``ego`` is the
+# vehicle frame of Argoverse 2. (4, 4)
 _NOMINAL = {
     "lidar": np.array([[0, 1, 0, 0.94], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]),
     "ego": np.eye(4),

@@ -217,7 +217,7 @@ class AtomicCheckpointHook(CheckpointHook):
             runner.val_loop.run()
 
     def _forget_foreign_best(self, runner: Runner) -> None:
-        """Forget best checkpoints outside of the run's folder, so that mmengine deletes none."""
+        """Forget best checkpoints outside of the run's folder, which mmengine might delete."""
         folder = Path(self.out_dir).resolve()
         if self._is_foreign(getattr(self, "best_ckpt_path", None), folder=folder):
             self.best_ckpt_path = None
@@ -245,10 +245,10 @@ class AtomicCheckpointHook(CheckpointHook):
         """
         for name in getattr(self, "key_indicators", ()):
             if metrics and name not in metrics:
-                means = [metric for metric in metrics if metric.endswith("/mAP")]
+                mean_names = [metric for metric in metrics if metric.endswith("/mAP")]
                 raise InputError(
                     f"default_hooks.checkpoint.save_best names {name!r}, which the validation does "
-                    f"not measure; it measures {', '.join(means)}."
+                    f"not measure; it measures {', '.join(mean_names)}."
                 )
         super().after_val_epoch(runner, metrics=metrics)
         if runner.rank == 0:

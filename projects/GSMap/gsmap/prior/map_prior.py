@@ -26,7 +26,8 @@ from gsmap.utils.files import atomic_write
 
 MEMORY_BYTES = 100 << 20
 """Default of the largest size of the tiles in memory."""
-_MOST_CELLS = 1 << 24  # largest number of cells in the rectangle around the view of a frame
+# Largest number of the prior's cells in a quadrant of the square around a frame (`_window`).
+_MOST_CELLS = 1 << 24
 
 
 class MapPrior:
@@ -34,9 +35,9 @@ class MapPrior:
 
     A tile is created when a frame is written to it. Beyond ``memory_bytes``, least recently used
     tiles are moved from memory to a temporary file. All methods may be called from several threads.
-    `read` and `write` take the nearest cell: a cell of the prior has the index floor(x / cell_m)
-    along each axis of the global frame. Only the position and the yaw of a pose are used, as in
-    `MapElements.to_frame`.
+    `read` and `write` use the cell of the prior in which the centre of a cell of the frame lies. It
+    has the index floor(x / cell_m) along x of the global frame, and floor(y / cell_m) along y. Only
+    the position and the yaw of a pose are used, as in `MapElements.to_frame`.
 
     Args:
         settings: Classes, place and cells.
@@ -59,7 +60,7 @@ class MapPrior:
         tile_shape = (self.rule.num_states, num_classes, side, side)
         self._tiles = TileStore(tile_shape, memory_bytes=memory_bytes)
         self._lock = threading.RLock()
-        self._owner: IO[str] | None = None
+        self._owner: IO[str] | None = None  # open file that reserves `_owned_path`
         self._owned_path: Path | None = None
 
     @classmethod
@@ -84,7 +85,8 @@ class MapPrior:
 
         Raises:
             ValueError: If the file is no valid prior, or has other settings.
-            RuntimeError: If the file is reserved by another process, or another prior of this one.
+            RuntimeError: If the file is reserved by another process, or by another prior in this
+                process.
         """
         path = Path(path)
         owner = reserve_file(path) if update else None
@@ -114,7 +116,8 @@ class MapPrior:
             path: File to create or replace.
 
         Raises:
-            RuntimeError: If the file is reserved by another process, or another prior of this one.
+            RuntimeError: If the file is reserved by another process, or by another prior in this
+                process.
         """
         path = Path(path)
         with self._lock:
@@ -261,7 +264,7 @@ class MapPrior:
             with self._lock:
                 tile = self._tiles.get_to_write(key, empty=self.rule.empty)
                 for channel, mask in enumerate(covered):
-                    # (S, 1, n): rules have an axis for the classes
+                    # Rules have an axis for the classes: (S states, 1 class, n cells).
                     states = tile[:, channel, mask][:, None]
                     hits = np.ones(states.shape[1:], dtype=np.float32)
                     updated = self.rule.update(states=states, values=hits)

@@ -58,8 +58,8 @@ def is_rigid(transform: NDArray[np.floating[Any]], tolerance: float = 1e-3) -> N
     shift = m[:3, 3]
     # The first two rows of a proper rotation have length 1 and are orthogonal, and the third is
     # their cross product.
-    mirror = np.cross(x, y, axis=0) - z
-    errors = [(x * x).sum(0) - 1, (y * y).sum(0) - 1, (x * y).sum(0), *mirror]
+    cross_error = np.cross(x, y, axis=0) - z
+    errors = [(x * x).sum(0) - 1, (y * y).sum(0) - 1, (x * y).sum(0), *cross_error]
     has_last_row = (m[3, 3] == 1) & ~m[3, :3].any(0)  # 0, 0, 0, 1
     valid = np.isfinite(shift.sum(0)) & has_last_row
     for error in errors:

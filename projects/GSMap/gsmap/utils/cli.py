@@ -314,7 +314,9 @@ class _SignalHandler:
             return
         self._raise_time_s = now_s
         self.received = number
-        raise self._exception(number)  # a variable would keep it alive by its traceback
+        # The exception is not stored in a variable. Its traceback refers to this frame, so a
+        # variable of the frame would keep it alive.
+        raise self._exception(number)
 
     def _exception(self, number: int) -> _SignalError:
         """Return the exception for a signal."""

@@ -359,7 +359,7 @@ def convert_infos(
             truth outside the range.
     """
     entries, frame = _entries(load_plain_pickle(infos), infos)
-    with explain_errors(infos, "make it anew"):
+    with explain_errors(infos, "make it again"):
         dim = _dim(entries, classes) if frame == "ego" else 2
     usual_x_range, usual_y_range = RANGES[frame]
     meta = AnnotationMeta(

@@ -12,8 +12,9 @@ import numpy as np
 from gsmap.utils.errors import InputError
 from gsmap.utils.numpy_pickle import CHECKED, CheckedArray, CheckedDtype
 
-# Substitutes of functions and classes, by their name in a pickle. The substitutes of containers
-# take no arguments, so they can only create empty ones.
+# Substitutes of functions and classes, by their name in a pickle. `CHECKED` has the substitutes of
+# numpy, which check what they are given. The substitutes of containers take no arguments, so they
+# can only create empty ones.
 _STAND_INS: dict[str, Callable[..., Any]] = {
     **CHECKED,
     "collections.OrderedDict": lambda: {},
@@ -147,14 +148,15 @@ def _count(value: Any, counts: dict[int, int], depth: int = 0) -> int:
         depth: Number of enclosing containers.
 
     Raises:
-        UnpicklingError: If a container holds itself or a class, or they are nested too deep.
+        UnpicklingError: If a container holds itself, a function or a class, or if containers are
+            nested too deep.
     """
     if callable(value):
         raise pickle.UnpicklingError("it holds a function or class, which is not plain data")
     if not isinstance(value, _CONTAINERS):
         return 1
     if depth > _MAX_DEPTH or counts.get(id(value)) == 0:
-        raise pickle.UnpicklingError("a container holds itself, or they are nested too deep")
+        raise pickle.UnpicklingError("a container holds itself, or containers are nested too deep")
     if id(value) not in counts:
         counts[id(value)] = 0
         items: Iterable[Any] = value.values() if isinstance(value, dict) else value
@@ -190,6 +192,6 @@ def load_plain_pickle(path: str | Path) -> Any:
     except _DAMAGE as error:
         raise InputError(
             f"{path} cannot be read as a pickle of plain data: {error}. Nothing of it was run: "
-            "fetch it again, or save it anew with lists, dicts and numpy arrays only."
+            "fetch it again, or save it with lists, dicts and numpy arrays only."
         ) from error
     return value

@@ -75,6 +75,7 @@ def data_settings(fields: Fields) -> dict[str, Any]:
         },
         "with_depth": False,
     }
+    # `drop` removes the settings in `names`, and each keyword setting if it has the given value.
     fields.drop("data", names="shuffler_sampler nonshuffler_sampler")
     for part in ("train", "val", "test"):
         section = f"data.{part}"

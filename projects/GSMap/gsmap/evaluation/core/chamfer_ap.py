@@ -76,6 +76,7 @@ class ChamferConfig(Metric):
         ValueError: If a value is out of its range.
     """
 
+    # `Metric` describes these values.
     name: ClassVar[str] = "chamfer"
     ranks: ClassVar[bool] = True
     has_curves: ClassVar[bool] = True
@@ -223,8 +224,8 @@ def match_chamfer(
         token: Name of the sample.
 
     Raises:
-        ValueError: If heights count, and the predictions or the ground truth have no heights; or
-            for the reasons of `check_pair`.
+        ValueError: If heights count, and the predictions or the ground truth have no heights; if a
+            label does not fit the classes; or if predictions have no scores (`check_pair`).
     """
     return _match(Sample(token, predictions, ground_truth), config)
 

@@ -233,7 +233,8 @@ class MapHead(LossHead):
     def init_weights(self) -> None:
         """Initialise matrices of the decoder (Xavier) and class logits with a low probability.
 
-        Weights of parts that start without effect are initialised last.
+        The parts initialise their weights last, so that parts that start without effect keep
+        their zeros.
         """
         init_matrices(self.decoder)
         for branch in self.cls_branches:
@@ -244,7 +245,8 @@ class MapHead(LossHead):
     def queries(self) -> tuple[Tensor, Tensor]:
         """Positional queries and content of the queries, as inputs of the decoder.
 
-        All query groups in training, only the first group in prediction.
+        In training, the queries of all query groups are returned; in prediction, only the queries
+        of the first group.
 
         Returns:
             Two tensors (N * P, C) for point queries, or (N, C) for instance queries.
@@ -385,7 +387,7 @@ class MapHead(LossHead):
         hooks: Sequence[FlowHook] = (),
         layers: Sequence[Predictions] | None = None,
     ) -> Tensors:
-        """Run the head and compute all losses, including those by auxiliary heads and hooks.
+        """Run the head and compute all losses, including the losses of auxiliary heads and hooks.
 
         Args:
             bev_outputs: Outputs of the BEV encoder, with ``bev_feats`` (B, C, H, W).

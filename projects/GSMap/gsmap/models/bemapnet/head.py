@@ -243,11 +243,11 @@ class BezierHead(LineHead):
                     f"has pieces of degree {curve.degree} and at most {largest} points: set "
                     "degrees and pieces of FormatBezierTargets to the values of the head."
                 )
-            pieces = (counts - 1) // curve.degree - 1  # number of pieces less one
+            piece_index = (counts - 1) // curve.degree - 1  # number of pieces less one
             num_missing = max(largest - points.shape[1], 0)
             controls = F.pad(points[is_class, :largest], (0, 0, 0, num_missing))
-            controls = controls * curve.control_mask(pieces)[..., None]
-            curves = curve(controls, pieces)
+            controls = controls * curve.control_mask(piece_index)[..., None]
+            curves = curve(controls, piece_index)
             if self.losses.redrawn_in_px:
                 # As in the released code, lines whose masks were drawn from their control points
                 # (`FormatBezierTargets`) have their curves in pixels.
@@ -256,7 +256,7 @@ class BezierHead(LineHead):
                 curves = torch.where(is_redrawn, curves * size, curves)
             class_truth = TrueCurves(
                 controls=controls,
-                pieces=pieces,
+                pieces=piece_index,
                 curves=curves,
                 masks=instances.masks[is_class].float(),
             )

@@ -48,6 +48,8 @@ HDMAPNET = KeyMap(
             },
         ),
     },
+    # Key prefixes (release, here) by which a checkpoint of this model is recognised. Keys with the
+    # prefix `_VIEWS` occur in the release only.
     markers=((_VIEWS, "bev_encoder.views."),),
     upstream_prefix=_VIEWS,
 )

@@ -35,7 +35,8 @@ class PriorBEVFusion(BaseModule):
         embed_dims: Channels C of the BEV features.
         num_channels: Channels M of the map in each cell.
         threshold: Smallest value of a channel from which a cell counts as known.
-        layer: Settings of the BEV layer, a `BEVQueryEncoder`; None to leave it out.
+        layer: Settings of the BEV layer, a `BEVQueryEncoder`. They replace the defaults in
+            ``_LAYER``. None leaves the layer out.
         z_range: Lowest and highest z of the pillars of the layer, in metres.
         residual: Add the result to the features through a 1 x 1 convolution, whose weights start
             at 0. A model that was trained without a map then keeps its features. False replaces

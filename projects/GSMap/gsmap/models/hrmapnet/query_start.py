@@ -36,6 +36,7 @@ class PriorQueries(BaseModule):
         num_channels: Channels M of the map in each cell.
         num_heads: Heads of the attention.
         stride: Every ``stride``-th row and column of the cells is used, from the first on.
+            `raster_prior.py`, which selects the cells, reads ``stride`` and ``threshold``.
         threshold: Value that a channel of a cell must exceed for the cell to be used.
         dropout: Probability to drop an attention weight in training.
         zero_init: Initialise the output projection with 0, so that a model that was trained without

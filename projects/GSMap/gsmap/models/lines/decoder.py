@@ -177,7 +177,8 @@ class PointLineDecoder(BaseModule):
         for layer in self.layers:
             mask = None
             if self.line_masks:
-                # Masks of nn.MultiheadAttention are (B * heads, Q, S), head after head of a sample.
+                # nn.MultiheadAttention takes masks (B * heads, Q, S), in which the heads of a
+                # sample are next to each other.
                 mask = self.attention_mask(outputs[-1]).repeat_interleave(self.num_heads, 0)
             states = layer(states, self.query_pos.weight, key=key, memory=memory, attn_mask=mask)
             outputs.append(self.lines(states, bev))

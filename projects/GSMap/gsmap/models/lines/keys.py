@@ -12,6 +12,7 @@ LINE_DECODER = "ins_decoder.bev_decoder."
 """Key prefix of these two released models, which no key of this project has."""
 
 BEV = "bev_decoder.bev_encoder."
+# Names of the two layers of a feed-forward network, to be inserted into a text of `rules_of`.
 LINEAR = "linear1.=ffn.layers.0.0. linear2.=ffn.layers.1. "
 _MLP = ((0, 0), (1, 2), (2, 4))  # index of each linear layer of an MLP: in the release, here
 
@@ -51,5 +52,5 @@ HEAD_RULES = (
     ("output_head.semantic_heads.{i}.0.", "map_head.semantic_branches.{i}."),
 )
 # The released models store the class weights of their loss as a buffer. Here they are a setting of
-# the loss, so a key with this value is left out.
+# the loss: conversion from the release drops the key, and conversion to it writes this value.
 CLASS_WEIGHTS = {"post_processor.criterion.empty_weight": torch.tensor((1.0, 0.5))}

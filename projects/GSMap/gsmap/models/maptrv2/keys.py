@@ -49,6 +49,7 @@ LIFTED_UNUSED: dict[str, Tensor | None] = {
     ENCODER + "nx": torch.tensor((200.0, 400.0, 1.0)),
     **MASK_WEIGHTS,
 }
+# Key prefixes (release, here) by which a checkpoint of these models is recognised.
 LIFTED_MARKER = (ENCODER + "depth_net.", "bev_encoder.depth_net.depth_conv.")
 
 MAPTRV2 = KeyMap(

@@ -23,7 +23,7 @@ from gsmap.structures.tensors import upload
 from gsmap.utils.errors import InputError
 
 # Values whose name has one of these prefixes are stored in single precision: they hold coordinates,
-# in which half precision has errors of centimetres.
+# in which half precision has errors of centimetres. `PREFIX` begins the names of `ElementMemory`.
 _SINGLE_PRECISION_PREFIXES = ("references", "targets", PREFIX)
 
 

@@ -101,7 +101,8 @@ class VectorMapNetHead(DetectionHead):
             batch_data_samples: Samples with the targets of `FormatPolylineTargets`.
 
         Raises:
-            ValueError: If a sample has no targets, or targets of another canvas.
+            ValueError: If a sample has no targets, or targets of another canvas (raised by
+                `get_targets`).
         """
         losses = self.detector.loss(bev_outputs, batch_data_samples)
         truths = [get_targets(sample, self.canvas) for sample in batch_data_samples]
@@ -167,6 +168,7 @@ class VectorMapNetHead(DetectionHead):
     def boxes(self, detections: InstanceData) -> Tensor:
         """Return the boxes of elements, x0, y0, x1, y1 in whole pixels of the canvas. (n, 4)"""
         corners = self.canvas.norm_from_metres(detections.pts[..., :2])
+        # The points of a `KeyPointHead` are two opposite corners of a box already.
         if not isinstance(self.detector, KeyPointHead):
             corners = torch.stack([corners.amin(dim=1), corners.amax(dim=1)], dim=1)
         size = constant(corners, self.canvas.size)
