@@ -95,6 +95,7 @@ def main() -> str:
         model = MODELS.build(cfg.model)
         if "scales" not in model.map_head.reference.outputs:
             raise InputError(f"{args.config} has no Gaussians: give a config of GSMap.")
+        # With `allow_mismatch`, the results may be of a part of the samples, as in the example.
         pairs = SamplePairs(
             args.results, args.ground_truth, classes, allow_mismatch=True, gaussians=True
         )

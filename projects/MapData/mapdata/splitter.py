@@ -143,6 +143,6 @@ def run(arguments: argparse.Namespace) -> str:
     return (
         f"train {len(parts['train'])} scenes ({len(train.tokens)} samples), "
         f"val {len(parts['val'])} scenes ({len(val.tokens)} samples); "
-        f"{left_out} scenes near both are left out; the nearest samples are "
+        f"{left_out} scenes near validation scenes are left out; the nearest samples are "
         f"{distance.min():.1f} m apart\n{arguments.out}: give it to create_data.py as --split-file"
     )

@@ -14,7 +14,7 @@ class PendingCheck(NamedTuple):
     """Check of one step whose result may still be on the way to the host.
 
     Attributes:
-        is_finite: One value per loss.
+        is_finite: One value per loss, a copy on the host that is awaited when it is read.
         names: Names of the losses.
         tokens: Tokens of the samples.
     """

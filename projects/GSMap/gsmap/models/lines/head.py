@@ -114,6 +114,7 @@ class LineHead(DetectionHead):
                 f"for {len(LAYER_WEIGHTS)} layers, got {num_layers}."
             )
         self.layer_weights = LAYER_WEIGHTS[-num_layers:]
+        # Without `margin_m`, lines are kept however far they reach beyond the map.
         self.coder = MapCoder(
             grid, max_num=sum(numbers), margin_m=None, score_threshold=score_threshold
         )

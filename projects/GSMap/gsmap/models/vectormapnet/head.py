@@ -171,6 +171,6 @@ class VectorMapNetHead(DetectionHead):
         # The points of a `KeyPointHead` are two opposite corners of a box already.
         if not isinstance(self.detector, KeyPointHead):
             corners = torch.stack([corners.amin(dim=1), corners.amax(dim=1)], dim=1)
-        size = constant(corners, self.canvas.size)
+        size = constant(corners, self.canvas.size)  # a tensor on the device of `corners`
         pixels = (corners * size).round().clamp(min=0).minimum(size)
         return pixels.long().flatten(1)
