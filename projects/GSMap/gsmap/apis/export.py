@@ -480,7 +480,8 @@ def _operator_translations() -> dict[Any, Any]:
         Deformable sampling (`gsmap.ops.deformable_sampling.sum_rows`) calls the operator in this
         way.
         """
-        if mode != 0 or weights is None or include_last_offset:
+        is_sum = mode == 0  # the other modes are the mean and the maximum
+        if not is_sum or weights is None or include_last_offset:
             raise NotImplementedError("embedding_bag other than weighted sums in bags of one size")
         one = op.Constant(value_ints=[1])
         num_bags = op.Shape(offsets)

@@ -173,6 +173,7 @@ def _describe_fault(error: BaseException, parts: list[_Part], cfg: Config) -> st
         hint = suggestion(absent[1], names=registry_names(registry)) or "."
         return f"there is no {registry.name} of type {absent[1]!r}{hint}"
     subject = " of ".join(part.name for part in typed_parts) or "the run"
+    # The override of the command line that the error is about, or the dotted name of the settings.
     place = find_override(error) or _find_place(cfg, parts=parts)
     settings = f"these settings ({place})" if place else "these settings"
     if type(error) is ValueError:  # raised by the checks of a library's class

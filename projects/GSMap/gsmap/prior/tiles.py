@@ -79,7 +79,8 @@ class TileStore:
     def get(self, key: TileKey) -> Tile | None:
         """Return a tile, or None if nothing was written to it.
 
-        The caller must not keep the tile, because later changes may go to a new array.
+        The caller must not keep the tile: if it leaves memory, it is read again as a new array, and
+        later changes go to this array.
         """
         tile = self._tiles.get(key)
         if tile is None:

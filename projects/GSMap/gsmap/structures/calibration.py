@@ -56,7 +56,7 @@ def calibration_arrays(
     Args:
         meta: Metainfo of the sample: ``lidar2img``, ``lidar2cam``, ``cam2img`` and
             ``img_aug_matrix`` (V, 4, 4), ``lidar2ego`` (4, 4) and ``can_bus`` (18,), as far as the
-            arrays need them.
+            arrays need them. In these names, ``lidar`` is the annotation frame.
         names: Names of the arrays.
 
     Returns:

@@ -9,7 +9,7 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.split_lists import SPLIT_LIST, checked_identity
 
 FORMAT_VERSION = 1
-UNITED = "united"  # default rule for pedestrian crossings
+UNITED = "united"  # default rule for pedestrian crossings: they are joined where they overlap
 _MAX_GROUND_Z_M = 10.0
 _MAX_CLASSES = 1000
 CLASSES = ("divider", "ped_crossing", "boundary")

@@ -23,7 +23,8 @@ class GeMapHead(MapHead):
         losses: Configs of the other losses.
         query_groups: Settings of each `QueryGroup`. Without ``one_to_many``, only the first group
             is used.
-        loss_euclidean: Settings of `EuclideanLoss`, or None to train without it.
+        loss_euclidean: Settings of `EuclideanLoss`, which by default has its default values. With
+            None, the head is trained without this loss.
         decoupled: Use the self-attention of GeMap in the layers instead of the configured one.
         one_to_many: Keep the further query groups, which GeMap does not have. The Euclidean loss of
             their many matches takes much memory. To train a group without it, list the other losses

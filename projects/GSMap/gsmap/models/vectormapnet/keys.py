@@ -71,7 +71,7 @@ VECTORMAPNET = KeyMap(
     },
     # prefixes, in the release and here, that identify the architecture
     markers=((_LINES, "map_head.generator."),),
-    # aliases of the branch of index 0
+    # the released branches of index 1 and higher are the branch of index 0 under further names
     ignored_pattern=r"head\.det_net\.pre_branches\.(cls|reg)\.[1-9]",
     upstream_prefix=_LINES,
 )
