@@ -267,24 +267,24 @@ def _reference_table(frames: list[Record], count: int, grid: BEVGrid) -> str:
         first_preds, first_truths = samples[0]
         evaluator.match("warm-up", first_preds, first_truths)
         start = time.process_time()
-        reference_map = evaluate_by_reference()
+        reference_mean_ap = evaluate_by_reference()
         reference_ms = (time.process_time() - start) / count * 1e3
         if name == "raster" and not reference.FILLS_AS_RELEASED:
             # This version of OpenCV fills other pixels than the version of the published figures.
-            reference_map = reference.raster_map(samples, raster, by_opencv=False)
+            reference_mean_ap = reference.raster_map(samples, raster, by_opencv=False)
         start = time.process_time()
         matches = []
         for k, (preds, truths) in enumerate(samples):
             matches.append(evaluator.match(f"{k:06d}", preds, truths))
-        our_map = evaluator.reports(matches)[0].metrics[f"{name}/mAP"]
+        our_mean_ap = evaluator.reports(matches)[0].metrics[f"{name}/mAP"]
         our_ms = (time.process_time() - start) / count * 1e3
         row = [
             f"AP_{name}",
             f"{reference_ms:.1f}",
             f"{our_ms:.3f}",
             f"{reference_ms / our_ms:.0f} x",
-            f"{reference_map:.6f}",
-            f"{our_map:.6f}",
+            f"{reference_mean_ap:.6f}",
+            f"{our_mean_ap:.6f}",
         ]
         rows.append(row)
     header = ["metric", "reference, ms", "ours, ms", "ratio", "reference mAP", "our mAP"]

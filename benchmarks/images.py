@@ -110,7 +110,7 @@ def _samples_per_second(frames: Frames, workers: int) -> float:
     num_samples = 0
     start = 0.0
     for number, batch in enumerate(loader, start=1):
-        if number == workers:
+        if number == workers:  # workers return batches in turn, so each has returned one
             start = time.perf_counter()
         elif number > workers:
             num_samples += len(batch["data_samples"])

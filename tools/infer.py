@@ -50,7 +50,7 @@ if TYPE_CHECKING:  # slow to import
     from gsmap.prior.opening import AnyPrior
 
 _ONE_SAMPLE_HZ = 1e-4  # at this rate, only one sample is read of a drive
-_SAMPLES = ".arrow"  # the file of the samples is named like --out, with this suffix
+_SAMPLES_SUFFIX = ".arrow"  # the file of the samples is named like --out, with this suffix
 SKIPPED = 1  # exit code after broken frames
 IMPLAUSIBLE = 1  # exit code for an implausible calibration
 
@@ -82,8 +82,10 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     args = parser.parse_args(argv)
     if not args.model and not args.check_calibration:
         parser.error("the following arguments are required: --model")
-    if args.out and args.out.suffix == _SAMPLES:
-        parser.error(f"--out names a JSON file, the samples go to a {_SAMPLES}: got {args.out}")
+    if args.out and args.out.suffix == _SAMPLES_SUFFIX:
+        parser.error(
+            f"--out names a JSON file, the samples go to a {_SAMPLES_SUFFIX}: got {args.out}"
+        )
     if args.ground_z is not None and not args.show_dir:
         parser.error("--ground-z is for pictures: give --show-dir, too, or leave it out")
     if args.update_prior and not args.prior:
@@ -105,7 +107,9 @@ def _add_input_options(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument("--vehicle-frame", help="the vehicle's frame in a bag, such as base_link")
     group.add_argument(
-        "--vehicle-ground-z", type=float, help="height of the road in it, in metres (default: 0)"
+        "--vehicle-ground-z",
+        type=float,
+        help="height of the road in the vehicle's frame, in metres (default: 0)",
     )
     group.add_argument(
         "--topics",
@@ -134,7 +138,7 @@ def _add_prior_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--update-prior",
         action="store_true",
-        help="write the predictions to it; a FILE that does not exist is created",
+        help="write the predictions to the maps of --prior; a FILE that does not exist is created",
     )
 
 
@@ -191,8 +195,9 @@ def read_input(args: argparse.Namespace, frames: Path | None = None) -> Source:
 
     Args:
         args: The options of the command.
-        frames: Folder for the images of a single sample of each drive. None reads all samples, and
-            writes their images into a folder beside the output.
+        frames: Folder for images that the reader writes. If it is given, a single sample of each
+            drive is read. None reads all samples, and writes images into a folder beside the
+            output.
 
     Raises:
         ValueError: If the input is not a recording.
@@ -200,8 +205,8 @@ def read_input(args: argparse.Namespace, frames: Path | None = None) -> Source:
     rate_hz = _ONE_SAMPLE_HZ
     if frames is None:
         rate_hz = args.rate
-        usual_stem = (args.show_dir or Path()) / "input"
-        stem = args.out.with_suffix("") if args.out else usual_stem
+        stem_without_out = (args.show_dir or Path()) / "input"
+        stem = args.out.with_suffix("") if args.out else stem_without_out
         frames = register_folder(stem.with_name(f"{stem.name}_frames"))
     options = InputOptions(
         data_root=args.data_root,
@@ -460,7 +465,7 @@ def place_of(dataset: "VectorizedMapDataset", chosen: Sequence[int], path: Path)
     if len(names) > 1 and not path.exists():
         raise InputError(
             f"{path} does not exist, and the samples are in {', '.join(names)}: make the prior of "
-            "each place from its own samples, by --token or its own file."
+            "each place from the samples of this place alone, by --token or a separate input."
         )
     return (names[0] if names else "") or path.stem
 
@@ -503,7 +508,7 @@ def main(argv: list[str] | None = None) -> str | None:
     source = read_input(args)
     if not isinstance(source.samples, AnnotationFile):
         if args.out:
-            require_own_samples(args.out.with_suffix(_SAMPLES))
+            require_own_samples(args.out.with_suffix(_SAMPLES_SUFFIX))
         check_calibration(args, source)
     from gsmap.apis.map_inferencer import select_samples
 
@@ -578,7 +583,7 @@ def print_summary(
     written = " and ".join(outputs)
     print(f"{count - len(broken)} of {format_count(count, 'sample')} predicted: {written}")
     if args.out and not isinstance(source.samples, AnnotationFile):
-        annotations = args.out.with_suffix(_SAMPLES)
+        annotations = args.out.with_suffix(_SAMPLES_SUFFIX)
         write_bytes(annotations, Path(ann_file).read_bytes())
         if source.has_poses:
             print(

@@ -90,7 +90,7 @@ def parse_args() -> argparse.Namespace:
 
 
 def main() -> str:
-    # Read before `parse_args`, which declares the page as an output that must not be read.
+    # The page is read before `parse_args`, which declares it as an output that must not be read.
     is_foreign = _PAGE.exists() and not is_own_page(_PAGE)
     args = parse_args()
     if args.out is _PAGE and is_foreign:  # without --out

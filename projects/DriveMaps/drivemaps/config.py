@@ -17,11 +17,12 @@ class MergeConfig:
 
     Args:
         gaussians: Whether to weight vertices by their Gaussians, where the results have them.
-        min_confidence: Smallest confidence of a vertex of a line in the map, in [0, 1]
-            (``merge_lines``).
-        min_area_confidence: Smallest confidence of an area in the map, in [0, 1]
-            (``merge_areas``). It is lower than for lines, because models detect areas only from
-            nearby.
+        min_confidence: Smallest confidence of a vertex of a line in the map, in [0, 1]. The
+            confidence is the sum of the scores of the frames with a line there, divided by the
+            number of frames with the vertex in their range (``merge_lines``).
+        min_area_confidence: Smallest confidence of an area in the map, in [0, 1], computed in the
+            same way at each spot of the area (``merge_areas``). It is lower than for lines, because
+            models detect areas only from nearby.
     """
 
     gaussians: bool = True

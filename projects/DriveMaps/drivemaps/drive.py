@@ -144,7 +144,8 @@ class Drive:
         Returns:
             All elements with a vertex or an edge in the range, and possibly some others.
         """
-        # `reduceat` takes an element from its offset to the next one, so none may be empty.
+        # `reduceat` reduces the points from each offset to the next one. For an empty element, it
+        # would return a point of the next element, so empty elements are left out.
         nonempty = np.flatnonzero(elements.num_points)
         if not len(nonempty):
             return elements
@@ -154,8 +155,8 @@ class Drive:
         high = np.maximum.reduceat(points, starts)  # (N, 2)
         # Whether bounding boxes overlap the square around the frame, by axis. (N, 2)
         starts_before = low <= frame.origin + self.reach_m
-        ends_behind = high >= frame.origin - self.reach_m
-        is_near = (starts_before & ends_behind).all(axis=1)
+        ends_after = high >= frame.origin - self.reach_m
+        is_near = (starts_before & ends_after).all(axis=1)
         return elements.select(nonempty[is_near])
 
     def footprint(self, frame: DriveFrame) -> shapely.Polygon:

@@ -33,8 +33,8 @@ def write_mcap(path: str | Path, replay: Replay) -> None:
 
     Raises:
         FileNotFoundError: If an image is missing.
-        BrokenSampleError: If an image file is damaged or is not an image. The content of this file
-            is not written.
+        BrokenSampleError: If an image file is damaged or is not an image. The content of such a
+            file is not copied into the MCAP file.
         RuntimeError: If ``foxglove-sdk`` is missing.
     """
     foxglove = import_extra("foxglove", "viz")
@@ -147,7 +147,7 @@ class _Log:
         Args:
             topic: Topic of the lines.
             frame: Name of the frame of the vertices.
-            lines: Class index and vertices in metres of each line. each (int, (n, 3))
+            lines: Class index and vertices in metres of each line. (int, (n, 3)) each
             time_ns: Time in nanoseconds.
         """
         messages = self._messages

@@ -100,7 +100,7 @@ def scan(
     first_rad = rng.uniform(low=0, high=2 * np.pi / COLUMNS)
     azimuth = np.linspace(-np.pi, np.pi, num=COLUMNS, endpoint=False) + first_rad
     elevation = np.linspace(LOWEST_RAD, HIGHEST_RAD, num=BEAMS)
-    level = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
+    directions = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
     slope = np.tan(elevation)
     # Horizontal distance at which each beam meets the ground, z = 0. It is infinite for beams that
     # are level or rise.
@@ -110,7 +110,7 @@ def scan(
     hit_box = np.full((BEAMS, COLUMNS), -1)
     corner_distances = np.linalg.norm(boxes[:, :8].reshape(-1, 4, 2) - origin[:2], axis=-1)
     near = boxes[corner_distances.min(axis=1) < RANGE_M]
-    entry = _entry_distances(origin[:2], level, boxes=near)  # (COLUMNS, boxes)
+    entry = _entry_distances(origin[:2], directions, boxes=near)  # (COLUMNS, boxes)
     column, box = np.nonzero(np.isfinite(entry))
     # Far hits first: of several hits of one ray, the nearest is written last and stays.
     order = np.argsort(-entry[column, box], kind="stable")
@@ -125,7 +125,7 @@ def scan(
     rows, columns = np.nonzero(reach / np.cos(elevation)[:, None] < RANGE_M)
     noise = rng.normal(loc=0, scale=RANGE_NOISE_M, size=len(rows))
     distance = reach[rows, columns] + noise
-    world_xy = origin[:2] + level[columns] * distance[:, None]
+    world_xy = origin[:2] + directions[columns] * distance[:, None]
     world_z = origin[2] + slope[rows] * distance
     world = np.column_stack([world_xy, world_z])
     point_box = hit_box[rows, columns]

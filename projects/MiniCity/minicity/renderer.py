@@ -21,7 +21,7 @@ from minicity.vehicles import Vehicle, vehicle_mesh
 FAR_M = 160.0  # largest distance of visible buildings
 SMALL_FAR_M = 90.0  # largest distance of other visible objects
 MIN_PIXELS = 1.2  # quads with a smaller extent are not drawn
-BACKDROP_RADIUS_M = 26.0  # radius of a sphere around any building
+BACKDROP_RADIUS_M = 26.0  # radius of a sphere around any building (`FrozenMesh.backdrop`)
 SMALL_RADIUS_M = 9.0  # radius of a sphere around any other object
 SHADOW_FAR_M = 45.0  # largest distance of vehicles with a shadow
 LIGHT_UNDER_VEHICLES = 0.62  # share of the light that remains under a vehicle if no sun shines
@@ -31,7 +31,7 @@ TOP_LIGHT = 0.1  # share of the ambient light that depends on the upward part of
 GLOW = 1.3  # brightness of lamps and lit windows under any light
 PAINTED_MARGIN_M = 50.0  # extent of the painted ground around a camera
 FINE_RESOLUTION_M = 0.06  # edge of a ground pixel for images of REFERENCE_WIDTH_PX
-NARROWEST_PX = 400
+NARROWEST_PX = 400  # narrower images get the ground pixels of an image of this width
 
 
 class SceneRenderer:

@@ -220,7 +220,8 @@ def _paint_coat(
     for outline in px:
         cv2.fillPoly(fine, [outline - shift], color=(255.0,), lineType=cv2.LINE_AA, shift=SHIFT)
     mask = cv2.resize(fine, (columns, rows), interpolation=cv2.INTER_AREA)
-    # Opaque where the noise stays below 1 - wear, bare above, with a soft edge between.
+    # The paint is opaque where the noise is below 1 - wear, and nearly transparent where it is
+    # above, with a soft edge in between.
     noise = np.arange(256) / 255.0
     cover = np.clip((1.0 - wear - noise) * 5 + 0.35, 0.12, 0.97)
     cover_px = cv2.LUT(blotches[window], (cover * 255).astype(np.uint8))

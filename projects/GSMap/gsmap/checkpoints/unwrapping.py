@@ -30,7 +30,8 @@ class Unwrapped:
 
     Attributes:
         state: Weights by the keys of the model.
-        holder: Mapping around the weights or their wrapper; None for a bare state dict.
+        holder: Contents of the file, if the weights are only a part of them; None for a bare state
+            dict.
         left_out: Number of unused entries by their kind.
     """
 

@@ -217,8 +217,8 @@ def _merge_state(state: dict[str, Any], members: Sequence[Sequence[int]]) -> Non
             if _group_settings(groups[index]) != settings:
                 raise InputError(
                     "the checkpoint's parameter groups differ in settings that are equal in the "
-                    "config: resume with the config that it was trained with, or start anew from "
-                    "it (load_from=...)."
+                    "config: resume with the config that it was trained with, or start a new run "
+                    "from it (load_from=...)."
                 )
             if index in param_states:
                 merged_states[next_param] = param_states[index]

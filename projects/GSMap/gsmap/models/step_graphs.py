@@ -197,7 +197,10 @@ class StepGraphs:
 
 
 class _Replay(torch.autograd.Function):
-    """Replay of a recorded forward pass, and of its backward pass."""
+    """Replay of a recorded forward pass, and of its backward pass.
+
+    The parameters are arguments of `forward` only so that autograd receives their gradients.
+    """
 
     @staticmethod
     def forward(

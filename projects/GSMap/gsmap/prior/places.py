@@ -18,7 +18,7 @@ from gsmap.structures.grid import BEVGrid
 from gsmap.structures.rigid import is_rigid
 from gsmap.utils.errors import InputError
 
-_MOST_SCENES = 16  # with one map for each scene, the largest number of maps that are kept
+_MOST_SCENES = 16  # largest number of maps that are kept with memory="scene"
 
 
 class Place(NamedTuple):
@@ -102,7 +102,7 @@ class PlaceMaps:
         self._priors: OrderedDict[str, AnyPrior] = OrderedDict()
 
     def settings_of(self, name: str) -> PriorSettings:
-        """Settings of the map of a place."""
+        """Settings of the map of a town or scene, by its name."""
         return PriorSettings(self.classes, place=name, cell_m=self.cell_m)
 
     def find(self, place: Place) -> AnyPrior | None:
@@ -157,7 +157,7 @@ class PlaceMaps:
 
 
 class GivenMaps(PlaceMaps):
-    """Map priors of a user, one for each place.
+    """Map priors of a user, one for each town (`Place.name`).
 
     Args:
         priors: The priors.
@@ -166,7 +166,7 @@ class GivenMaps(PlaceMaps):
         update: Write each frame after it is predicted.
 
     Raises:
-        ValueError: If a prior has other classes or cells, two are of one place, or a prior that is
+        ValueError: If a prior has other classes or cells, two are of one town, or a prior that is
             no `MapPrior` is to be written.
     """
 

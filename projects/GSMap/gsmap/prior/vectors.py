@@ -37,8 +37,8 @@ def covered_cells(
         width_m: Width of a line in metres, > 0.
 
     Returns:
-        Place of each tile, and whether an element of a class covers a cell, (C, tile_cells,
-        tile_cells).
+        Column and row of each tile, and whether an element of a class covers a cell, (C,
+        tile_cells, tile_cells).
 
     Raises:
         ValueError: If a label or a vertex is out of range, or the map is too large.

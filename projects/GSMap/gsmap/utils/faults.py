@@ -115,8 +115,8 @@ def _describe_machine_error(error: BaseException, text: str) -> str | None:
         first_line = text.strip().splitlines()[0]
         reason = first_line.rstrip(".")
     # When a worker has died, the message of torch's DataLoader is either "DataLoader worker (pid 7)
-    # is killed by signal: Bus error." or "DataLoader worker (pid(s) 7) exited unexpectedly". The
-    # cause of an error with the second message may have the first one, which names the signal.
+    # is killed by signal: Bus error." or "DataLoader worker (pid(s) 7) exited unexpectedly". An
+    # error with the second message may be caused by one with the first, which names the signal.
     text_and_cause = f"{text} {error.__cause__}"
     if is_runtime_error and "signal: Bus error" in text_and_cause:
         return f"bus error of a data loader's worker: {_BUS_ERROR_ADVICE}."

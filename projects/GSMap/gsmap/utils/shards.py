@@ -64,7 +64,7 @@ class Shard:
         return cls(index=int(match[1]), count=int(match[2]))
 
     def part(self, items: Items) -> Items:
-        """Return the contiguous range of items of this shard; all shards cover all items."""
+        """Return the contiguous range of items of this shard; the shards together cover all."""
         if not self.count:
             return items
         start = len(items) * self.index // self.count
@@ -231,6 +231,7 @@ def read_shard(path: Path) -> ShardFile:
         if wrong_names or not is_shard or manifest["samples"] < 0:
             raise InputError(f"wrong values of {wrong_names or ['shard', 'of', 'samples']}")
         named_path = shard.path_of(path.with_name(manifest["target"]))
+    # An `InputError` is a ValueError, so the error above also gets the path of the manifest here.
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         message = f"{manifest_path} is damaged ({error!r}): make that shard again."
         raise InputError(message) from error

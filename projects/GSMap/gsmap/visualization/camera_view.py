@@ -119,6 +119,7 @@ def arrange_cameras(cameras: Sequence[Camera], view: FrameView) -> list[list[Cam
     looking_back: list[tuple[float, Camera]] = []
     for camera in cameras:
         azimuth = viewing_azimuth(camera.img_from_frame, view)
+        # The tolerance lets a camera that looks exactly sideways count as looking ahead.
         if abs(azimuth) > np.pi / 2 + 1e-3:
             # The angle runs from pi / 2 (left) over pi (back) to 3 pi / 2 (right).
             looking_back.append((azimuth % (2 * np.pi), camera))

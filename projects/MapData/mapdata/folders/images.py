@@ -61,7 +61,7 @@ def read_image_folder(
         The samples, with notes on assumptions and omissions.
 
     Raises:
-        FileNotFoundError: If a camera has no image, or there is no file of poses.
+        FileNotFoundError: If a camera has no image, or the file names poses that do not exist.
         ValueError: If the file is malformed; the message names the camera.
     """
     folder = file.parent
@@ -88,7 +88,7 @@ def read_image_folder(
         if poses is not None and pose_at is not None:
             frames, pose_notes = _frames_with_poses(frames, poses=poses, pose_at=pose_at)
             notes += pose_notes
-        # Images without distortion are cached below a digest, which depends on this key.
+        # The folder of the rectified images is named by a digest, which depends on this key.
         target_key = set_rectification_targets(rig, trained or {})
         scene = folder.resolve().name
         samples = rig_samples(scene, rig, frames=frames, pose_at=pose_at)
@@ -173,7 +173,7 @@ def _find_images(
 
 
 def _simplify_pattern(pattern: str) -> str:
-    """Remove repeated ``**`` from a pattern of files; more than a few others are refused."""
+    """Reduce successive ``**`` of a pattern to one, and refuse more than `_MOST_ANY` in all."""
     parts: list[str] = []
     for part in Path(pattern).parts:
         is_repeat = part == "**" and parts[-1:] == ["**"]
@@ -290,9 +290,8 @@ def _usage_notes(
         if not (all_are_used and all_have_one):
             notes.append(
                 f"camera {name!r}: {counts[name]} of {format_count(len(paths), 'image')} used, for "
-                f"{format_count(len(frames), 'sample')}; the others have no partner among the "
-                f"images of {first!r}, which has the same name or a time within "
-                f"{tolerance_ns / 1e6:g} ms"
+                f"{format_count(len(frames), 'sample')}; for the other images, {first!r} has none "
+                f"of the same name or within {tolerance_ns / 1e6:g} ms"
             )
     return notes
 

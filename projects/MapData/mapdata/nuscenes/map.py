@@ -196,8 +196,9 @@ def _read_centerlines(nusc_map: "NuScenesMap", layers: MapLayers) -> None:
 class NuScenesLocalMap:
     """One map, prepared for extracting the elements around the vehicle at many poses.
 
-    Dividers are the lines of ``road_divider`` and ``lane_divider``, clipped to the patch. Crossings
-    and the extended classes are areas, clipped to the patch and united where they overlap; their
+    The patch is the rectangle of ``x_range`` and ``y_range`` around the vehicle. Dividers are the
+    lines of ``road_divider`` and ``lane_divider``, clipped to the patch. Crossings, stop lines,
+    intersections and car parks are areas, clipped to the patch and united where they overlap; their
     outlines are closed rings. Boundaries are the outlines of the union of ``road_segment`` and
     ``lane``, clipped to the patch shrunk by 0.2 m on each side.
 

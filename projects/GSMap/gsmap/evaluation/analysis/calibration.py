@@ -106,8 +106,8 @@ def _vertices_of_sample(sample: Sample, config: ChamferConfig) -> Iterator[Verti
         span = slice(predictions.offsets[row], predictions.offsets[row + 1])
         points = predictions.points[span, :2]
         line = gt_lines[gt][:, :2]
-        # The line with as many points as the prediction, in each direction and, if closed, from
-        # each start. The order nearest to the prediction pairs their points.
+        # The line is resampled to as many points as the prediction has, in each direction and, if
+        # it is closed, from each start. The order nearest to the prediction pairs their points.
         orders = equivalent_orders(line, num_points=len(points))
         nearest_order = np.abs(orders - points).sum(axis=(1, 2)).argmin()
         means = torch.tensor(points)

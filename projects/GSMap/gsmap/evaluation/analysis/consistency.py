@@ -3,8 +3,8 @@
 C-mAP is an mAP whose matches must also continue the track of their ground truth.
 The rules equal MapTracker's public code. They differ from AP_chamfer in four ways:
 predictions with a score of 0.4 or less are left out, a frame without ground truth of a class does
-not count for the class, lines have 200 points, and the 4 m wide strips around a matched pair of
-lines need not touch.
+not count for the class, lines have 200 points, and two lines can match even if the strips of 4 m
+width around them do not touch.
 """
 
 from collections.abc import Iterable, Sequence
@@ -362,7 +362,10 @@ class FrameHits:
 
 
 def _number_untracked(tracks: Sequence[IntArray]) -> list[IntArray]:
-    """Give each prediction of a scene without a track a unique number below -1. (N,) each"""
+    """Give each prediction of a scene without a track a unique number below -1. (N,) each
+
+    Numbers that differ keep such a prediction from continuing the track of another one.
+    """
     numbered = []
     last = -1
     for frame_tracks in tracks:

@@ -126,8 +126,8 @@ def count_pieces(covered: BoolArray, step_m: float, min_piece_m: float) -> int:
     while len(covered):
         gains = (covered & is_free).sum(axis=1)
         best = int(gains.argmax())
-        # `not >=` also ends the loop for NaN, the product of no points and an infinite step (of a
-        # line with huge coordinates).
+        # `not >=` also ends the loop for NaN, which is the product of 0 points and an infinite step
+        # (of a line with huge coordinates).
         if not gains[best] * step_m >= min_piece_m:
             break
         is_free &= ~covered[best]

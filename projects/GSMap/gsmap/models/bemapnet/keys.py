@@ -99,10 +99,11 @@ BEMAPNET = KeyMap(
         *HEAD_RULES,
     ),
     unused=CLASS_WEIGHTS,
+    # Key prefixes, in the release and here, that distinguish this architecture from others.
     markers=((_NECK, "img_neck.rounds."),),
     # The release saves the weights of `src_pos_embed_layer` a second time under this name.
     ignored_pattern=r"bev_decoder\.bev_encoder\.tgt_pos_embed_layer\.",
-    upstream_prefix=LINE_DECODER,
+    upstream_prefix=LINE_DECODER,  # only released keys have it
 )
 
 KEY_MAPS = (BEMAPNET,)

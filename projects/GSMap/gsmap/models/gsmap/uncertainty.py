@@ -44,6 +44,7 @@ class ErrorReference(GaussianReference):
         kwargs: Further arguments of `GaussianReference`.
     """
 
+    # A checkpoint may lack the weights with these prefixes (`AddsWeights`).
     neutral_keys = (*GaussianReference.neutral_keys, "error_branches.")
 
     def __init__(self, grid: BEVGrid, embed_dims: int = 256, **kwargs: Any) -> None:

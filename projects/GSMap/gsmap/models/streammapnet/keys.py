@@ -40,11 +40,15 @@ STREAMMAPNET = KeyMap(
         ("head.query_update.fc.", "temporal.queries.fc."),
         ("stream_fusion_neck.", "temporal.bev."),
     ),
-    unused={  # cells, size and corner of the map, which are settings of a config
+    # Released keys without a counterpart here: cells, size and corner of the map, which are
+    # settings of a config.
+    unused={
         "plane": torch.stack([_X, _Y, torch.zeros_like(_X), torch.ones_like(_X)], -1),
         "head.roi_size": torch.tensor((60.0, 30.0)),
         "head.origin": torch.tensor((-30.0, -15.0)),
     },
+    # `markers` distinguish this architecture from others, in the release and here. Only released
+    # keys have `upstream_prefix`.
     markers=((_INPUT, "map_head.decoder.input_proj."),),
     upstream_prefix=_INPUT,
 )

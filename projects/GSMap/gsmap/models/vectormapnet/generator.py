@@ -246,7 +246,7 @@ class PolylineGenerator(BaseModule):
 
         Args:
             tokens: Coordinates x, y, x, y, ... in pixels of the canvas. (n, T)
-            by_x: Whether y of a noisy coordinate is replaced by its x.
+            by_x: Whether each noisy y is replaced by the shifted x of its point.
 
         Returns:
             Coordinates on the canvas. (n, T)
@@ -263,7 +263,7 @@ class PolylineGenerator(BaseModule):
         Args:
             tokens: Coordinates x, y, x, y, ... in pixels of the canvas. (n, T)
             noise: Shift of each coordinate, in pixels. (n, T)
-            by_x: Whether y is replaced by x.
+            by_x: Whether each y is replaced by the shifted x of its point.
 
         Returns:
             Coordinates in [1, W] and [1, H]. (n, T)
@@ -343,8 +343,8 @@ class PolylineGenerator(BaseModule):
             tokens: Tokens, from `generate`. (n, 2 P + 1)
 
         Returns:
-            Points in metres, where the last point of a line fills its row (n, P, 2), and the number
-            of points of each line. (n,)
+            Points in metres, with the last point of each line repeated to the end of the row
+            (n, P, 2), and the number of points of each line. (n,)
         """
         pairs = tokens[:, :-1].unflatten(1, (-1, 2))  # (n, P, 2)
         num_points = (pairs > 0).all(dim=-1).sum(dim=-1)  # (n,)

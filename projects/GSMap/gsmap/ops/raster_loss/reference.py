@@ -74,15 +74,15 @@ def raster_loss_sums_reference(
 
     Returns:
         Seven values of each mask, with w = 1 + (weight - 1) t: sum w |p - t|, sum w p,
-        sum (1 - SSIM), sum w t, sum (w - 1), the number of pixels whose window covers part of the
-        target, and the number of pixels whose window covers part of the target or of the
-        prediction (`MIN_COVERAGE`). (n, 7)
+        sum (1 - SSIM), sum w t, sum (w - 1), the number of pixels with any part of the target in
+        their window, and the number of pixels whose window covers the target or the prediction by
+        more than `MIN_COVERAGE`. (n, 7)
     """
     excess = (weight - 1) * targets
     weights = 1 + excess
     window = gaussian_window(window_size, window_sigma, like=preds)
     dissimilarity, mean_p, mean_t = dssim_map(preds, targets, window=window)
-    # Largest value of the target in the window of each pixel: > 0 if the window covers part of it.
+    # Largest value of the target in the window of each pixel: > 0 if any part of it is inside.
     largest_targets = F.max_pool2d(
         targets[:, None], window_size, stride=1, padding=window_size // 2
     )[:, 0]
