@@ -212,7 +212,8 @@ def per_item_orders(instances: Sequence[MapInstance], num_points: int) -> list[n
         points = instance.points
         if is_closed(points):
             rings = []
-            # A closed ring repeats its first point, so it has one start less than points.
+            # A closed ring repeats its first point, so it has one start less than points. At most
+            # P - 1 starts are used, as in MapTR's data set.
             for k in range(min(len(points), num_points) - 1):
                 ring = np.roll(points[:-1], k, axis=0)
                 rings.append(resample(np.concatenate([ring, ring[:1]])))

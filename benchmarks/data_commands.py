@@ -5,7 +5,7 @@ import json
 import tempfile
 from pathlib import Path
 
-from benchmarks import data as benchmarks
+from benchmarks import data
 from benchmarks.memory import measure_memory
 
 
@@ -13,13 +13,13 @@ def loading(args: argparse.Namespace) -> dict[str, float]:
     """Measure the loading of a tiled annotation file."""
     with tempfile.TemporaryDirectory() as folder:
         tiled = Path(folder, "tiled.arrow")
-        benchmarks.tile_annotations(args.annotations, tiled, count=args.samples)
-        return benchmarks.measure_loading(tiled)
+        data.tile_annotations(args.annotations, tiled, count=args.samples)
+        return data.measure_loading(tiled)
 
 
 def ground_truth(args: argparse.Namespace) -> dict[str, float]:
     """Measure the computation of the ground truth of a frame."""
-    return benchmarks.measure_ground_truth(args.root, args.annotations)
+    return data.measure_ground_truth(args.root, args.annotations)
 
 
 def pipeline(args: argparse.Namespace) -> dict[str, float]:
@@ -32,7 +32,7 @@ def pipeline(args: argparse.Namespace) -> dict[str, float]:
     init_default_scope("mmdet3d")
     config = Config.fromfile(args.config).train_dataloader.dataset
     config.update(data_root=str(args.root), ann_file=str(args.annotations.resolve()), split=None)
-    return benchmarks.measure_pipeline(config, args.root, count=args.samples)
+    return data.measure_pipeline(config, args.root, count=args.samples)
 
 
 def images(args: argparse.Namespace) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Operators on the pretended GPU: sets by their launches and waits, and counterparts for the CPU.
+"""Sets of operators by their launches and waits on the pretended GPU, and counterparts for the CPU.
 
 The pretended GPU (`benchmarks.pretended_gpu`) computes on the CPU. It counts the kernels that would
 be launched on a GPU, and the times at which the host would wait for it.
@@ -190,6 +190,7 @@ def run_cpu_kernel(name: str, args: Any) -> Any:
         grads = torch.autograd.grad(result, leaves, grad_outputs=upstream, materialize_grads=True)
         return list(grads)
 
-    # Autograd is off here, inside of the dispatch mode of `PretendedGPU`; another thread has it.
+    # Inside of the dispatch mode of `PretendedGPU`, autograd is off. Another thread is outside of
+    # this mode, so autograd works there.
     with ThreadPoolExecutor(1) as thread:
         return thread.submit(gradients).result()

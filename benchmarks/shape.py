@@ -89,7 +89,7 @@ def line_shapes(results: Path, truth: Path) -> dict[str, FloatArray]:
             continue
         truth_lines = truths[matches.token].polylines
         pred_lines = predictions[matches.token].polylines
-        truth_indices = matches.matched_gt[:, -1]  # at the largest threshold; -1 without a match
+        truth_indices = matches.matched_gt[:, -1]  # within 1.5 m, the largest threshold, or -1
         for index, label, score, truth_index in zip(
             matches.pred_index, matches.labels, matches.scores, truth_indices, strict=True
         ):

@@ -19,7 +19,9 @@ from mapdata.ros_bag import library_errors
 
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-_STAMP_END = 12  # index of the first byte after the stamp of a camera info, in ROS 1 and 2
+# Index of the first byte after the stamp of a camera info: 4 bytes of a sequence number (ROS 1) or
+# of the encoding (ROS 2), and 8 bytes of the stamp.
+_STAMP_END = 12
 # Version of the rules by which images are written. It is a part of the digest that names the folder
 # of the images, so images that were written by another version are not reused.
 _RULES = b"2"
@@ -53,7 +55,9 @@ class BagContent:
     changed_infos: Counter[str] = field(default_factory=Counter)
 
     def add_info(self, topic: str, info: Any) -> bool:
-        """Store the first camera info with focal lengths, and count the others that differ.
+        """Store the first camera info with focal lengths, and count later ones that differ from it.
+
+        Until there is one, each camera info replaces the stored one.
 
         Args:
             topic: Topic of the images.

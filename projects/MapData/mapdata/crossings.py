@@ -1,6 +1,7 @@
-"""Pedestrian crossings as map elements: long edges, or outlines that are open at the patch.
+"""Pedestrian crossings as map elements: long edges, or outlines that are open.
 
-The patch is the rectangle around the vehicle to which a local map is cut.
+A local map is cut to a rectangle around the vehicle, the patch. An open outline ends where the edge
+of the patch cuts the crossing.
 """
 
 import numpy as np
@@ -11,7 +12,9 @@ from mapdata.local_map import COLLECTION, LocalPatch, is_line
 
 EDGES = "edges"
 PARALLEL = "parallel"
-CROSSINGS = (UNITED, EDGES, PARALLEL)  # names of all rules by which crossings become map elements
+# Names of all rules by which crossings become map elements: rings of overlapping crossings united
+# (`mapdata.nuscenes.map`), `long_edges`, and `open_outlines`.
+CROSSINGS = (UNITED, EDGES, PARALLEL)
 EDGE_MARGIN_M = 0.2  # distance from the edge of the patch at which open outlines end
 PARALLEL_COSINE_GAP = 0.01  # one minus the cosine of the largest angle, about 8 degrees
 
@@ -117,9 +120,9 @@ def _long_side(geometry: shapely.Geometry) -> np.ndarray:
     hull = shapely.get_coordinates(shapely.convex_hull(geometry))
     edges = np.diff(hull, axis=0)
     edge_lengths = np.hypot(edges[:, 0], edges[:, 1])
-    along = edges / edge_lengths[:, None]  # a side of the rectangle lies on the hull
+    along = edges / edge_lengths[:, None]  # the smallest rectangle has a side on one of the edges
     across = np.stack([-along[:, 1], along[:, 0]], axis=-1)
-    # Extents of the hull along and across each edge, the sides of the rectangle on this edge.
+    # The rectangle on an edge has the extents of the hull along and across this edge as its sides.
     length = np.ptp(hull @ along.T, axis=0)
     width = np.ptp(hull @ across.T, axis=0)
     best = (length * width).argmin()

@@ -64,8 +64,9 @@ class LocalPatch:
             xmin=x0 - margin_m, ymin=y0 - margin_m, xmax=x1 + margin_m, ymax=y1 + margin_m
         )
 
-    # Products are written out below: a matrix product may round equal points differently in
-    # different rows, and equal points must stay equal for lines to join.
+    # Products with the inverse (transposed) rotation are written out below: a matrix product may
+    # round equal points differently in different rows, and equal points must stay equal for lines
+    # to join.
     def points_to_local(self, points: Points) -> np.ndarray:
         """Transform points from the map to the patch's frame, in the plane. (n, 2+) -> (n, 2)"""
         x, y = (points[:, :2] - self.global_from_frame[:2, 3]).T

@@ -27,7 +27,7 @@ def pose_messages(
         Messages with position and orientation in the world, and velocity, acceleration (gravity
         included) and rotation rate in the car's frame, by central differences.
     """
-    # Half a step more than the duration includes the end in the range.
+    # `arange` excludes its limit, which therefore lies half a period after the end of the drive.
     times = np.arange(-0.1, duration_s + 0.5 / RATE_HZ, 1.0 / RATE_HZ)
     before = np.array([world_from_ego(float(t - STEP_S)) for t in times])
     now = np.array([world_from_ego(float(t)) for t in times])
@@ -35,6 +35,7 @@ def pose_messages(
     car_from_world = np.swapaxes(now[:, :3, :3], 1, 2)  # the inverse of a rotation: its transpose
     velocity = (after[:, :3, 3] - before[:, :3, 3]) / (2 * STEP_S)
     second_derivative = (after[:, :3, 3] - 2 * now[:, :3, 3] + before[:, :3, 3]) / STEP_S**2
+    # An accelerometer at rest measures the acceleration of gravity, upwards.
     acceleration = second_derivative + np.array([0.0, 0.0, GRAVITY])
     # Rotation of the car from before to after, in the car's frame.
     rotation = Rotation.from_matrix(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])

@@ -18,7 +18,7 @@ from gsmap.utils.errors import InputError
 from minicity.config import VERSION
 
 LAYERS = ["drivable_area", "road_segment", "lane", "ped_crossing", "walkway"]
-RADIUS_M = 75.0
+RADIUS_M = 75.0  # half the side of the square of the map that is drawn around the vehicle
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

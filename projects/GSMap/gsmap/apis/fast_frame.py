@@ -83,10 +83,12 @@ class StaticFrame(nn.Module):
 
         Args:
             images: Pixel values of the cameras, 0 to 255. (B, V, 3, H, W)
-            calibration: Arrays of ``names`` (`calibration_arrays`). (B, V, 4, 4) or (B, 18) each
+            calibration: Arrays of ``names`` (`calibration_arrays`): matrices (B, V, 4, 4), and
+                signals of the vehicle (B, 18).
 
         Returns:
-            Concatenated fields of ``layout`` in float32, best element first. (B, M, F)
+            The M best elements, best first, each as the F numbers of its fields in the order of
+            ``layout``, float32. (B, M, F)
         """
         model = self.model
         images = model.data_preprocessor.normalise(images)
@@ -110,7 +112,8 @@ class StaticFrame(nn.Module):
             references: References of all elements, as the head predicts them.
 
         Returns:
-            Concatenated fields of ``layout``. (M, F)
+            The M best elements, each as the F numbers of its fields in the order of ``layout``.
+            (M, F)
         """
         head = self.model.map_head
         decoded = head.reference.decode(references)
@@ -216,6 +219,7 @@ class FastFrames:
         with (
             self._lock,
             torch.no_grad(),
+            # With mixed precision, the backbone runs in float16 and other products in TF32.
             matrix_products(in_tf32=self.frame.model.half_backbone is not None),
         ):
             batch_elements = self._run(inputs)

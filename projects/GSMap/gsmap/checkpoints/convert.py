@@ -78,6 +78,7 @@ def upstream_from_ours(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
             f"keys that upstream's {key_map.name} does not have: {summarize_names(unknown)}. "
             "Without these weights the model would predict other maps, so it is not converted."
         )
+    # `unused` has a constant weight, or None, for each key that only upstream has.
     for key, constant in key_map.unused.items():
         if constant is not None:  # None marks a key that only some upstream models have
             # Some constants are expanded tensors, whose elements share memory.

@@ -69,8 +69,8 @@ def choose_backend(
     """Choose the backend of an operation.
 
     Args:
-        backend: ``"auto"`` for the fused kernels of the tensor's device and type, or the reference
-            if there are none; or the name of a backend.
+        backend: Name of a backend, or ``"auto"``. The latter selects the fused kernels for the
+            device and type of the tensor, or the reference if there are none.
         tensor: Input of the operation, whose device and type decide.
         fused: Fused kernels of the operation: ``"cpu"`` (numba), ``"triton"``.
         kernel: Name of the function in ``TRITON_KERNELS``, if it has a Triton kernel.

@@ -50,7 +50,7 @@ def planar_pose(pose: Pose) -> PlanarPose:
         pose: Transform from a frame to the global frame, in metres. (4, 4)
 
     Raises:
-        ValueError: If it is no rigid transform, too far from the origin, or has no yaw.
+        ValueError: If the pose is not rigid, is too far from the origin, or has no yaw.
     """
     transform = to_numpy(pose).astype(np.float64, copy=False)
     if transform.shape != (4, 4) or not is_rigid(transform):

@@ -179,8 +179,8 @@ class MapElements:
         """Transform the elements to another frame, by the position and yaw of a pose.
 
         Roll and pitch are ignored; they would move a point 30 m away by centimetres. Ground truth
-        is cut out of a map by position and yaw, too, so this transform to the frame of the map is
-        the exact inverse.
+        is cut out of a map by position and yaw, too, so this transform back to the frame of the map
+        restores the coordinates of the map.
 
         Args:
             transform: Transform from the frame of the elements to the other one, in metres. (4, 4)

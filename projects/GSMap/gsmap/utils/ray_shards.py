@@ -147,7 +147,7 @@ class _Run:
         """Run all shards, and return the failures."""
         # Index of the shard of each task of Ray that is running.
         running = {self._start(index): index for index in range(self.count)}
-        repeated: set[int] = set()
+        restarted: set[int] = set()  # shards that were started a second time
         finished: set[int] = set()
         failures: list[str] = []
         room_since_s: float | None = None  # time since which resources have been free
@@ -172,8 +172,8 @@ class _Run:
             longest_s = max(self.durations_s, default=math.inf)
             limit_s = max(self.patience_s, 2 * longest_s)
             if room_since_s is not None and now_s - room_since_s > limit_s:
-                late = set(running.values()) - repeated
-                repeated |= late
+                late = set(running.values()) - restarted
+                restarted |= late
                 self.repeated += len(late)
                 for index in late:
                     running[self._start(index)] = index
@@ -209,7 +209,7 @@ class _Run:
         return failure
 
     def _has_room(self) -> bool:
-        """Whether the resources of another shard are free, so that no shard is waiting."""
+        """Whether the resources for one more shard are free. Then no shard waits for resources."""
         free = self.ray.available_resources()
         cpus = self.resources.get("num_cpus", 1)
         gpus = self.resources.get("num_gpus", 0)

@@ -236,6 +236,7 @@ class Argoverse2Map:
     def _crossing_rings(self, patch: LocalPatch) -> np.ndarray:
         """Ring of each crossing, closed along the edge of the patch (MapTR)."""
         pieces, _ = clip_polygons(self._crossings.near(patch), patch)
+        # The pieces lie inside of the patch, so a larger box cuts nothing, and rings stay closed.
         lines, _ = cut_rings(rings_of(pieces), patch.box(EDGE_MARGIN_M))
         return lines
 
@@ -243,5 +244,6 @@ class Argoverse2Map:
         """Outline of the drivable area without the edge of the patch (MapTR and MapTRv2)."""
         pieces, _ = clip_polygons(self._drivable.near(patch), patch)
         area = shapely.get_parts(shapely.union_all(pieces))
+        # The smaller box cuts off the parts of the outline along the edge of the patch.
         lines, _ = cut_rings(rings_of(area), patch.box(-EDGE_MARGIN_M))
         return lines

@@ -41,7 +41,8 @@ def read_rig(file: Path, ground: np.ndarray) -> tuple[list[tuple[RigCamera, str]
             ``ground_z_m``. (4, 4)
 
     Returns:
-        The cameras, each with its ``images``, and the pose of the road. (4, 4)
+        The cameras, each with the value of its key ``images`` (the topic in a bag), and the pose of
+        the road. (4, 4)
 
     Raises:
         ValueError: If the file is malformed; the message names the camera.

@@ -80,7 +80,8 @@ WEIGHTS = {
     f"{_PTS_HEAD}.loss_bbox": "loss_weight", f"{_PTS_HEAD}.loss_iou": "loss_weight",
     f"{_COSTS}.reg_cost": "weight", f"{_COSTS}.iou_cost": "weight",
 }  # fmt: skip
-# settings that follow from other settings or have no effect in GSMap, by section
+# settings that follow from other settings or have no effect in GSMap: names separated by spaces, by
+# section
 IGNORED_NAMES = {
     "model": "type video_test_mode",
     _PTS_HEAD: "type num_query in_channels code_weights num_classes positional_encoding",
@@ -125,7 +126,8 @@ def convert_upstream(names: dict[str, Any]) -> Conversion:
     """Convert the assignments of an original config to settings of a GSMap config.
 
     Args:
-        names: Values by top-level name (`read_assignments`). Modified in place.
+        names: Values by top-level name, as `mapdata.upstream_configs.reader` reads them from the
+            file. Modified in place.
 
     Raises:
         ValueError: If the model, one of its parts or the data set is not supported.
@@ -291,7 +293,7 @@ def _base_config(encoder: str, model: str, is_argoverse2: bool, has_depth: bool)
     data_set = "Argoverse 2" if is_argoverse2 else "nuScenes"
     for entry in _entries("configs"):
         has_encoder = entry["encoder"] == encoder and entry["data_set"] == data_set
-        fits_depth = entry.get("depth", has_depth) == has_depth
+        fits_depth = entry.get("depth", has_depth) == has_depth  # without "depth", both fit
         if has_encoder and fits_depth:
             config: str = entry["config"]
             return config.removeprefix("configs/")

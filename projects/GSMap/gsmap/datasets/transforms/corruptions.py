@@ -1,8 +1,7 @@
 """Corruptions of camera images and calibrations: failures, shifts, delays, weather and compression.
 
 The kinds of corruptions and their five severities follow MapBench and ImageNet-C. Random numbers
-depend only on the seed and the token of the sample. A higher severity uses equal random numbers and
-is stronger.
+depend only on the seed and the token of the sample, so all severities of a kind use the same ones.
 """
 
 from collections.abc import Callable
@@ -62,7 +61,7 @@ def lose_cameras(results: dict[str, Any], views: NDArray[np.integer[Any]]) -> No
             changed in place.
         views: Indices of the views.
     """
-    finish_on_host(results)
+    finish_on_host(results)  # applies the recorded image steps now
     for view in views.tolist():
         results["img"][view] = np.zeros_like(results["img"][view])
         _set_extrinsics(results, view, lidar2cam=OUT_OF_SIGHT)
@@ -107,7 +106,7 @@ class CorruptImages(BaseTransform):
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Corrupt ``results['img']``, or ``lidar2cam`` and ``lidar2img``."""
-        finish_on_host(results)
+        finish_on_host(results)  # applies the recorded image steps now
         rng = generator(self.seed, results["token"])
         level = self.severity - 1
         # Entries of the lists are replaced below, and the lists of the caller must not change.

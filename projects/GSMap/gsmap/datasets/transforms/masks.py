@@ -96,7 +96,8 @@ class MakeInstanceMasks(BaseTransform):
     Args:
         size: Rows H and columns W over the range of the ground truth.
         thickness_px: Width of the lines in cells.
-        gap_px: Width of the lines around elements with a higher label in which cells are removed.
+        gap_px: Width in cells of a line along each element. Within this line, cells of elements
+            with a lower label are removed.
         mirrored: Whether to flip the masks left to right, as in the public code of MGMap. Flipped
             masks do not fit the BEV features.
 

@@ -110,7 +110,8 @@ class _ClassFit:
         """Count the free ground truths that each line matches, averaged over thresholds. (N,)"""
         hits = []
         for t, threshold in enumerate(self.thresholds):
-            # Without a ground truth in reach, ``nearest`` is -1 and the distance infinite.
+            # Without a ground truth in reach, ``nearest`` is -1, which reads the last entry of
+            # ``is_taken``. The distance is infinite then, so there is no hit.
             is_new = (distance <= threshold) & ~self.is_taken[t][nearest]
             hits.append(is_new.sum(axis=-1))
         return np.asarray(np.mean(hits, axis=0))
@@ -163,9 +164,10 @@ def fit_prior(
     """Fit the constant set of elements with the best AP on a training set.
 
     Each step adds the element that increases the area under the precision-recall curve of its class
-    the most. The increase is precision times recall, both of the element's new matches alone. Its
-    score increases with its precision, the share of samples in which it has a new match. An element
-    is a ground truth of the training set, moved to the mean of its matches where this adds matches.
+    the most. The increase is precision times recall, both of the element's new matches alone. The
+    score of an element increases with its precision, the share of samples in which it has a new
+    match. An element is a ground truth of the training set, moved to the mean of its matches if the
+    moved element has more matches.
 
     Args:
         truth: Ground truth of each training sample.

@@ -46,6 +46,8 @@ class SampleAP(Metric):
     """AP per sample; the metric of each method is a subclass in ``models/<method>/metric.py``.
 
     Attributes:
+        ranks: Whether the metric ranks predictions over all samples.
+        takes_min_score: Whether the metric uses the setting ``min_score``.
         line_px: Thickness of lines in pixels.
         report_thresholds: Largest distances of a match in metres, by the name of the report.
 
@@ -233,7 +235,7 @@ def _mean_distances(
 
     Args:
         mask: Number of the element at each pixel, of N elements, or -1. (H, W)
-        is_near: Whether to measure each pair of an element and an other element. (N, m)
+        is_near: Which pairs of one of the N elements and one of the m others to measure. (N, m)
         rows: Row of each pixel of the other elements. (M,)
         columns: Column of each pixel of the other elements. (M,)
         owners: Number, below m, of the other element of each pixel. (M,)
@@ -394,8 +396,8 @@ def sample_aps(detections: ClassDetections) -> FloatArray:
     for t, hits in enumerate(detections.hits.T):
         order = np.lexsort((~hits, scores, samples))  # by sample, then score, then matches first
         sorted_hits = hits[order]
-        hits_of_sample = np.bincount(samples, weights=hits, minlength=num_samples)
-        for s in np.flatnonzero(hits_of_sample > 0).tolist():
+        num_hits = np.bincount(samples, weights=hits, minlength=num_samples)  # (S,)
+        for s in np.flatnonzero(num_hits > 0).tolist():
             hits_in_sample = sorted_hits[starts[s] : ends[s]]
             aps[s, t] = ten_point_ap(hits_in_sample, num_gts=int(num_gts[s]))
     return aps
@@ -434,7 +436,8 @@ def sample_ap_reports(matches: MatchTable, config: SampleAP) -> list[MetricRepor
             # Whether the AP of a sample is defined does not depend on the threshold.
             num_samples = (~np.isnan(class_aps[:, 0])).sum()
             metrics[f"{class_name}/num_samples"] = float(num_samples)
-            # Reports mark an undefined AP by UNDEFINED, and `_mean` leaves out NaN.
+            # An undefined mean is UNDEFINED in the reports. Here it becomes NaN, which `_mean`
+            # below leaves out.
             means[row] = np.where(np.equal(class_means, UNDEFINED), np.nan, class_means)
             detections[class_name] = ranked
             aps[class_name] = class_aps

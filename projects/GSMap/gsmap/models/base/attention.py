@@ -216,8 +216,8 @@ class BEVDeformableAttention(SamplingAttention):
         table = at_least_float32(tokens).reshape(-1, tokens.shape[-1])  # (B * H * W, C)
         rows = batch_index * tokens.shape[1] + cells
         sampled = sum_rows(table, rows, cell_weights)
-        # The projection of a weighted sum of cells has the bias times the sum of their weights,
-        # which is less than 1 for samples at the border of the map.
+        # If each cell were projected first, the weighted sum would have the bias times the sum of
+        # the weights. This sum is less than 1 if a sample lies at the border of the map.
         weight = self.value_proj.weight.unflatten(0, (self.num_heads, -1))  # (heads, C / heads, C)
         bias = self.value_proj.bias.view(self.num_heads, -1)
         projected = torch.einsum("bqhc,hdc->bqhd", sampled, weight)
@@ -250,7 +250,7 @@ class MultiLevelAttention(SamplingAttention):
         Args:
             query: Queries with their positional encoding. (B, Q, C)
             reference: References, as in `place_samples`. (B, Q, D)
-            feats: Feature maps; offsets are in cells of each. (B, C, h, w) each
+            feats: Feature maps. The offsets of a map are in cells of this map. (B, C, h, w) each
             frames: Matrices of the offsets, as in `place_samples`, or None. (B, Q, 2, 2)
 
         Returns:

@@ -22,7 +22,8 @@ class MapLoss(nn.Module, NeedsTargets):
         loss_weight: Weight of the loss, or a weight for each class, applied to the pairs of the
             class.
         last_layer_only: Compute the loss for the last decoder layer only.
-        first_group_only: Compute the loss for the first query group only, which predicts.
+        first_group_only: Compute the loss for the first query group only, the only one that
+            predicts after the training.
 
     Attributes:
         name: Name of the loss, unique in a head. It is logged as ``loss_<name>``.
@@ -77,7 +78,7 @@ class MapLoss(nn.Module, NeedsTargets):
 
     def forward(self, pairs: MatchedPairs) -> Tensor:
         """Weighted loss of one layer. Without pairs, it is 0 with a gradient of 0. ()"""
-        # A subclass that overrides this method is called the other way round, by `by_layer`.
+        # If a subclass overrides this method, `by_layer` calls it instead, for each layer.
         (loss,) = self.by_layer(pairs)
         return loss
 
@@ -97,7 +98,8 @@ class MapLoss(nn.Module, NeedsTargets):
         has_class_weights = isinstance(self.loss_weight, Sequence)
         if has_class_weights:
             weights = class_weights(self.loss_weight, pairs.gt_labels)
-            # The axis of the pairs goes last, where the weights (M,) are broadcast, and back.
+            # The axis of the pairs is moved to the end, where the weights (M,) are broadcast, and
+            # back to the front.
             values = (weights * values.movedim(0, -1)).movedim(-1, 0)
         layer_values = pairs.by_layer(values)  # (L, M / L, ...)
         sums = layer_values.flatten(1).sum(1) / pairs.avg_factor

@@ -66,7 +66,7 @@ class BezierLosses(LineLosses):
             all pixels.
         redrawn_in_px: Whether to keep a peculiarity of the released code. If a line is hidden by
             others of its class, its mask is drawn from its curve. This converts the targets of the
-            curve loss from [0, 1] to pixels.
+            curve loss from [0, 1] to pixels (done by the head, which creates the targets).
 
     Raises:
         ValueError: If ``mask_points`` is less than 10.
@@ -127,6 +127,7 @@ class BezierLosses(LineLosses):
         lines = case.lines
         truth = case.truth
         num_lines = lines.curves.shape[0]
+        # 25 pixels around each of the 100 points of a curve.
         points = neighbourhood(lines.curves, truth.masks.shape[-2:])  # (n, 2500, 2)
         all_points = points.flatten(0, 1)
         values = point_sample(truth.masks[None], all_points[None])[0]  # (K, n * 2500)

@@ -31,8 +31,8 @@ class SpatialCrossAttention(SamplingAttention):
         ValueError: If ``num_points`` is not a multiple of ``num_heights``.
     """
 
-    # Whether invisible pairs of cell and camera are computed, too, with weight 0. `StepGraphs` sets
-    # it, since the sizes of tensors in a CUDA graph are fixed.
+    # Whether invisible pairs of cell and camera are computed, too, with weight 0. The code that
+    # records CUDA graphs (`StepGraphs`, `StaticFrame`) sets it, since sizes in them are fixed.
     fixed_sizes = False
 
     def __init__(
@@ -102,7 +102,7 @@ class SpatialCrossAttention(SamplingAttention):
 
 
 def _visible_cells(visible: Tensor) -> list[Tensor]:
-    """Indices of the visible cells of each camera, with a single synchronisation.
+    """Indices of the visible cells of each camera, for which the host waits once for the GPU.
 
     Args:
         visible: Whether a cell is visible in a camera. (B, V, Q)

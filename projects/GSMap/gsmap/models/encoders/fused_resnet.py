@@ -29,7 +29,8 @@ class Convolve(Protocol):
 
         Args:
             conv: The convolution.
-            norm: The batch norm after it, or the identity if it is folded into the weights.
+            norm: The batch norm after the convolution. A function whose convolutions already
+                contain their batch norms does not use it.
             x: Input. (n, C, h, w)
             identity: Residual in the shape of the output, or None.
             relu: Whether the ReLU is applied.

@@ -39,8 +39,8 @@ def pillar_points(
     Returns:
         Homogeneous points (x, y, z, 1) in metres, cells row by row. (Q, Z, 4)
     """
-    # Fractions first, then metres, in float32. `GeometryKernelAttention` rounds the projections to
-    # pixels, so another order of operations could select other pixels.
+    # The fractions are computed first, then the metres, both in float32. `GeometryKernelAttention`
+    # rounds the projections to pixels, so another order of operations could select other pixels.
     cols = torch.linspace(0.5, grid.width - 0.5, grid.width, device=device) / grid.width
     rows = torch.linspace(0.5, grid.height - 0.5, grid.height, device=device) / grid.height
     heights = torch.linspace(0.5 / num_heights, 1 - 0.5 / num_heights, num_heights, device=device)
@@ -114,8 +114,8 @@ def frustum_points(
 ) -> Tensor:
     """Points of every feature pixel at every depth, in the annotation frame.
 
-    Feature pixels are spaced evenly from the first to the last pixel of the image, as released.
-    They are not the centres of the feature cells.
+    Feature pixels are spaced evenly from the first to the last pixel of the image, as in the
+    released code. They are not the centres of the feature cells.
 
     Args:
         frame_from_img: Inverse of ``lidar2img`` after augmentation: maps (u * d, v * d, d, 1), with

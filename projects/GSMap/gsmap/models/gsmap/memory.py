@@ -75,7 +75,8 @@ class GaussianMemory(QueryMemory):
         """
         points = super().transform_references(head, references, past)
         if self.covariance == "points":
-            initial_gaussians = torch.zeros_like(points[..., -3:])  # sigmas and theta
+            # Zeros encode the sigmas and theta of the initial Gaussian of a query.
+            initial_gaussians = torch.zeros_like(points[..., -3:])
             return torch.cat([points[..., :-3], initial_gaussians], dim=-1)
         space = require_gaussians(self, head).space
         scale = past.seconds.sqrt()

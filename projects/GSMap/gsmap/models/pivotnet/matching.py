@@ -27,7 +27,7 @@ def path_costs(costs: Floats) -> Floats:
     table = np.full(costs.shape, fill_value=np.inf)
     table[..., 0, 0] = costs[..., 0, 0]
     for row in range(1, costs.shape[-2]):
-        # The pivot before is matched with any earlier point, at the lowest cost of these.
+        # The previous pivot is matched with the earlier point that has the lowest total cost.
         best_before = np.minimum.accumulate(table[..., row - 1, :-1], axis=-1)
         table[..., row, 1:] = best_before + costs[..., row, 1:]
     return table

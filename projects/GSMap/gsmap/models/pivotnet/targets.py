@@ -16,8 +16,9 @@ from gsmap.utils.errors import InputError
 def significances(points: Points) -> NDArray[np.float64]:
     """Compute the significance of a line's points for simplification (Visvalingam and Whyatt).
 
-    The point of the smallest triangle with its neighbours is removed first. Its significance is the
-    area of the triangle, but at least the significance of the points removed before it.
+    Each point but the ends forms a triangle with its two neighbours. The point with the smallest
+    triangle is removed until only the ends remain. Its significance is the area of its triangle,
+    but at least the significance of the points removed before it.
 
     Args:
         points: Vertices of the line. (n, 2)
@@ -28,8 +29,8 @@ def significances(points: Points) -> NDArray[np.float64]:
     areas = np.full(len(points), fill_value=np.inf)
     areas[1:-1] = _triangle_areas(points[:-2], points[1:-1], points[2:])
     remaining = list(range(len(points)))
-    # Position of a neighbour that is removed next, because its significance is not larger than that
-    # of the removed point. 0, the position of an end, if there is no such neighbour.
+    # If a neighbour of the removed point is not more significant, it is removed next, and this is
+    # its position. Otherwise this is 0, the position of an end, which is never removed.
     next_position = 0
     while len(remaining) > 2:
         position = next_position or int(np.argmin(areas[remaining]))

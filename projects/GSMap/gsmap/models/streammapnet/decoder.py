@@ -12,7 +12,10 @@ from gsmap.models.base.decoder import Decoded, MapDecoder, MapDecoderLayer
 
 @MODELS.register_module()
 class StreamMapNetDecoderLayer(MapDecoderLayer):
-    """`MapDecoderLayer` of instance queries with `LinePointAttention` at their points.
+    """`MapDecoderLayer` of instance queries.
+
+    Its cross-attention is `LinePointAttention`: each query samples the BEV features near each point
+    of its line.
 
     Args:
         embed_dims: Channels C of the queries.

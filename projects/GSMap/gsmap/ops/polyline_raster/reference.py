@@ -82,13 +82,15 @@ def soft_rasters_reference(
 ) -> Tensor:
     r"""Render closed rings: lines as :math:`\exp(-D / s)`, polygons as :math:`\sigma(\pm D / s)`.
 
+    D is the squared distance of a pixel to the nearest edge. The sign is + inside of the polygon.
+
     Args:
         rings: Vertices in pixels; pixel (row, col) is sampled at (col, row). (n, V, 2)
         is_polygon: Whether a ring is a polygon, bool. (n,)
         height: Rows H of the raster.
         width: Columns W of the raster.
         softness: Softness s of lines and of polygons, in the unit of D. (2,)
-        plain: Whether D is the distance to the nearest edge instead of its square.
+        plain: Whether D is the distance itself instead of its square.
 
     Returns:
         Values in [0, 1]. (n, H, W)

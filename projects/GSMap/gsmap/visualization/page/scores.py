@@ -48,7 +48,10 @@ class ScoredResult:
     law: str
 
     def hits(self, token: str) -> IntArray:
-        """Index of the ground truth that each counted prediction hits within 1 m, or -1. (N,)"""
+        """Index of the ground truth that each prediction hits within 1 m, or -1. (N,)
+
+        The N predictions are in the order of ``matches[token]``.
+        """
         return self.matches[token].matched_gt[:, _HIT_COLUMN]
 
     def f1(self, token: str, score_thr: float) -> float:
@@ -110,7 +113,8 @@ def score_result(
         notes = mismatch_notes(predictions, truth, allowed=allow_mismatch)
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error
-    num_ignored = dict(file.ignored)  # predictions by class
+    # Number of predictions by unknown class, and number of samples with heights (`THREE_D`).
+    num_ignored = dict(file.ignored)
     if num_ignored.pop(THREE_D, 0):
         notes.append("some predictions have heights, which no figure here counts")
     for class_name, count in sorted(num_ignored.items()):
@@ -147,7 +151,7 @@ def score_by_distance(
         meta: Metadata of the annotation file.
 
     Returns:
-        Result whose reports have a sample for each band of each sample.
+        The result with new reports, in which each band of a sample counts as a separate sample.
     """
     evaluator = _create_evaluator(meta)
     nothing = MapElements.from_polylines()
