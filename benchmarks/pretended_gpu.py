@@ -105,7 +105,8 @@ class PretendedTensor(Tensor):
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "PretendedTensor":
         copy: Any = PretendedTensor(self.host.detach().clone()).requires_grad_(self.requires_grad)
-        if getattr(self, "_is_param", False):  # torch marks a parameter that is a subclass by it
+        # torch sets `_is_param` on a parameter whose tensor is of a subclass of `Tensor`.
+        if getattr(self, "_is_param", False):
             copy._is_param = True  # type: ignore[attr-defined]
         memo[id(self)] = copy
         return copy
@@ -367,7 +368,11 @@ class PretendedGPU(TorchDispatchMode):
             self._wait("boolean index")
 
     def _part_of_gradient(self) -> str:
-        """Part whose gradient autograd is computing."""
+        """Part whose gradient autograd is computing.
+
+        Gradients are added up outside of the nodes of the forward pass, which is counted for
+        ``backward: sums``.
+        """
         node = torch._C._current_autograd_node()
         if node is None or "AccumulateGrad" in node.name():
             return "backward: sums"

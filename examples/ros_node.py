@@ -75,7 +75,8 @@ class MapNode(Node):
                 projection = np.reshape(info.p, (3, 4))  # of the rectified image
                 intrinsics[name] = projection[:, :3]
                 mounting[name] = self.cam_from_vehicle(info)
-            # CAMERAS may have fewer cameras than the model was trained with.
+            # The frame "vehicle" of the library has the axes and the origin of VEHICLE. CAMERAS may
+            # have fewer cameras than the model was trained with.
             self.live = self.inferencer.live(
                 intrinsics, cam_from_frame=mounting, frame="vehicle", allow_missing_cameras=True
             )
@@ -87,7 +88,7 @@ class MapNode(Node):
 
 
 def rgb(message: Any) -> np.ndarray:
-    """Pixels of an image message of 8 bits. (H, W, 3)"""
+    """RGB pixels of an image message with encoding rgb8 or bgr8. (H, W, 3)"""
     # A row has `step` bytes, which may include padding at its end.
     rows = np.frombuffer(message.data, np.uint8).reshape(message.height, message.step)
     pixels = rows[:, : 3 * message.width].reshape(message.height, message.width, 3)

@@ -192,10 +192,11 @@ def check(inferencer: MapInferencer, exported: OnnxInferencer, args: argparse.Na
     if args.results:
         exported.write(args.results, predictions)
     # Differences are infinite if the numbers of elements of a class differ.
-    equal_classes = [pair for pair in differences if np.isfinite(pair).all()]
-    score, distance_m = np.max(equal_classes or [(0, 0)], axis=0)
+    finite_differences = [pair for pair in differences if np.isfinite(pair).all()]
+    score, distance_m = np.max(finite_differences or [(0, 0)], axis=0)
+    num_equal = len(finite_differences)
     return (
-        f"in {len(equal_classes)} of {len(chosen)} samples, ONNX Runtime and torch predict equal "
+        f"in {num_equal} of {len(chosen)} samples, ONNX Runtime and torch predict equal "
         "numbers of elements of each class; in these samples, scores differ by at most "
         f"{score:.1e}, and nearest elements by at most {distance_m:.1e} m"
     )

@@ -172,10 +172,10 @@ def add_analysis(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--by",
         metavar="map|scene|distance|FILE",
-        help="AP of each map or scene alone, of the map cut at 10 and 20 m from the vehicle, or "
-        "of scenes by night and weather (FILE: scene.json of nuScenes' tables, or JSON with a word "
-        "for each scene or each sample), or of samples with and without a change in range (FILE: "
-        "GeoJSON of changes)",
+        help="AP of each group. map, scene: a group for each map or scene. distance: elements are "
+        "cut at 10 and 20 m from the vehicle. FILE: scene.json of nuScenes' tables (scenes by "
+        "night and weather), JSON with a word for each scene or each sample, or GeoJSON of changes "
+        "(samples with and without a change in range)",
     )
     group.add_argument(
         "--changes",

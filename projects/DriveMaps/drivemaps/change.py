@@ -68,7 +68,7 @@ class Changes:
     """Changes of a place.
 
     Args:
-        changes: Changes by class, then by kind.
+        changes: The changes, sorted by class and then by kind.
         num_on_new_ground: Number of elements of the passes on ground that the old map does not
             cover, by class. They are no changes.
         num_not_in_view: Number of elements of the old map without a vertex in view of any pass, by

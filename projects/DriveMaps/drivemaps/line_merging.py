@@ -1,9 +1,9 @@
 """Merging of the lines of many frames into one set of lines.
 
-Each vertex is matched, across its line, with the lines of the other frames and moves to their
-mean, weighted by certainty. The lines of one object then lie on top of each other. The longest
-well-supported lines are selected first, other lines add the parts that are not covered yet, and
-ends that meet are joined.
+Each vertex is matched with the points at which the normal of its line meets the lines of other
+frames. It then moves to the mean of itself and these points, weighted by certainty, so that the
+lines of one object come to lie on top of each other. The longest well-supported lines are selected
+first, other lines add the parts that are not covered yet, and ends that meet are joined.
 """
 
 from dataclasses import replace
@@ -60,9 +60,9 @@ def merge_lines(drive: Drive, label: int, config: MergeConfig) -> list[tuple[Flo
     matches = match_vertices(lines, normals_of(lines))
     # A segment has the index of its first vertex, whose score it takes.
     matched_scores = lines.scores[matches.segments]
-    support = lines.scores + np.bincount(matches.vertices, matched_scores, minlength=num_vertices)
+    score_sum = lines.scores + np.bincount(matches.vertices, matched_scores, minlength=num_vertices)
     num_frames = drive.count_frames_in_range(lines.points)
-    share = support / np.maximum(num_frames, 1)
+    share = score_sum / np.maximum(num_frames, 1)
     # A vertex at a sharp corner has no match. The median of three gives it its neighbours' share.
     smooth_share = median_filter(share, 3)
     confidence = np.minimum(smooth_share, 1.0)
@@ -106,8 +106,9 @@ def _select_parts(
 ) -> list[slice]:
     """Select parts of lines that together cover all lines once.
 
-    Lines are visited by falling support. The parts of a line that no previous part covers are
-    selected, and the vertices of other lines that match a selected part become covered.
+    The support of a line is the sum of the confidence of its vertices that may be selected. Lines
+    are visited by falling support. The parts of a line that no previous part covers are selected,
+    and the vertices of other lines that match a selected part become covered.
 
     Args:
         lines: Lines of all frames, which lie on top of each other.
@@ -125,10 +126,10 @@ def _select_parts(
     line_bounds = np.searchsorted(
         lines.line_indices[matches.segments], np.arange(len(lines.offsets))
     )
-    # Sum of the confidence of the vertices of each line. (N,)
-    support = np.add.reduceat(confidence * is_confident, lines.offsets[:-1])
+    support = np.add.reduceat(confidence * is_confident, lines.offsets[:-1])  # (N,)
     is_free = is_confident.copy()
     parts = []
+    # Support is rounded, so that lines of equal support keep their order despite rounding errors.
     for index in np.argsort(-support.round(9), kind="stable").tolist():
         line_start = int(lines.offsets[index])
         line_end = int(lines.offsets[index + 1])

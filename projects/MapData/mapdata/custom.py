@@ -89,10 +89,10 @@ def from_records(
         data_root: Folder that image and LiDAR paths are relative to.
         shard: Part of the records to take, such as ``Shard.parse("3/16")``.
         join: Whether to join lines of a class whose ends meet, for maps in pieces (`join_lines`).
-        calibration: Calibration file of the vehicle, in the format that `infer` reads in a folder
-            of images. It defines intrinsics, distortion, mounting and, if it names ``poses``,
-            ``global_from_frame`` at the record's ``timestamp_ns``. Cameras of records then have
-            ``name`` and ``path``, and ``timestamp_ns`` if the image has another time.
+        calibration: Calibration file of the vehicle, in the format that ``tools/infer.py`` reads in
+            a folder of images. It defines intrinsics, distortion, mounting and, if it names
+            ``poses``, ``global_from_frame`` at the record's ``timestamp_ns``. Cameras of records
+            then have ``name`` and ``path``, and ``timestamp_ns`` if the image has another time.
 
     Returns:
         Number of samples.
@@ -229,7 +229,7 @@ def _nearby_place(places: Sequence[np.ndarray], point: np.ndarray) -> np.ndarray
 
 
 def _create_sample(record: Mapping[str, Any], meta: AnnotationMeta, root: Path) -> MapSample:
-    """Create the sample of a record, whose values are not yet checked."""
+    """Create the sample of a record. The caller checks its values (`check_samples`)."""
     token = record["token"]
     if record.get(_GLOBAL) is not None:
         record = _transform_elements(record, meta)
@@ -287,7 +287,10 @@ def _transform_elements(record: Mapping[str, Any], meta: AnnotationMeta) -> dict
 
 
 def _create_record(kind: type[Record], values: Mapping[str, Any]) -> Record:
-    """Create a record from a mapping. Keys of the mapping that are not fields are ignored."""
+    """Create an object of a dataclass, such as `SweepRecord`, from a mapping.
+
+    Keys of the mapping that are not fields of the dataclass are ignored.
+    """
     arguments = {field.name: values[field.name] for field in fields(kind)}  # type: ignore[arg-type]
     return kind(**arguments)
 

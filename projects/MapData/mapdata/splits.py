@@ -62,7 +62,7 @@ class SplitList:
 
 
 def _families() -> list[str]:
-    """Names of the files of published lists, in the order of ``--split-name``."""
+    """Names of the files of published lists, in the order in which their splits are offered."""
     folder = files("mapdata").joinpath("split_lists")
     return sorted((Path(file.name).stem for file in folder.iterdir()), reverse=True)
 

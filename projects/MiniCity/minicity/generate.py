@@ -1,4 +1,7 @@
-"""Generate a MiniCity data set in the nuScenes format. An unfinished data set is never left."""
+"""Generate a MiniCity data set in the nuScenes format.
+
+The folder of the data set appears only when it is complete.
+"""
 
 import json
 import logging
@@ -165,7 +168,7 @@ def is_complete(root: Path, config: MiniCityConfig) -> bool:
             raise InputError(f"{marker} is another program's file: choose another --root.")
         parts = []
         for key in sorted({*present, *requested}):
-            default = getattr(MiniCityConfig, key, None)
+            default = getattr(MiniCityConfig, key, None)  # some fields are left out at the default
             found = present.get(key, default)
             wanted = requested.get(key, default)
             if found != wanted:
@@ -307,7 +310,7 @@ def _pass_table(config: MiniCityConfig, tasks: list[SceneTask]) -> list[dict[str
 def _splits(config: MiniCityConfig, tasks: list[SceneTask]) -> dict[str, list[str]]:
     """Names of the scenes of each split.
 
-    Validation scenes before the repainting form the split ``val_earlier``.
+    Validation scenes of all passes before the last ``new_passes`` form the split ``val_earlier``.
     """
     splits: dict[str, list[str]] = {"train": [], "val": [], "val_earlier": []}
     for task in tasks:

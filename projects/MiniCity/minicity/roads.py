@@ -200,8 +200,9 @@ class Road:
     def band_with_mouths(self, right_m: float, left_m: float) -> Array:
         """Outline of the whole road between two offsets in metres, anticlockwise. (n, 2)
 
-        At its ends, the outline has every vertex of the mouths of the junctions (`mouth`), so that
-        it meets the outlines of the junctions without a gap.
+        At both ends of the road, the outline also has a vertex at each entry of ``all_offsets``
+        between the two offsets. The outlines of the junctions have vertices at these points, too,
+        so that no gap is left.
         """
         start_points = []
         end_points = []
@@ -245,8 +246,8 @@ class Road:
         """Shift the edges that are painted lines between two lanes."""
         if self.shift_m == 0:
             return edges
-        # Edges go from the centre to the kerb: the first one is a line or the median, and the last
-        # one is no line between lanes.
+        # Edges go from the centre to the kerb. The first one is a line between two lanes only if
+        # the road has a centre line, and the last one never is.
         first = 0 if self.has_center_line else 1
         last = len(edges) - 1
         shifted = []
@@ -299,7 +300,8 @@ class Road:
             at_start: Whether the crossing lies at the start of the centre line.
             stop: Whether to add a stop line before the crossing.
         """
-        # Distances from this end of the road: far side of the crossing, and start of the paint.
+        # `far` (far side of the crossing) and `clear` (start of the paint) are distances from this
+        # end of the road. Vehicles that drive towards the start of the road use backward lanes.
         far = start_m + depth_m
         bare_m = STOP_GAP_M + STOP_LINE_M if stop else _BARE_M
         clear = far + bare_m

@@ -49,7 +49,8 @@ class Vehicle:
 def _body(size: Size, back: float, front: float, width: float) -> Array:
     """Rectangle in metres around the origin, heading along +x. (4, 2)
 
-    ``back`` and ``front`` are shares of the length, -0.5 to 0.5. ``width`` is a share of the width.
+    ``back`` and ``front`` are positions along x as shares of the length in ``size``, -0.5 to 0.5.
+    ``width`` is a share of the width in ``size``.
     """
     center = np.array([(back + front) / 2 * size[0], 0.0])
     length_m = (front - back) * size[0]
@@ -57,7 +58,10 @@ def _body(size: Size, back: float, front: float, width: float) -> Array:
 
 
 def _add_lights(mesh: Mesh, face: Array, color: Color) -> None:
-    """Add two lamps to a face with corners as in `patch`. (4, 3)"""
+    """Add two lamps to a face. (4, 3)
+
+    The corners are in the order bottom left, bottom right, top right, top left.
+    """
     for left, right in ((0.04, 0.22), (0.78, 0.96)):  # edges as shares of the width of the face
         lamp = patch(face, left, right, bottom=0.5, top=0.8)
         mesh.add_quad(lamp, color, layer=2, glow=True)

@@ -158,6 +158,7 @@ class MapInferencer:
             self.replicas.append(replica)
             fast_frames = self._build_fast_frames(replica, device=place, cuda_graphs=cuda_graphs)
             self._fast_frames.append(fast_frames)
+        # Camera embeddings as trained. `_fit_cameras` replaces them in the replicas.
         self._camera_embeds = getattr(self.model.bev_encoder, "cams_embeds", None)
         self.visualizer = _build_visualizer(self.cfg)
         self._scratch = tempfile.TemporaryDirectory(prefix="gsmap-")
@@ -167,6 +168,8 @@ class MapInferencer:
         self, model: Any, device: torch.device, cuda_graphs: bool | None
     ) -> FastFrames | None:
         """Build the predictor of recorded frames; None if ``test_step`` runs the frames.
+
+        With mixed precision on a GPU, also switch the model to a backbone in float16.
 
         Args:
             model: Replica of the model.
@@ -363,7 +366,8 @@ class MapInferencer:
                     on_broken(frame)
                 if batch is not None:
                     turn = number % len(pools)
-                    with delay_signals():  # a pool has locks, see `result_of`
+                    # A signal handler that raises here could leave a lock of the pool locked.
+                    with delay_signals():
                         future = pools[turn].submit(
                             self._step, turn=turn, batch=batch, stream=stream, maps=maps
                         )
@@ -453,7 +457,8 @@ class MapInferencer:
                 viewing direction. (H, W, 3) each
             intrinsics: Pinhole matrix of each camera, in pixels. (3, 3) each
             cam_from_frame: Transform from the frame to each camera, in metres. (4, 4) each
-            frame: Frame of the transforms, as `LiveMap` takes it.
+            frame: Frame of the transforms: ``vehicle``, ``lidar`` or ``ego``, see `LiveMap`. By
+                default the frame of the config.
             allow_missing_cameras: Whether cameras of the model may be absent.
             can_bus: Vehicle signals, or None. (18,)
 
@@ -486,7 +491,8 @@ class MapInferencer:
         Args:
             intrinsics: Pinhole matrix of each camera, in pixels. (3, 3) each
             cam_from_frame: Transform from the frame to each camera, in metres. (4, 4) each
-            frame: Frame of the transforms, as `LiveMap` takes it.
+            frame: Frame of the transforms: ``vehicle``, ``lidar`` or ``ego``, see `LiveMap`. By
+                default the frame of the config.
             allow_missing_cameras: Whether cameras of the model may be absent.
             prior: Map of earlier drives, for a model that reads one.
             update_prior: Write each frame to ``prior`` after it is predicted.

@@ -58,12 +58,13 @@ def modulated_deform_conv(
     rows, cols = coordinates
     locations = torch.stack([cols, rows], dim=-1).flatten(0, 1).flatten(1, 2)  # (B G, K h, w, 2)
     parts = images.reshape(batch * deform_groups, -1, size[0], size[1])
-    samples = F.grid_sample(parts, locations, align_corners=False)
+    samples = F.grid_sample(parts, locations, align_corners=False)  # (B G, C / G, K h, w)
     samples = samples.view(batch, deform_groups, -1, num_taps, out_size[0], out_size[1])
     samples = samples * mask.unflatten(1, (deform_groups, 1, num_taps))
-    columns = samples.reshape(batch, groups, -1, out_size[0] * out_size[1])
+    # The inputs of each output pixel, as from `F.unfold`. (B, groups, C / groups * K, h w)
+    unfolded = samples.reshape(batch, groups, -1, out_size[0] * out_size[1])
     filters = weight.view(groups, len(weight) // groups, -1)
-    out = (filters @ columns).flatten(1, 2)  # (B, O, h w)
+    out = (filters @ unfolded).flatten(1, 2)  # (B, O, h w)
     if bias is not None:
         out = out + bias[:, None]
     return out.unflatten(2, out_size)

@@ -42,6 +42,7 @@ def items_of(
         except _FormError as error:
             raise InputError(f"{path} holds {error} and no list{under}: {advice}.") from error
         except (ValueError, RecursionError) as error:  # RecursionError: nested too deeply
+            # Other advice for a pointer of Git LFS or a web page in place of the JSON file.
             file.seek(0)
             advice = fetch_advice(start=file.read(100), otherwise=advice)
             raise InputError(
@@ -79,7 +80,7 @@ class _Parser:
 
     def _items_under(self, key: str, other_entries: dict[str, Any]) -> Iterator[tuple[Any, Place]]:
         """Yield the items of the list under a key of an object."""
-        is_complete = False
+        has_list = False  # whether the key has been found
         names = []
         for _ in self._members(opening="{", closing="}"):
             if self._next_character() != '"':
@@ -92,12 +93,12 @@ class _Parser:
                 if name in other_entries:
                     other_entries[name] = value
                 continue
-            if is_complete:
+            if has_list:
                 raise self._error(f"a second {key!r}")
             self._require(opening="[", where=f" under {key!r}")
-            is_complete = True
+            has_list = True
             yield from self._list_items()
-        if not is_complete:
+        if not has_list:
             raise _FormError(f"an object with {names[:_LISTED_NAMES] or 'nothing'}")
 
     def _list_items(self) -> Iterator[tuple[Any, Place]]:

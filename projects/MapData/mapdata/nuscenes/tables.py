@@ -204,8 +204,8 @@ class NuScenesTables:
             Channels of the cameras, the six of nuScenes first, and the channel of the LiDAR.
 
         Raises:
-            ValueError: If there is no LIDAR_TOP, unless the frame is ``ego`` and there is one other
-                LiDAR.
+            ValueError: If there is no LIDAR_TOP and no LiDAR to take its place. Only with the frame
+                ``ego``, a LiDAR of another name takes its place, if there is exactly one.
         """
         sensors = self._records["sensor"]
         camera_channels = set()
@@ -278,7 +278,7 @@ class NuScenesTables:
         return self.chain("sample", scene["first_sample_token"], step="next", origin=scene)
 
     def location_of(self, scene: dict[str, Any]) -> str:
-        """Name of the map of a scene, in whose frame its poses are."""
+        """Name of the map of a scene. The poses of the scene are in the frame of this map."""
         return self._records["log"][scene["log_token"]]["location"]
 
     def expansion_of(self, scene: dict[str, Any]) -> str:
@@ -387,7 +387,7 @@ def read_nuscenes(
     """Read all samples with a LIDAR_TOP key frame, in the frame of this LiDAR.
 
     Args:
-        root: Data root.
+        root: Data root with at least one version folder (`versions_in`).
         version: Version folder, such as ``v1.0-mini``; may be omitted if there is only one.
 
     Returns:

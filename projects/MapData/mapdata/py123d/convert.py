@@ -75,7 +75,8 @@ def convert_py123d(options: Py123dOptions) -> ConversionSummary:
     for folder in _find_logs(options):
         try:
             log = Log(folder)
-            log.ground_z_m  # noqa: B018 - reads the poses' table
+            # Reads the table of poses, so that a log without a valid one is left out here.
+            log.ground_z_m  # noqa: B018
             logs.append(log)
         except (FileNotFoundError, ValueError) as error:
             summary.add_problem(f"log left out: {error}", folder.name)
@@ -83,7 +84,7 @@ def convert_py123d(options: Py123dOptions) -> ConversionSummary:
         raise WorkError(f"no log is left of {options.split}:\n{summary.text()}")
     data_root = options.data_root or options.root
     target = options.path_of("py123d", options.split)
-    own_logs = options.shard.part(logs)
+    shard_logs = options.shard.part(logs)
     meta = options.meta(
         dataset=file_name(f"py123d_{logs[0].metadata.get('dataset')}"),
         frame="ego",
@@ -91,7 +92,7 @@ def convert_py123d(options: Py123dOptions) -> ConversionSummary:
         ground_z_m=_ground_z_m(logs, options.ground_z_m),
         options={"rate_hz": options.rate_hz},
     )
-    with Progress(own_logs, desc=f"py123d {options.split}", unit="logs") as progress:
+    with Progress(shard_logs, desc=f"py123d {options.split}", unit="logs") as progress:
         records = _all_records(progress, options, summary=summary)
         # The first record is read before the file is opened: without one, no file is written.
         first = next(records, None)
@@ -104,7 +105,7 @@ def convert_py123d(options: Py123dOptions) -> ConversionSummary:
     for sample in AnnotationFile(path):
         summary.add_sample(options.split, sample)
     tables: set[str] = set()
-    for log in own_logs:
+    for log in shard_logs:
         tables.update(log.unused_tables)
     if tables:
         names = ", ".join(sorted(tables))
@@ -224,7 +225,8 @@ def _cameras(
 ) -> list[dict[str, Any]]:
     """List the cameras of a frame, as `mapdata.custom.from_records` takes them.
 
-    The transforms to the cameras include the motion of the vehicle between the two times.
+    The transforms to the cameras include the motion of the vehicle between the time of the frame
+    and the time of each image.
 
     Args:
         log: The log.
@@ -253,7 +255,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--root", type=Path, required=True, help="folder of py123d with logs and maps")
     add("--split", required=True, help="folder below logs, such as nuscenes_val")
     add("--data-root", type=Path, help="folder of the images that logs name (default: --root)")
-    add("--logs", nargs="+", default=(), metavar="LOG", help="only these (first characters)")
+    add("--logs", nargs="+", default=(), metavar="LOG", help="only logs that begin with LOG")
     add(
         "--rate", type=parse_rate, default=2.0, dest="rate_hz", metavar="RATE",
         help="samples per second, such as 2hz, or all (default: 2hz)",

@@ -81,6 +81,7 @@ class Camera:
             return f"its model is {model!r:.40}, not 'pinhole'"
         if self.metadata.get("intrinsics") is None:
             return "it has no intrinsics"
+        # Integers in place of paths or images are the numbers of frames in a video file.
         if pa.types.is_integer(self._table.schema.field(self._column("data")).type):
             return "its images are in a film; py123d must store them as JPEG or PNG"
         return ""
@@ -128,7 +129,7 @@ class Camera:
         if not isinstance(data, bytes):
             raise InputError(f"{where} has no image in row {row}")
         size = (int(self.metadata["width"]), int(self.metadata["height"]))
-        decode_image(data, path=f"row {row}", where=where, size=size)
+        decode_image(data, path=f"row {row}", where=where, size=size)  # only to check the image
         suffix = "png" if data.startswith(_PNG_START) else "jpg"
         folder = f"images/{file_name(scene)}/{file_name(self.name)}"
         path = f"{folder}/{self.time_us(row)}.{suffix}"
@@ -141,7 +142,7 @@ class Camera:
     def calibration(self) -> dict[str, Any]:
         """Name, size, intrinsics and distortion of the camera.
 
-        The keys are those of `mapdata.custom.from_records`.
+        The keys are the ones that `mapdata.custom.from_records` expects in a record of a camera.
 
         Raises:
             ValueError: If a value is missing.
@@ -220,7 +221,10 @@ class Log:
 
     @cached_property
     def imu_from_axle(self) -> np.ndarray:
-        """Pose of the rear axle (x ahead, y left, z up), the frame ``ego``, in the IMU. (4, 4)"""
+        """Transform from the frame ``ego`` to the frame of the IMU. (4, 4)
+
+        The origin of ``ego`` is the centre of the rear axle, with x ahead, y left and z up.
+        """
         with explain_errors(self.folder / f"{_EGO}.arrow", REMEDY):
             return pose_of(metadata_of(self._ego)["rear_axle_to_imu_se3"])
 

@@ -16,12 +16,14 @@ Lines = tuple[FloatArray, IntArray, IntArray]
 # Compiler flags: no value is NaN, and the sign of zero does not matter. Minima then vectorise,
 # and sums still add in the written order.
 _NO_NAN = {"nnan", "nsz"}
-_BOUND_SLACK = 1.0 - 1e-12  # factor of computed bounds, which rounding may have made too large
+_BOUND_SLACK = 1.0 - 1e-12  # factor that makes a bound safe against rounding errors
 
 
 @njit(cache=True, error_model="numpy")
 def resample_lines(points: FloatArray, offsets: IntArray, num_points: int) -> FloatArray:
-    """Resample lines at equal arc length in the plane, with results equal to `resample_all`.
+    """Resample lines at equal arc length in the plane.
+
+    The results are equal to `gsmap.structures.polylines.resample_all`.
 
     Args:
         points: Vertices of all lines in metres. (M, D)
@@ -125,6 +127,8 @@ def _boxes(points: FloatArray, offsets: IntArray) -> FloatArray:
 def beside_a_segment(points: FloatArray, line: FloatArray, half_width_m: float) -> bool:
     """Check whether any of some points projects onto a segment of a line and is close to it.
 
+    A point whose distance is ``half_width_m`` up to rounding errors does not count as close.
+
     Args:
         points: Points in metres; z is not used. (3, P)
         line: Vertices in metres; z is not used. (3, Q)
@@ -142,7 +146,8 @@ def beside_a_segment(points: FloatArray, line: FloatArray, half_width_m: float) 
             qx = px[i] - lx[j]
             qy = py[i] - ly[j]
             # `seg_sq` is the squared length of the segment. `along` and `across` are the distances
-            # of the point from its start, along and across its direction, times its length.
+            # of the point from the start of the segment, along and across the segment, multiplied
+            # by the length of the segment.
             seg_sq = sx * sx + sy * sy
             along = qx * sx + qy * sy
             if 0.0 < along < seg_sq:

@@ -255,6 +255,7 @@ class SamplePairs:
                     is_full = len(pending_truth) >= CHUNK
                     pending_truth[token] = place if is_full else elements
         if isinstance(self._truth, AnnotatedTruth) and not self._allow_other_split:
+            # Raises an error if the model of the results was trained on another split.
             require_results_of(self._truth.split_list, self.about, self._results.path)
         self._mismatches = mismatch_notes(
             pending_results, pending_truth, allowed=self._allow_mismatch

@@ -275,7 +275,8 @@ def assign(quality: FloatArray, thresholds: FloatArray) -> IntArray:
     Among equally good ground truths, the last one is taken.
 
     Args:
-        quality: Quality of each pair; predictions in descending order of score. (N, K)
+        quality: IoU or negative distance of each pair, so that larger values are better. The
+            predictions are in descending order of score. (N, K)
         thresholds: Smallest quality of a match, inclusive, for each prediction. (N, T)
 
     Returns:

@@ -64,7 +64,7 @@ class LossHead(DetectionHead):
             Scalars by name.
 
         Raises:
-            FloatingPointError: If a matching cost is not finite.
+            FloatingPointError: If a matching cost is not finite. The assigner checks the costs.
         """
         truths = self.prepare_gts(batch_gt_instances)
         return self.losses_by_feat(outputs, truths, metas=batch_img_metas, hooks=hooks)

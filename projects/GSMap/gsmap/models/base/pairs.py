@@ -372,7 +372,7 @@ class MatchedPairs:
     def gt_masks(self) -> Tensor:
         """Masks of the ground truth. (M, H, W)"""
         masks = self.predictions.masks
-        if masks.of_points:
+        if masks.of_points:  # drawn from the P points in the matched order, not from the polylines
             return masks.draw(self.gt_pts_m, self.gt_labels, masks.grid)
         return self.of_truths(self.truths.masks)
 

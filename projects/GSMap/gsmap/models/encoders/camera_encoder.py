@@ -19,7 +19,7 @@ def stack_calibration(
 
     Args:
         img_metas: Meta information of the samples, B of them.
-        names: Names of arrays of `calibration_arrays`.
+        names: Names of arrays of `gsmap.structures.calibration.calibration_arrays`.
         device: Device of the result.
 
     Returns:
@@ -33,7 +33,7 @@ class CameraEncoder(BaseModule):
     """Base class of BEV encoders of camera features.
 
     Attributes:
-        calibration: Names of the arrays of `calibration_arrays` that the encoder reads.
+        calibration: Names of the arrays that the encoder reads, see `stack_calibration`.
         num_levels: Number of levels of image features, from the finest on. None: all.
     """
 

@@ -107,7 +107,7 @@ class ViewTransformEncoder(CameraEncoder):
         self.released_units = released_units
         self.view_pixel_m = bev_pixel_m / 0.6  # side of a cell of a camera map: 5/3 of a BEV cell
         self.feature_size = (image_size[0] // stride, image_size[1] // stride)
-        num_rows, num_columns = forward_size(self.grid)
+        num_rows, num_columns = forward_size(self.grid)  # rows across the direction of travel
         # 2/3 of the size of the BEV, in cells that are 5/3 as long: 2/3 divided by 5/3 is 2/5.
         self.view_size = (2 * num_rows // 5, 2 * num_columns // 5)
         if min(self.feature_size + self.view_size) < 1:
@@ -186,7 +186,8 @@ class ViewTransformEncoder(CameraEncoder):
         with torch.autocast(cam_from_ground.device.type, enabled=False):
             matrices = cam_from_ground.float()
             cells = self.cell_coordinates(matrices.device)
-            # Right and forward axis of the camera (rows) for points with z = 0 on the ground.
+            # The rows for x (right) and z (ahead) of the camera frame. The third column is not
+            # needed, because the points lie on the ground, where z = 0.
             rotations = matrices[..., [0, 2], :2]
             rotated_cells = torch.einsum("bvij,hwj->bvhwi", rotations, cells)
             unit = 1.0 if self.released_units else self.view_pixel_m

@@ -217,7 +217,8 @@ def ridge_pixels(probs: FloatArray, tolerance: float) -> BoolArray:
     """Find the pixels with the largest probability across their line.
 
     A line counts as vertical where the mean over 9 rows and 5 columns exceeds the mean over 5 rows
-    and 9 columns. There a ridge pixel is the largest of 5 in its row, elsewhere of 5 in its column.
+    and 9 columns. A ridge pixel has the largest probability among 5 pixels: of its row if the line
+    is vertical there, otherwise of its column.
 
     Args:
         probs: Probability of a class, 0 outside its clusters. (H, W)

@@ -148,6 +148,8 @@ class MGMapDecoder(MapDecoder):
         """
         fused_feats, levels = self.neck(bev_feats)
         num_instances = query.shape[1] // self.num_points
+        # The network has masks for the instances of all query groups. In inference, only the first
+        # group is there, which has the first masks.
         masks = self.mask_net(fused_feats)[:, :num_instances]  # (B, N, H, W)
         instance_feats = self.instance_features(fused_feats, masks)
         mask_embeddings = self.activation(instance_feats)  # (B, N, C)

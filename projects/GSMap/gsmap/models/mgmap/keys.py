@@ -14,7 +14,7 @@ _BLOCKS = (
     (_ENHANCED + "layer2.{i}.", _NECK + "stages.1.{i}."),
     (_ENHANCED + "layer3.{i}.", _NECK + "stages.2.{i}."),
 )
-_ACTIVATION = (TRANSFORMER + "decoder.ins_conv.", "map_head.decoder.mask_net.")
+_MASK_NET = (TRANSFORMER + "decoder.ins_conv.", "map_head.decoder.mask_net.")
 
 
 def _gate_rules() -> Rules:
@@ -28,7 +28,7 @@ def _gate_rules() -> Rules:
 MGMAP = KeyMap(
     "mgmap",
     (
-        _ACTIVATION,
+        _MASK_NET,
         (TRANSFORMER + "decoder.linear1.", "map_head.decoder.activation."),
         (HEAD + "pts_embedding_.", "map_head.pts_embedding."),
         *rules_of(
@@ -59,7 +59,7 @@ MGMAP = KeyMap(
         *MAPTR.rules,
     ),
     unused=CODE_WEIGHTS,
-    markers=(_ACTIVATION,),
+    markers=(_MASK_NET,),
     # modules that are never called, an alias of glimpse_transformer_0, and weights of a loss
     ignored_pattern=r"pts_bbox_head\.(conv_seg|glimpse_transformer|loss_fn_?|(cls|reg)_branches\.[6-9]|"
     r"transformer\.bevencode\.(fpn_conv|attention)|(rego_hs_fuser|layer_norms)_\d\.[1-5])\.|"

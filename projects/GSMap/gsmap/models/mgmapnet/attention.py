@@ -174,7 +174,8 @@ class MultiPointAttention(PerPointSampling):
     """Attention that updates the instance queries alone, from samples around all of their points.
 
     A linear layer computes the point queries from the instance query. This attention is the
-    baseline in the tables of MGMapNet and corresponds to `LinePointAttention`.
+    baseline in the tables of MGMapNet and corresponds to `LinePointAttention`, in which instance
+    queries sample near the points of their lines.
 
     Args:
         embed_dims: Channels C.
@@ -313,7 +314,8 @@ class MultiGranularityAttention(PerPointSampling):
         locations = samples.locations.mean(dim=(3, 4))  # (B, N, P, K, 2)
         point_code: Tensor | float = 0.0
         instance_code: Tensor | float = 0.0
-        # Differs from the poster's MLP(S, W): the released model encodes their product.
+        # Differs from the poster, which encodes locations and weights as two inputs of the MLP: the
+        # released model encodes their product.
         if self.point_code is not None:
             point_weights = samples.point_weights.mean(dim=(3, 4))  # (B, N, P, K)
             weighted_locations = locations * point_weights[..., None]

@@ -17,8 +17,8 @@ from gsmap.models.mgmapnet.bev_pyramid import BEVPyramid
 class MGMapNetDecoderLayer(MapDecoderLayer):
     """Decoder layer of instance and point queries with `MultiGranularityAttention` to the BEV.
 
-    It consists of the self-attention of the instances, the attention to the BEV, and a feed-forward
-    network for each granularity.
+    It consists of the self-attention of the instances, the attention to the BEV, and one
+    feed-forward network each for instance queries and for point queries.
 
     Args:
         embed_dims: Channels C of the queries.
@@ -54,6 +54,7 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
             embed_dims,
             ffn_dims=ffn_dims,
             dropout=dropout,
+            # The self-attention has one query per instance, as a line of one point.
             self_attn={"num_points": 1, **(self_attn or {})},
             cross_attn={**cross_attn_defaults, **(cross_attn or {})},
             **kwargs,
@@ -129,7 +130,10 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
         return state._replace(instances=self.norms[2](instances))
 
     def guide_position(self, position: Tensor, reference: Tensor) -> Tensor:
-        """Apply the guidance to the position of each point, and average over the points.
+        """Add embeddings of the references to the positions, if the layer has a guidance.
+
+        The guidance (an optional part of `MapDecoderLayer`) conditions a query on its reference. It
+        is applied once for each point, and the results are averaged over the points.
 
         Args:
             position: Positions of the instances. (B, N, C)
@@ -189,7 +193,7 @@ class MGMapNetDecoder(MapDecoder):
     ) -> None:
         super().__init__(layer or {}, **kwargs, embed_dims=embed_dims, num_levels=num_levels)
         # Differs from the poster: as in the released model, the first layer adds the learned
-        # position.
+        # position instead of an encoding of the references.
         self.layers[0].reference_code = None
         self.bev_pyramid = BEVPyramid(embed_dims, num_levels)
 

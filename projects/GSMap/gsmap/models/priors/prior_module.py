@@ -16,7 +16,7 @@ from gsmap.utils.errors import InputError
 
 
 class PriorModule(BaseModule):
-    """Part of a `MapDetector` that reads maps of earlier frames, its ``prior``.
+    """Part ``prior`` of a `MapDetector`, which reads maps of earlier frames.
 
     For each batch the detector calls `fuse` with the outputs of the encoder, `hook` for the flow of
     the head, `update_detections` with the detections and `keep` with the hook. This base class does
@@ -82,7 +82,7 @@ class PriorModule(BaseModule):
         return GivenMaps(priors, self.classes, grid=self.window, update=update)
 
     def flush(self) -> None:
-        """Write the predictions that `keep` has kept to the maps."""
+        """Write the predictions that were passed to `keep` into the maps."""
 
     def use(self, maps: PlaceMaps | None) -> None:
         """Use these maps in tests from now on; None for the maps of the model.

@@ -43,7 +43,7 @@ CHUNK = tl.constexpr(32)  # Gaussians whose boxes are tested at once: the bits o
 POWER = math.sqrt(math.log2(math.e) / 2)  # exp(-x^2 / 2) = 2^-(POWER x)^2
 SIGMA = tl.constexpr(1 / POWER)  # brings sums of POWER u and POWER v back to units of sigma
 WARP_OPTIONS = {"num_warps": 1, "enable_fp_fusion": True}
-MAX_DENSITY = tl.constexpr(1 - 1e-6)
+MAX_DENSITY = tl.constexpr(1 - 1e-6)  # keeps 1 - G, by which the backward pass divides, above 0
 
 
 @triton.jit
@@ -63,7 +63,7 @@ def _tile_pixels(tile, x_min, y_min, step_x, step_y, height, width, TILE: tl.con
 def _touches(gaussian, left, right, low, high):
     """Whether the bounding box of a Gaussian meets a tile; true for NaN.
 
-    ``gaussian`` points to the 8 parameters of `_prepare`, also in the functions below.
+    ``gaussian`` points to the 8 parameters of a Gaussian, in the order of `_prepare`.
     """
     mean_x = tl.load(gaussian)
     mean_y = tl.load(gaussian + 1)
@@ -77,7 +77,10 @@ def _touches(gaussian, left, right, low, high):
 
 @triton.jit
 def _density(gaussian, x, y):
-    """Density of a Gaussian at pixels, and their coordinates u, v in sigmas. (TILE, TILE)"""
+    """Density of a Gaussian at pixels, and their coordinates u, v in sigmas. (TILE, TILE)
+
+    ``gaussian`` points to the 8 parameters of a Gaussian, in the order of `_prepare`.
+    """
     dx = x - tl.load(gaussian)
     dy = y - tl.load(gaussian + 1)
     cos = tl.load(gaussian + 2)
@@ -213,7 +216,10 @@ def _lowest_bit(bits):
 
 @triton.jit
 def _warp_density(gaussian, x, y):
-    """Density of a Gaussian at pixels, and their coordinates u, v in sigmas times POWER."""
+    """Density of a Gaussian at pixels, and their coordinates u, v in sigmas times POWER.
+
+    ``gaussian`` points to the 8 parameters of a Gaussian, in the order of `_warp_parameters`.
+    """
     dx = x - tl.load(gaussian)
     dy = y - tl.load(gaussian + 1)
     u = tl.load(gaussian + 2) * dx + tl.load(gaussian + 3) * dy
