@@ -152,7 +152,10 @@ class Trial:
 
     @contextmanager
     def _count_parts(self) -> Iterator[None]:
-        """Count each launch for the part, of `PARTS` or of the optimizer, that is running."""
+        """Count each launch for the part that is running.
+
+        The parts are `PARTS`, the step of the optimizer, gradient clipping and the backward pass.
+        """
         gpu = self.gpu
         with ExitStack() as stack:
             for attribute, method, part in PARTS:

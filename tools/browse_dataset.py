@@ -49,7 +49,7 @@ def main() -> str:
         dataset = DATASETS.build(cfg[f"{args.split}_dataloader"].dataset)
     if args.web:
         options = PageOptions(data_root=Path(dataset.data_root), max_frames=args.num)
-        return write_page(args.web, page_data(dataset.ann_file, {}, options))
+        return write_page(args.web, page_data(dataset.ann_file, {}, options))  # no results
     visualizer = MapVisualizer("browse", show_order=args.order)
     visualizer.dataset_meta = dataset.metainfo
     indices = spread_evenly(len(dataset), args.num)

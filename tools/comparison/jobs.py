@@ -86,7 +86,8 @@ class Job:
         else:
             environment["CUDA_VISIBLE_DEVICES"] = self.device
         with open_to_append(self._log) as log:
-            # Position in bytes: an earlier attempt that was killed may have written to the file.
+            # Position in bytes at which the output of this process begins. Before it, the file may
+            # have the output of an earlier attempt that was killed.
             self._log_start = log.seek(0, os.SEEK_END)
             self._process = subprocess.Popen(
                 self.run.commands()[self.stage],
@@ -118,6 +119,8 @@ class Job:
 
     def _collect_process(self) -> bool:
         """Record exit code and peak memory if the process has ended; return whether it has."""
+        # Unlike `Popen.poll`, `os.wait4` returns the memory of the process, but it does not set the
+        # exit code of the `Popen` object.
         pid, status, usage = os.wait4(self._process.pid, os.WNOHANG)
         if pid == 0:
             return False

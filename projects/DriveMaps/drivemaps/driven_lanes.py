@@ -19,7 +19,7 @@ from drivemaps.directed_lines import (
 from gsmap.structures.elements import FloatArray, IntArray
 
 _WIDTH_M = (2.0, 5.0)  # smallest and largest width of a lane whose middle is known
-_MOST_APART_M = 8.0  # largest distance of the borders, if cars are parked in the lane, for example
+_MOST_APART_M = 8.0  # largest width of a lane, such as a lane in which cars are parked
 _MOST_GAP_M = 30.0  # largest distance of the positions of successive frames of one track
 _LEAST_STEP_M = 0.5  # a vehicle that moves less stands still
 _MOST_CROSSING_M = 50.0  # longest stretch without borders, such as a junction, between two lanes
@@ -55,24 +55,25 @@ def driven_lanes(positions: FloatArray, borders: list[FloatArray]) -> DrivenLane
     """Find the lanes along the track of a vehicle.
 
     A lane lies between the nearest border on the left and on the right. Its centre line is their
-    middle where they are 2 to 5 m apart. Where they are 5 to 8 m apart, it keeps the distance from
-    the track that it has before and behind. A lane begins and ends where the vehicle changes lanes.
-    A stretch of at most 50 m without borders between two lanes, such as a junction, joins them.
+    middle where they are 2 to 5 m apart. Where they are 5 to 8 m apart, the distance of the centre
+    line from the track is interpolated between the places before and after. A lane begins and ends
+    where the vehicle changes lanes. A stretch of at most 50 m without borders between two lanes,
+    such as a junction, joins them.
 
     Args:
         positions: Positions of the vehicle in the order of time, in metres. (n, 2)
         borders: Dividers and boundaries, in metres. each (m, 2)
 
     Returns:
-        Centre lines, one for each stretch with borders and each stretch without. A lane that is
-        driven twice has one.
+        Centre lines, with a separate line for each stretch with borders and each stretch without
+        borders. A lane that is driven twice has one centre line.
     """
     tree = border_tree(borders)
     lanes = [_lane_along(track, tree) for track in _tracks(positions)]
     if not lanes:
         return DrivenLanes([], driven_m=0.0, outside_m=0.0)
     earlier_points = _earlier_points(lanes)
-    stretches: list[tuple[int, int]] = []  # indices of their first and last point
+    stretches: list[tuple[int, int]] = []  # indices of the first and the last point of each
     driven_m = 0.0
     outside_m = 0.0
     first_point = 0  # index, among the points of all lanes, of the first point of the lane
@@ -82,7 +83,8 @@ def driven_lanes(positions: FloatArray, borders: list[FloatArray]) -> DrivenLane
         outside_m += float(lane.steps_m[~is_lane].sum())
         end_point = first_point + len(lane.centers)
         is_repeated = earlier_points[first_point:end_point] >= 0
-        is_new = ~(is_repeated[:-1] & is_repeated[1:])  # of the steps between two points
+        # A step between two points is new unless both points repeat an earlier pass.
+        is_new = ~(is_repeated[:-1] & is_repeated[1:])
         states = np.where(is_lane & is_new, lane.kinds, _OUTSIDE)
         for start, stop in _runs(states):
             if states[start] != _OUTSIDE:
@@ -180,7 +182,8 @@ def _earlier_points(lanes: Sequence[_Lane]) -> IntArray:
         earlier = np.array(neighbours)
         cosines = directions[earlier] @ directions[later]
         is_along = is_in_lane[earlier] & (cosines > _MIN_PARALLEL_COSINE)
-        is_earlier_pass = earlier < later - _FILTER  # not one of the points just before
+        # The last `_FILTER` points before a point count as the same pass.
+        is_earlier_pass = earlier < later - _FILTER
         earlier = earlier[is_along & is_earlier_pass]
         if len(earlier):
             distances_m = np.linalg.norm(points[earlier] - points[later], axis=1)

@@ -149,7 +149,8 @@ class MapGrid:
         is_wrong = ~(np.isfinite(lon_deg) & np.isfinite(lat_deg))
         area = system.area_of_use
         if area is not None and np.abs(points).max(initial=0.0) <= _FARTHEST_M:
-            with np.errstate(invalid="ignore"):  # infinite where there is no longitude
+            # A point that has no longitude has an infinite one here, whose remainder is NaN.
+            with np.errstate(invalid="ignore"):
                 from_west_deg = (lon_deg - area.west) % 360.0
             width_deg = (area.east - area.west) % 360.0
             if width_deg == 0.0:  # the whole Earth

@@ -71,8 +71,8 @@ def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
     """Read the samples of an open bag.
 
     The cameras are built first, from their camera info or from a calibration file. Then the images
-    are grouped to frames at the times of one camera, and the frames with a pose become samples. At
-    last, their images are written.
+    are grouped to frames at the times of one camera, and the frames with a pose become samples.
+    Finally, the images of these frames are written.
     """
     kinds = {connection.topic: connection.msgtype for connection in bag.connections}
     listing = _listing(bag)
@@ -224,6 +224,7 @@ def _choose_vehicle(content: BagContent, wanted: str | None) -> str:
     try:
         return content.tree.choose_vehicle(wanted)
     except ValueError as error:
+        # Topics of which no message can be read, and topics of which some messages cannot be read.
         topics = [*content.unreadable, *content.unread]
         if not topics:
             raise

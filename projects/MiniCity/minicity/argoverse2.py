@@ -26,7 +26,8 @@ DOUBLE_GAP_M = 0.12
 DASH_M, GAP_M = 3.0, 6.0
 SAME_LINE_M = 0.3  # lines closer than this are one line
 WEAR = 0.15  # share of the paint that is worn off
-HEIGHT_SMOOTHING_M = 1.0  # heights are stored in steps of about 5 cm
+# Standard deviation of the Gaussian filter of heights, which are stored in steps of about 5 cm.
+HEIGHT_SMOOTHING_M = 1.0
 
 Bounds = tuple[float, float, float, float]
 
@@ -127,6 +128,7 @@ def _line_paint(line: np.ndarray, kind: str) -> list[np.ndarray]:
         return dashed_line(line, LINE_WIDTH_M, dash_m=DASH_M, gap_m=GAP_M)
     if kind.startswith(("DASH_SOLID", "SOLID_DASH")):  # one solid, one dashed line side by side
         curve = shapely.LineString(line)
+        # The offsets are from the curve to the middles of both lines.
         left = np.array(curve.offset_curve(DOUBLE_GAP_M).coords)
         right = np.array(curve.offset_curve(-DOUBLE_GAP_M).coords)
         is_left_solid = kind.startswith("SOLID")  # a kind names the left line first

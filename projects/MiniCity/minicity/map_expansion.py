@@ -121,6 +121,7 @@ class MapWriter:
         self._add_block(road, road.backward_edges, segment=segment, direction="backward")
         for start, end in divider_pieces(road):
             if road.has_center_line:
+                # The offset of the centre line is 0, to which the shift of painted lines is added.
                 center = self.line(road.line(road.shift_m, start, end_m=end))
                 self.add("road_divider", line_token=center, road_segment_token=segment)
             for offset in lane_divider_offsets(road):
@@ -205,7 +206,7 @@ class MapWriter:
     def _add_center(self, token: str, center: Array) -> None:
         """Add the centre line (n, 2) of a lane or connector as an arc-line path of straight pieces.
 
-        The connectivity gets an entry for the lane without any neighbours, which are added later.
+        The connectivity gets an entry without neighbours, to which `add_connector` adds them.
         """
         lengths = arc_lengths(center)
         count = max(1, round(lengths[-1] / PIECE_M))

@@ -176,7 +176,7 @@ def _add_crossings(road: Road, rng: np.random.Generator) -> None:
             depth_m = float(rng.uniform(low=2.5, high=4.5))
             stop = lanes_in > 0 and rng.random() < 0.8
             road.add_crossing(gap_m, depth_m, at_start=at_start, stop=stop)
-        elif lanes_in and rng.random() < 0.6:  # a stop line alone
+        elif lanes_in and rng.random() < 0.6:  # a stop line alone, at which divider paint ends
             if at_start:
                 road.stop_backward = (END_STOP_M, END_STOP_M + STOP_LINE_M)
                 road.clear_start_m = END_STOP_M + STOP_LINE_M
@@ -281,6 +281,7 @@ def _make_carpark(road: Road, sign: int, middle_m: float, bays: int) -> Carpark:
         end = far + along * (k * BAY_WIDTH_M - length / 2)
         lines.append(np.stack([end, end - BAY_LENGTH_M * across]))
         if k < bays:
+            # 2.6 m from the far end of the bay is near its middle.
             slot = end + along * BAY_WIDTH_M / 2 - 2.6 * across
             slots.append(np.append(slot, heading))
     return Carpark(outline, driveway, bays=lines, slots=np.array(slots))

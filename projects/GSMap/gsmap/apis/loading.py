@@ -71,8 +71,10 @@ def load_model(
         load_weights(model, path=checkpoint, checkpoint=contents)
     model.cfg = cfg
     model.mount = _training_mount(cfg, contents=contents, path=checkpoint)
+    # A checkpoint without settings is from an earlier version, which did not record whether the
+    # training data had vehicle signals (CAN bus).
     model.without_signals = False
-    if contents is not None and contents.settings is not None:  # older files do not record signals
+    if contents is not None and contents.settings is not None:
         model.without_signals = not contents.can_bus
     model.training_dataset = _training_dataset(contents, name=checkpoint)
     model.rig = {} if contents is None else trained_rig(contents)
@@ -119,7 +121,8 @@ def _training_dataset(contents: Checkpoint | None, name: object) -> str:
     if contents is None:
         return ""
     model = named_models().get(Path(str(name)).name.removesuffix(".pth"))
-    default = "minicity" if model is not None and not model.address else ""
+    is_shipped = model is not None and not model.address  # others have a download address
+    default = "minicity" if is_shipped else ""
     return str(contents.dataset_meta.get("dataset", default))
 
 
@@ -160,7 +163,7 @@ def _training_mount(cfg: Config, contents: Checkpoint | None, path: object) -> M
     try:
         height = None if height is None else _check_height(height)
         matrix = None if matrix is None else _check_mount(matrix)
-    except (TypeError, ValueError, OverflowError) as error:  # also of values that are no numbers
+    except (TypeError, ValueError, OverflowError) as error:  # the values may be no numbers
         raise InputError(
             f"{path} was not loaded: the place of its frame in the vehicle is impossible ({error})."
         ) from error

@@ -321,7 +321,8 @@ class VectorizedMapDataset(BaseDataset):
 
             * ``images``, ``lidar_points``, ``lidar_sweeps`` and ``timestamp``, as in mmdet3d's
               multi-view pipelines;
-            * the keys of the packed metainfo, and ``dim``;
+            * the keys that become the metainfo of the packed sample, and ``dim``. In names such as
+              ``lidar2global``, ``lidar`` is the annotation frame, as in mmdet3d;
             * ``map_instances``: the elements at full resolution, with ``dim`` coordinates per point
               in metres;
             * ``map_heights``: the heights of the n points of each element in metres, (n,), or None
@@ -383,7 +384,10 @@ class VectorizedMapDataset(BaseDataset):
         return bool(self.annotations.meta.options.get("poses", True))
 
     def _vehicle_signals(self, sample: MapSample, row: int) -> np.ndarray:
-        """Return the vehicle signals of a sample without history, zero if unknown. (18,)"""
+        """Return the vehicle signals of a sample, zero if unknown. (18,)
+
+        Signals that depend on an earlier frame are zero, too (`without_history`).
+        """
         if self.can_bus_in_memory is not None:
             return without_history(self.can_bus_in_memory)
         if self._pose_only_signals:
@@ -433,7 +437,10 @@ class VectorizedMapDataset(BaseDataset):
         return self._pose_only_signals or self.sample(0).can_bus is not None
 
     def _images(self, sample: MapSample, entry: dict[str, int]) -> dict[str, dict[str, Any]]:
-        """Return path, size and calibration by camera, with the paths of ``image_row``."""
+        """Return path, size and calibration of the images, by camera.
+
+        Paths and sizes are from the sample at ``image_row``, calibration is from ``sample``.
+        """
         cameras = {camera.name: camera for camera in sample.cameras}
         image_cameras = cameras
         if entry["image_row"] != entry["row"]:
@@ -464,7 +471,8 @@ class VectorizedMapDataset(BaseDataset):
         """Return LiDAR paths and transforms in the format of mmdet3d's point transforms."""
         sweeps = []
         for sweep in lidar.sweeps:
-            # mmdet3d computes points @ R - t with R and t of "lidar2sensor"
+            # mmdet3d computes points @ R - t with R and t of "lidar2sensor". For this reason, the
+            # rotation is transposed and the translation negated.
             rotation = sweep.frame_from_lidar[:3, :3]
             shift = sweep.frame_from_lidar[:3, 3]
             path = str(Path(self.data_root, sweep.path))

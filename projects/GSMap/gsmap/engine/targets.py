@@ -137,7 +137,10 @@ def needed_targets(cfg: Config) -> dict[str, Any]:
 
 
 def _class_with_targets(kind: Any) -> type[NeedsTargets]:
-    """Return the class of a part if the class declares its targets, otherwise `NeedsTargets`."""
+    """Return the class of a part if it inherits from `NeedsTargets`, otherwise `NeedsTargets`.
+
+    The base class `NeedsTargets` itself names no transforms and has no target settings.
+    """
     part_class = class_of_type(kind)
     if part_class is not None and issubclass(part_class, NeedsTargets):
         return part_class

@@ -74,8 +74,8 @@ class GaussianMetric(BaseMetric):
         figures = {}
         for label in set(truth["labels"].tolist()) | set(labels.tolist()):
             is_class = labels == label
-            gts = np.flatnonzero(truth["labels"] == label)
-            lines = [truth["polylines"][k] for k in gts]
+            gt_index = np.flatnonzero(truth["labels"] == label)
+            lines = [truth["polylines"][k] for k in gt_index]
             iou = self._matched_iou(masks[is_class], lines=lines, grid=grid)
             sizes = extents[is_class].flatten(start_dim=0, end_dim=1).numpy()
             figures[label] = (iou, sizes)

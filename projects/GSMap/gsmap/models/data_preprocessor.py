@@ -95,11 +95,11 @@ def run_image_steps(images: Tensor, steps: Sequence[Sequence[Any]]) -> Tensor:
         return images
     batch_shape = images.shape[:2]
     batch_steps = _join_steps(steps)
-    if batch_steps is None:
+    if batch_steps is None:  # the samples have different steps and are processed one by one
         samples = []
         for index, sample_steps in enumerate(steps):
-            image = images[index : index + 1]
-            samples.append(run_image_steps(image, steps=[sample_steps]))
+            sample_images = images[index : index + 1]  # (1, V, 3, H, W)
+            samples.append(run_image_steps(sample_images, steps=[sample_steps]))
         return torch.cat(samples)
     images = images.flatten(start_dim=0, end_dim=1)
     for step in batch_steps:

@@ -171,9 +171,9 @@ def _add_problems(summary: ConversionSummary, log_id: str, result: LogSamples) -
     """Count the samples, map elements and polygons of a log that are left out."""
     for reason, count in result.left_out.items():
         summary.add_problem(f"sample left out: {reason}", log_id, count=count)
-    for reason, numbers in result.elements.items():
-        for number in numbers:
-            summary.add_problem(reason.rstrip("."), f"{number} of {log_id}")
+    for reason, element_ids in result.elements.items():
+        for element_id in element_ids:
+            summary.add_problem(reason.rstrip("."), f"{element_id} of {log_id}")
     for kind, count in result.invalid.items():
         reason = f"invalid polygon among the {kind} left out"
         summary.add_problem(reason, log_id, count=count)
@@ -207,7 +207,7 @@ def _meta(options: Argoverse2Options, log_dirs: Iterable[Path], identity: str) -
     Args:
         options: Options of the conversion.
         log_dirs: Folders of all logs of the split.
-        identity: Name and digest of the split list.
+        identity: Name and digest of the split list, or ``OFFICIAL`` without a list.
     """
     sizes = {}
     for log_dir in log_dirs:

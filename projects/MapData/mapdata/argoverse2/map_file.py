@@ -76,7 +76,7 @@ def read_map_file(path: Path) -> tuple[ArgoverseStaticMap, dict[str, list[str]]]
 
 
 def _check_lines(record: Any, min_points: dict[str, int]) -> None:
-    """Raise a ``ValueError`` if a line of an element has too few points, or one is not finite."""
+    """Raise a ``ValueError`` if a line has too few points, or a coordinate that is not finite."""
     for key, least in min_points.items():
         points = record[key]
         if len(points) < least:

@@ -345,7 +345,7 @@ def _sample(
 def _cameras(
     log: Argoverse2Log, timestamp_ns: int, city_from_ego: np.ndarray, options: Argoverse2Options
 ) -> list[CameraRecord]:
-    """List the image of each calibrated camera that is closest in time.
+    """List the images that are closest in time, one for each calibrated camera.
 
     The transforms to the cameras include the motion of the vehicle from the time of the sample to
     the time of the image. Only samples at rows of the pose table may lack an image of a camera.

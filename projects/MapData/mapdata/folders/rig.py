@@ -40,9 +40,9 @@ class RigCamera:
         size_px: Width and height of the images.
         distortion: Distortion coefficients in OpenCV's order; empty for a pinhole camera. (n,)
         model: Distortion model, as ROS names it.
-        trained: Width, height, fx, fy, cx and cy of the camera that a model was trained on. If
-            this camera is distorted, its images are rectified to that camera, scaled to their size.
-            None rectifies them to ``intrinsics``.
+        trained: Width, height, fx, fy, cx and cy of the camera that a model was trained on. Images
+            of a distorted camera are rectified to these intrinsics, scaled to the size of the
+            images. None rectifies them to ``intrinsics``.
 
     Raises:
         ValueError: If the size is not positive, or images cannot be rectified with such

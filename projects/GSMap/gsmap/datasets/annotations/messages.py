@@ -40,7 +40,7 @@ def read_messages(
 
     Raises:
         ValueError: If the content does not begin or end like an Arrow file, or has a batch without
-            rows that is not a seal. The caller adds the name of the file to the message.
+            rows that is not a seal. The caller adds the name of the file to the error.
     """
     size = content.size
     if size < len(_START) + _TAIL_BYTES or content[: len(_START)].to_pybytes() != _START:

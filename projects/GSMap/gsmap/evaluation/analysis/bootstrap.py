@@ -162,8 +162,8 @@ def _aps(
         hit_rows: Indices of the predictions that match, for one threshold after the other. (H,)
         ends: End of each threshold in ``hit_rows``. (T,)
         scene: Scene of each prediction. (N,)
-        scene_copies: Number of copies of each scene. (B, S)
-        gts: Number of ground truths of each scene. (S,)
+        scene_copies: Number of copies of each scene. (B, scenes)
+        gts: Number of ground truths of each scene. (scenes,)
         interpolated: Whether AP is the mean at 101 recalls; the area otherwise.
 
     Returns:
@@ -199,8 +199,8 @@ def resampled_aps(
     Args:
         hits: Whether each prediction matches, in descending order of score. (N, T)
         scene: Scene of each prediction. (N,)
-        scene_copies: Number of copies of each scene. (B, S)
-        gts: Number of ground truths of each scene. (S,)
+        scene_copies: Number of copies of each scene. (B, scenes)
+        gts: Number of ground truths of each scene. (scenes,)
         interpolated: Whether AP is the mean at 101 recalls; the area otherwise.
 
     Returns:
@@ -251,7 +251,8 @@ def resampled_figures(report: MetricReport, resamples: Weights) -> dict[str, Flo
             )
         class_aps[name] = aps
         if report.by_distance and not report.sample_aps:
-            aps = np.nan_to_num(aps)  # AP_chamfer of an absent class is 0
+            # AP_chamfer of an absent class is 0, but does not count in the mean over the classes.
+            aps = np.nan_to_num(aps)
         for t, threshold in enumerate(ranked.thresholds):
             figures[f"{name}/AP@{threshold}"] = aps[:, t]
         figures[f"{name}/AP"] = aps.mean(axis=1)

@@ -77,7 +77,7 @@ class Heights(Metric):
             errors[index, 0] = pred[:, 2] - gt[nearest, 2]
             errors[index, 1] = distance.min(axis=1)
         # Columns of the table from which `reports` computes the means.
-        return SampleValues(token, {"labels": matches.labels[rows], "apart": errors})
+        return SampleValues(token, {"labels": matches.labels[rows], "errors": errors})
 
     def _resample(self, elements: MapElements) -> FloatArray:
         """Resample the lines of one side in space. (N, P, 3)"""
@@ -96,7 +96,7 @@ class Heights(Metric):
             table: Values of all samples.
         """
         labels = np.concatenate(table.column("labels"))
-        errors = np.concatenate(table.column("apart"))  # (matches, 2, P)
+        errors = np.concatenate(table.column("errors"))  # (matches, 2, P)
         figures: dict[str, float] = {}
         for label, name in enumerate(self.classes):
             is_class = labels == label

@@ -1,4 +1,8 @@
-"""Decoder of map elements: layers with attention among queries and to the BEV features."""
+"""Decoder of map elements: layers with attention among queries and to the BEV features.
+
+A reference is the geometry of a point that a query predicts and that each layer refines: D numbers,
+which are the coordinates of the point or also the entries of a Gaussian.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,7 +22,7 @@ Refine = Callable[[int, Tensor, Tensor], Tensor]  # (layer, point states, refere
 
 
 class Guidance(nn.Module):
-    """Base class of the conditioning of decoder layers on the references of their queries."""
+    """Base class of modules that condition a decoder layer on the references of the queries."""
 
     def position(self, query_pos: Tensor, reference: Tensor) -> Tensor:
         """Add embeddings of references to the positional queries.
@@ -64,7 +68,7 @@ class Queries(NamedTuple):
 class Decoded:
     """Output of a decoder layer for a batch.
 
-    Decoders with further outputs have a subclass, whose fields have the leading dimensions (B, N).
+    Decoders with further outputs return a subclass. All fields have the leading dimensions (B, N).
 
     Args:
         point_states: States of the points, from which references are refined. (B, N, P, C)
@@ -215,7 +219,9 @@ class MapDecoder(BaseModule):
 
     @classmethod
     def reference_settings(cls, num_points: int) -> dict[str, Any]:
-        """Settings of the reference that follow from the number of points of a state.
+        """Settings of the reference that depend on the decoder. This class has none.
+
+        A decoder in which the state of an instance refines all P points passes P, for example.
 
         Args:
             num_points: Points per instance P.

@@ -33,13 +33,17 @@ class LSSEncoder(CameraEncoder):
         depth_range: ``(low, high, step)`` of the depth bins in metres.
         camera_aware: Use the depth net with camera parameters. Otherwise one convolution,
             as in the BEVPool variant of MapTR.
-        aspp_channels: Channels of each branch of the pyramid of the camera-aware depth head.
+        aspp_channels: Channels of each branch of the spatial pyramid (ASPP) in the camera-aware
+            depth net.
+        init_cfg: Initialisation config of mmengine.
 
     Raises:
         ValueError: If ``depth_range`` contains no bin.
     """
 
-    fixed_sizes = False  # whether points are scattered into cells instead of sorted by cell
+    # Whether the sizes of tensors must not depend on values, as in a CUDA graph. Points are then
+    # scattered into cells instead of sorted by cell.
+    fixed_sizes = False
 
     def __init__(
         self,

@@ -27,6 +27,8 @@ class MovingPillars:
 
     Attributes:
         heights: Current heights, [0, 1] over the range, not clipped. (B, Q, Z), initially (Z,)
+        feet: Projections of the argument ``feet``, as homogeneous image points. (B, V, Q, 4)
+        upwards: Change of a homogeneous image point per metre of height. (B, V, 1, 1, 4)
     """
 
     def __init__(
@@ -44,9 +46,7 @@ class MovingPillars:
         self.img_shape = img_shape
         matrices = img_from_frame.float()
         with torch.autocast(feet.device.type, enabled=False):
-            # Homogeneous image points of the cell centres at z = 0. (B, V, Q, 4)
             self.feet = feet @ matrices.transpose(-1, -2)
-        # Change of a homogeneous image point per metre of height. (B, V, 1, 1, 4)
         self.upwards = matrices[:, :, None, None, :, 2]
 
     def move(self, offsets_m: Tensor, accumulate: bool) -> PillarProjection:
@@ -77,8 +77,10 @@ class HeightKernelAttention(GeometryKernelAttention):
         kernel_size: Rows and columns of the kernel.
         accumulate_heights: Start from the heights of the previous layer, as in the released code.
             Otherwise start from the evenly spaced heights.
-        released_cells: As in `GeometryKernelAttention`.
-        equal_weights: As in `GeometryKernelAttention`; True in the released code.
+        released_cells: Use the visible cells of the first sample of the batch for all samples
+            (`GeometryKernelAttention`).
+        equal_weights: Initialise to equal weights over the kernel (`GeometryKernelAttention`), as
+            in the released code.
     """
 
     def __init__(

@@ -26,7 +26,7 @@ class QueryMaskLoss(MapLoss):
     Args:
         loss_weight: Weight of the cross-entropy.
         dice_weight: Weight of the dice loss.
-        flags: Flags of `MapLoss`.
+        flags: Flags ``last_layer_only`` and ``first_group_only`` of `MapLoss`.
     """
 
     name = "ins"

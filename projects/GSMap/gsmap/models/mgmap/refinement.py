@@ -116,7 +116,10 @@ class _HalfAttention(nn.TransformerDecoderLayer):
 
 
 class PatchRefinement(BaseModule):
-    """Refinement of point states, which attend to the patches around the points (MGMap).
+    """Refinement of point states by the patches around the points (MGMap).
+
+    The features of the patches attend to one another and to the states. Then the states are fused
+    with them.
 
     Args:
         embed_dims: Channels C of the patches and of the corrected states.

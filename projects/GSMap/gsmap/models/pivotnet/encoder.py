@@ -216,7 +216,7 @@ class PivotBEVEncoder(CameraEncoder):
         pixels = []
         for project, level in zip(self.input_proj, levels, strict=True):
             pixels.append(project(level).flatten(2))
-        tokens = torch.cat(pixels, dim=2).transpose(1, 2)  # (B, S, C)
+        tokens = torch.cat(pixels, dim=2).transpose(1, 2)  # (B, pixels of all levels, C)
         position = torch.cat(list(self.source_pos.parameters()))
         tokens = tokens + position  # As in the released code, values have the position, too.
         reference = centres(self.shapes, position.device).expand(len(tokens), -1, -1)

@@ -1,7 +1,8 @@
 """Mapping between the state keys of the released PivotNet and of this project.
 
 `rules_of` takes the common prefix of released keys, the common prefix of the keys here, and a text.
-Each word of the text continues both prefixes: ``released=here``, or one name for both.
+Each word of the text continues both prefixes: ``released=here``, or one name for both. `mlps` takes
+the prefixes of a multilayer perceptron, in the release and here.
 """
 
 import torch
@@ -57,8 +58,9 @@ PIVOTNET = KeyMap(
         BEV + "image_order": torch.arange(6),
         "post_processor.criterion.collinear_pt_weight": torch.tensor((0.2, 1.0)),
     },
+    # Pair of keys (released, here) by which a checkpoint of PivotNet is recognised.
     markers=((LINE_DECODER + "query_feat", "map_head.decoder.query.weight"),),
-    upstream_prefix=LINE_DECODER,
+    upstream_prefix=LINE_DECODER,  # only released checkpoints have keys with this prefix
 )
 
 KEY_MAPS = (PIVOTNET,)

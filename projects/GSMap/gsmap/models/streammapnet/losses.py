@@ -20,7 +20,7 @@ class SmoothPointsLoss(MapLoss):
     Args:
         loss_weight: Weight of the loss.
         beta: Distance in [0, 1] over the map below which the loss is quadratic, > 0.
-        flags: Flags of `MapLoss`.
+        flags: Flags ``last_layer_only`` and ``first_group_only`` of `MapLoss`.
     """
 
     name = "pts"

@@ -87,7 +87,7 @@ class KeyPointLayer(nn.Module):
         attention_output, _ = self.self_attn(query, query, value, need_weights=False)
         states = states + self.dropout(attention_output)
         states = states + self.cross_attn(self.norms[1](states) + pos, reference, context)
-        return self.ffn(self.norms[2](states), states)
+        return self.ffn(self.norms[2](states), states)  # `states` is the residual
 
 
 @dataclass(frozen=True)

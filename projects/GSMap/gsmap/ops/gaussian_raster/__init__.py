@@ -12,6 +12,7 @@ from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32
 from gsmap.utils.errors import InputError, InputTypeError
 
+# Arguments of the operators. `frame` is the position and the pixel size of the raster.
 _ARGUMENTS = "Tensor gaussians, float[] frame, int height, int width"
 
 
@@ -20,6 +21,7 @@ def _masks_shape(gaussians: Tensor, frame: list[float], height: int, width: int)
     return len(gaussians), height, width
 
 
+# Only the first argument of both operators has a gradient (`differentiable=1`).
 _render = fused_operator(
     "gaussian_raster.render_gaussians", _ARGUMENTS, shape=_masks_shape, differentiable=1
 )
@@ -68,7 +70,7 @@ def render_gaussians(
         flat = gaussians.reshape(math.prod(batch_shape), means.shape[-2], 5)
         # Corner of the raster with the smallest x and y, and the sides of a pixel, in metres.
         frame = [grid.x_range[0], grid.y_range[0], *grid.pixel_size_m]
-        # The second Triton kernel replaces the first one if the user has enabled it.
+        # If the user has enabled the kernel with one warp per tile, it replaces the other one.
         in_warps = backend == "triton" and "render_gaussians_in_warps" in backends.AUTO_KERNELS
         render = _render_in_warps if in_warps else _render
         masks = render(flat, frame, height=grid.height, width=grid.width, backend=backend)

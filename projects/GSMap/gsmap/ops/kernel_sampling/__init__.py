@@ -19,7 +19,7 @@ _sample_kernels = fused_operator(
 
 def has_kernel(value: Tensor) -> bool:
     """Whether ``backend="auto"`` of `sample_kernels` selects the Triton kernel for a map."""
-    like = at_least_float32(value[:0])
+    like = at_least_float32(value[:0])  # without entries: only the device and the type count
     return choose_backend("auto", like, fused=("triton",), kernel="sample_kernels") == "triton"
 
 
