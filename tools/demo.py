@@ -378,7 +378,7 @@ def main() -> None:
     for name in args.models:
         shipped += shipped_steps(name, folder, budget)
     trained = [*data_steps(folder, budget, "train"), prior_step(folder, budget)]
-    if "MapTR" not in args.models:  # other models are trained on from it, so the table has it
+    if "MapTR" not in args.models:  # other models start from it, so the table has it
         trained += shipped_steps("MapTR", folder, budget)
     for training in runs:
         trained += training_steps(training, folder, budget)

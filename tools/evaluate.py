@@ -80,9 +80,9 @@ class TruthSettings(NamedTuple):
 
 
 def json_settings(path: Path) -> TruthSettings:
-    """Settings of ground truth in JSON.
+    """Settings of ground truth in JSON, read from the entry ``meta`` of the file.
 
-    They are read from its ``meta``. A missing setting has the value for nuScenes.
+    A missing setting has the value for nuScenes.
 
     Args:
         path: Ground truth, such as ``create_data.py export`` writes it.

@@ -198,7 +198,7 @@ class _Parser:
                 parser.Parse(b"", True)
             except (expat.ExpatError, ValueError, LookupError) as error:
                 # A LookupError is raised for an unknown encoding.
-                if isinstance(error, InputError):  # of `_error`, which already has the reason
+                if isinstance(error, InputError):  # a ValueError of `_error`, which has the reason
                     raise
                 advice = fetch_advice(start[:200], otherwise="give a Lanelet2 map in OSM XML")
                 raise InputError(f"{self._path} is no valid XML ({error}): {advice}.") from error

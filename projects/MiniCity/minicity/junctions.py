@@ -57,7 +57,8 @@ def mouth(road: Road, at_start: bool) -> Array:
     """
     end = 0 if at_start else -1
     points = np.stack([road.line(offset_m)[end] for offset_m in road.section.all_offsets])
-    # Offsets go from right to left along the centre line, which enters the junction at its end.
+    # Offsets go from right to left for a driver in the direction of the centre line. At the end of
+    # the road this driver enters the junction, so the order is reversed for a driver who leaves it.
     return points if at_start else points[::-1]
 
 
@@ -85,7 +86,7 @@ def make_junction(node: int, arms: list[tuple[int, bool]], roads: list[Road]) ->
     for i in range(len(arms)):
         j = (i + 1) % len(arms)
         # The corner leads from the left kerb of road i, into the junction, and to the right kerb of
-        # the next road.
+        # the next road. The sharper the turn, the longer are the tangents at its ends (`pull`).
         turn_rad = float(np.arccos(np.clip(-outward[i] @ outward[j], -1, 1)))
         corner = hermite(
             start=mouths[i][-1],

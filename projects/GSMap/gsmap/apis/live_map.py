@@ -74,9 +74,9 @@ class LiveMap:
             metres, by name or as a list. (4, 4) each
         frame: ``vehicle`` (x ahead, y left, on the road below the rear axle), or an annotation
             frame: ``lidar`` (x right, y ahead, at a roof LiDAR) or ``ego`` (x ahead, y left, at the
-            rear axle). By default the frame of the config. If it is the frame that the model was
-            trained in, its pose on the vehicle is taken from the training data, otherwise from
-            nuScenes (``lidar``) or Argoverse 2 (``ego``).
+            rear axle). By default the frame of the config. The pose of an annotation frame on the
+            vehicle is taken from the training data if the model was trained in this frame, and
+            otherwise from nuScenes (``lidar``) or Argoverse 2 (``ego``).
         allow_missing_cameras: Whether cameras of the model may be absent.
         prior: Map of earlier drives, for a model that reads a prior.
         update_prior: Write each frame to ``prior`` after it is predicted.
@@ -173,8 +173,9 @@ class LiveMap:
         has_pose = at is not None
         if self._priors and not has_pose:
             raise InputError("a frame reads the prior at its pose: give it at=Frame(...).")
-        is_pose_of_prior = bool(self._priors) and not has_stream  # then `at` needs no stream
-        if has_stream != has_pose and not is_pose_of_prior:
+        # `at` and `stream` belong together, but a model that reads the prior may have `at` alone.
+        allows_pose_alone = bool(self._priors) and not has_stream
+        if has_stream != has_pose and not allows_pose_alone:
             raise InputError(
                 "a frame that continues a stream needs both at=Frame(...) and stream=..., got "
                 f"at={at} and stream={stream}."
@@ -227,16 +228,16 @@ class LiveMap:
                 self._logged_warnings.add(line)
         model_cameras = self._config.get("cameras") or pixels
         unknown = set(pixels) - set(model_cameras)
-        # If the model has no camera with such a name, the cameras are assigned to the cameras of
-        # the model by their directions.
+        # If the model has none of the given names, the cameras are assigned to the cameras of the
+        # model by their directions.
         if unknown and unknown != set(pixels):
             raise InputError(
                 f"the model has the cameras {list(self._config.cameras)}, but not "
                 f"{sorted(unknown)}: name all cameras as the model does, or none of them."
             )
         dataset = self._inferencer.dataset(source)
-        # The inferencer has written a temporary annotation file and the data set has read it. It is
-        # removed now, because each change of the image sizes writes another one.
+        # The inferencer has written a temporary annotation file and the data set has read it. The
+        # file is removed now, because each change of the image sizes writes another one.
         Path(dataset.ann_file).unlink()
         if self._frame == VEHICLE:
             ground_from_calibration = np.eye(4)

@@ -99,7 +99,7 @@ class StreamTrainSampler(Sampler[int]):
             the code that introduced this training. The scenes then switch at different times:
             after 1.6 times ``single_frame_iters`` iterations, half of the samples come from
             pieces.
-        seed: Seed of the random numbers, equal on all ranks; None for 0.
+        seed: Seed of the random numbers, equal on all ranks. None is the same as 0.
 
     Raises:
         TypeError: If the data set is not a `VectorizedMapDataset`.

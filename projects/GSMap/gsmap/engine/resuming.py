@@ -84,7 +84,7 @@ def check_optimizer_state(state: Mapping[str, Any], optimizer: Optimizer, path: 
         ValueError: If a setting has another type than in the run, or if an entry is not finite,
             or has neither a single value nor the shape of its parameter.
     """
-    # Groups or parameters of another number are left to torch, which refuses them on loading.
+    # If the numbers of groups or parameters differ, torch refuses the state when it loads it.
     for group, run_group in zip(state["param_groups"], optimizer.param_groups, strict=False):
         for name in run_group.keys() & group.keys() - {"params"}:
             if not _is_compatible(group[name], reference=run_group[name]):

@@ -81,8 +81,9 @@ def reason(error: ChildFailedError) -> tuple[str, int]:
 if __name__ == "__main__":
     for part in ("agent.server.api", "multiprocessing.api"):  # torch sets a level for each logger
         logging.getLogger(f"torch.distributed.elastic.{part}").setLevel(logging.CRITICAL)
-    os.environ[LAUNCHER] = str(os.getpid())
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, END_SIGNALS)  # the ranks inherit the mask
+    os.environ[LAUNCHER] = str(os.getpid())  # the ranks end when the process with this ID ends
+    # The caller may have blocked these signals, and the ranks inherit the mask.
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, END_SIGNALS)
     try:
         main()
     except Exception as error:

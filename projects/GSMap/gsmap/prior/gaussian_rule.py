@@ -11,14 +11,15 @@ class GaussianRule:
 
     Args:
         spacing_m: Distance of new Gaussians along a line, in [0.2, 5] metres. The standard
-            deviation of a Gaussian along its line is half of it.
+            deviation of a Gaussian along its line is half of this distance.
         sigma_m: Standard deviation across the line for predictions that have no Gaussians, in
             [0.01, 5] metres.
         least_sigma_m: Smallest standard deviation of a Gaussian across its line, in [0.001, 1]
             metres, which covers the errors that all frames share.
         line_sigma_m: Standard deviation of a drawn line across its direction, in [0.05, 2] metres.
-        decay: Factor of the older hits and misses, and of the inverse older variances, each time
-            that a frame has the Gaussian in view, in [0.5, 1].
+        decay: Factor in [0.5, 1]. It multiplies the older hits and misses each time that a frame
+            has the Gaussian in view, and the inverse of the older variance across its line each
+            time that a line measures it.
         prior_count: Pseudo-count of misses, in [0.01, 100].
         least_value: Smallest value of a drawn Gaussian, in [0, 1]; the value is hits / (hits +
             misses + ``prior_count``).

@@ -48,7 +48,7 @@ class Measurements(NamedTuple):
 
     Attributes:
         is_found: Whether a line crosses the normal of the Gaussian within reach. (N,)
-        distances: Distance to it along the normal in metres, positive on the left. (N,)
+        distances: Distance to this line along the normal in metres, positive on the left. (N,)
         variances: Variance of the distance in square metres. (N,)
         turns: Angle from the Gaussian to the line, in radians within 30 degrees. (N,)
         scores: Score of the line, in [0, 1]; 0 without a line. (N,)
@@ -238,7 +238,8 @@ def fuse_across(
     A line measures the position across it alone: its information is :math:`n n^T / \sigma_m^2` with
     the normal n. The variance across becomes :math:`1 / (\lambda / \sigma^2 + 1 / \sigma_m^2)` with
     the decay :math:`\lambda`, and the centre moves by the gain
-    :math:`\sigma_{new}^2 / \sigma_m^2` times the distance.
+    :math:`\sigma_{new}^2 / \sigma_m^2` times the distance. The least variance limits only the new
+    variance, not the gain. A Gaussian without a measurement does not change.
 
     Args:
         variances: Variances across the lines, in square metres. (N,)

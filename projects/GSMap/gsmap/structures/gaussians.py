@@ -223,7 +223,7 @@ class GaussianSpace:
         return _cos_and_sin(theta, factor=2.0, shift_rad=2 * self.heading_rad)
 
     def describe(self, reference: Tensor) -> Tensor:
-        """Describe Gaussians by features of unit size, equal for theta and theta + pi.
+        """Describe Gaussians by features of about size 1, which are equal for theta and theta + pi.
 
         Args:
             reference: References of the decoder. (..., 5 or more)

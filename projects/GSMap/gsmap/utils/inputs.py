@@ -13,7 +13,7 @@ from gsmap.utils.errors import InputError, WorkError
 _Identity = tuple[int, int, int]  # device, inode and modification time of a file
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 _SYSTEM_FOLDERS = ("/dev/", "/proc/", "/sys/")  # pipes and devices there may be read
-_MARKED_BYTES = 1 << 16  # at the start and at the end of a file, in which its mark is searched
+_MARKED_BYTES = 1 << 16  # length of the start and of the end of a file that `has_mark` searches
 
 
 class InputReplacedError(WorkError):
@@ -39,7 +39,11 @@ def watch_files() -> None:
 
 @contextmanager
 def protect_inputs() -> Iterator[None]:
-    """Context in which overwriting an input (`declare_files`) or reading a pipe is an error."""
+    """Context in which overwriting an input or reading a pipe is an error.
+
+    `declare_files` names the inputs. The writers of `gsmap.utils.files` check them
+    (`require_no_input`), and an audit hook checks each file that is read.
+    """
     watch_files()
     try:
         yield
@@ -154,12 +158,13 @@ def has_mark(path: Path, mark: bytes) -> bool:
 
 
 def require_own_file(path: Path, mark: bytes) -> None:
-    """Require that a file whose name a command chooses is new, or was written by the command.
+    """Require that no other program's file is at a path at which a command writes.
 
-    A link may be there: `atomic_write` replaces it, and its target does not change.
+    The command may replace a file that an earlier run of it has written. It may also replace a
+    link: `atomic_write` replaces the link itself, and the target of the link does not change.
 
     Args:
-        path: Path of the file, in a folder that the user has named.
+        path: Path of the file. The user has named its folder, and the command its name.
         mark: Bytes at the start or at the end of each such file of the command.
 
     Raises:

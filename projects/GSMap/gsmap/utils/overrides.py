@@ -32,10 +32,11 @@ def declare_overrides(overrides: Mapping[str, Any]) -> None:
 def check_kinds(settings: Any, overrides: Mapping[str, Any], source: str) -> None:
     """Refuse overrides whose kind differs from the kind of the value that they replace.
 
-    A number cannot become a text or a dictionary. A truth value cannot become a text, a dictionary
-    or a list. A list cannot become a text. A dictionary or a list of dictionaries can only become a
-    dictionary or a list of dictionaries. Every value may become None. The value None, and a value
-    that the settings do not have, may become anything.
+    A number cannot become a dictionary, nor a text other than ``auto``, ``cores`` or ``dynamic``. A
+    truth value cannot become a text, a dictionary or a list. A list cannot become a text. A
+    dictionary or a list of dictionaries can only become a dictionary or a list of dictionaries.
+    Every value may become None. The value None, and a value that the settings do not have, may
+    become anything.
 
     Args:
         settings: Config before the overrides.
@@ -85,7 +86,7 @@ def _wanted_kind(old_value: Any, value: Any) -> str | None:
 
 
 def _is_section(value: Any) -> bool:
-    """Whether a value is a dictionary or an empty list."""
+    """Whether a value is a dictionary, or an empty list, which may stand for a list of them."""
     return isinstance(value, dict) or value in ([], ())
 
 
@@ -118,6 +119,7 @@ def find_override(error: BaseException) -> str | None:
     if not suspects:
         return None
     for number, frame in enumerate(_frames(error)):
+        # The frame that raises the error is searched even if it is of the loop.
         reaches_loop = number > 0 and _is_of_loop(frame)
         if number == _SEARCHED_FRAMES or reaches_loop:
             break
@@ -154,7 +156,7 @@ def describe_override(error: BaseException) -> str | None:
 
 
 def _frames(error: BaseException) -> Iterator[FrameType]:
-    """Yield the frames of the cause of an error, then its frames, each the innermost first."""
+    """Yield frames from innermost to outermost, first of the cause of an error, then of the error."""
     cause = error.__cause__ or error.__context__  # mmengine replaces errors of hooks
     if cause is not None:
         yield from _frames(cause)

@@ -159,11 +159,12 @@ def _sample(info: Mapping[str, Any], root: Path, where: str, allow_missing: bool
     cameras = _cameras(info["images"], root, where=where, allow_missing=allow_missing)
     ego_from_lidar = _matrix(lidar["lidar2ego"], size=4, name=f"{where}: lidar2ego")
     global_from_ego = _matrix(info["ego2global"], size=4, name=f"{where}: ego2global")
+    # A time that is no Unix time is in seconds.
     timestamp_ns = in_nanoseconds(info["timestamp"], usual_unit_ns=10**9)
     record = None
     if lidar.get("lidar_path"):
         path = _locate(lidar["lidar_path"], "LIDAR_TOP", root=root, owner=f"{where}, LiDAR")
-        record = LidarRecord(path.as_posix(), np.eye(4))
+        record = LidarRecord(path.as_posix(), frame_from_lidar=np.eye(4))
     return MapSample(
         token=str(info.get("token", info.get("sample_idx", where))),
         scene=str(info.get("scene_token", "")),

@@ -41,7 +41,7 @@ class Views:
     y_range: tuple[float, float]
 
     def contains(self, sample: int, points: FloatArray) -> BoolArray:
-        """Find the points in the range of a sample. As in a map, heights are ignored.
+        """Find the points in the range of a sample. Heights are ignored.
 
         Args:
             sample: Index of the sample.
@@ -89,7 +89,7 @@ def _level(pose: FloatArray) -> FloatArray:
 def with_map_names(
     changes: Iterable[MapChange], map_names: Sequence[str], where: str
 ) -> list[MapChange]:
-    """Complete changes that do not name their map by the name of the only map.
+    """Give the name of the only map to changes that do not name their map.
 
     Args:
         changes: Changes of a file.
@@ -130,15 +130,15 @@ def changed_samples(changes: Sequence[MapChange], annotations: AnnotationFile) -
         tokens.setdefault(map_name, []).append(token)
     group_of = {}
     for map_name, tokens_of_map in tokens.items():
-        points = _all_samples([change for change in changes if change.map_name == map_name])
-        for index, token in enumerate(tokens_of_map):  # views have the order of the file, too
+        points = _points_along([change for change in changes if change.map_name == map_name])
+        for index, token in enumerate(tokens_of_map):  # in the order of the views
             is_changed = views[map_name].contains(index, points).any()
             group_of[token] = CHANGED if is_changed else UNCHANGED
     return group_of
 
 
-def _all_samples(changes: Sequence[MapChange]) -> FloatArray:
-    """Points at equal steps along the old and new places of changes. (M, 2)"""
+def _points_along(changes: Sequence[MapChange]) -> FloatArray:
+    """Points at equal steps (`MapChange.samples`) along old and new places of changes. (M, 2)"""
     points = [np.zeros((0, 2))]
     for change in changes:
         points.append(change.samples())
@@ -265,7 +265,7 @@ def _targets(truth: Sequence[MapChange], views: Mapping[str, Views]) -> dict[Map
     for change in truth:
         if change.map_name not in views:
             continue
-        points = change.samples()
+        points = change.samples()  # points along the change, not samples of the annotation file
         in_view = points[views[change.map_name].count(points) >= MIN_VIEWS]
         # The points are `STEP_M` apart, so numbers of points stand for lengths.
         least_points = len(points) / 2 if is_closed(change.points) else SHORTEST_M / STEP_M

@@ -1,7 +1,8 @@
 """Average precision of ranked predictions, and the calibration of their scores.
 
-Three definitions of AP are in use: the area under the precision envelope (VOC 2010, MapTR), its
-mean at 101 recalls (COCO), and its mean at ten recalls (methods with AP per sample).
+Three definitions of AP are in use: the area under the precision envelope (VOC 2010, MapTR), the
+mean of the envelope at 101 recalls (COCO), and its mean at ten recalls (methods with AP per
+sample).
 """
 
 import numpy as np

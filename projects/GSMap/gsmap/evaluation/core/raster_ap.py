@@ -60,7 +60,7 @@ class RasterConfig(Metric):
     """
 
     name: ClassVar[str] = "raster"
-    ranks: ClassVar[bool] = True
+    ranks: ClassVar[bool] = True  # predictions are ranked over all samples
     has_curves: ClassVar[bool] = True
 
     classes: tuple[str, ...]
@@ -207,7 +207,7 @@ def match_raster(
 
 
 def _mean(values: Iterable[float]) -> float:
-    """Compute the mean of the values other than ``UNDEFINED``, -1; it is -1 without such values."""
+    """Compute the mean of the values that are not ``UNDEFINED`` (-1); -1 if there are none."""
     defined = [value for value in values if value != UNDEFINED]
     return float(np.mean(defined)) if defined else UNDEFINED
 
@@ -219,6 +219,7 @@ def _class_figures(ranked: ClassDetections, ious: FloatArray) -> dict[str, float
     for limit in RECALL_LIMITS:
         figures[f"AR@{limit}"] = UNDEFINED
         if ranked.num_gts:
+            # `ranked.ranks` counts the predictions of the class in each sample from 0.
             hits = ranked.hits[ranked.ranks < limit].sum(axis=0)  # (T,)
             figures[f"AR@{limit}"] = _mean(hits / ranked.num_gts)  # mean over the thresholds
     figures["mIoU"] = _mean(ious[~np.isnan(ious)])

@@ -45,7 +45,8 @@ class MapCoder:
             detections.
         score_threshold: Detections need a higher score. None keeps all detections.
         unfold_classes: Class indices of lines whose points are reordered to a short path
-            (`shortest_orders`). Losses of masks do not penalise lines that run back and forth.
+            (`shortest_orders`). This is for models that are trained with losses of masks, which do
+            not penalise lines that run back and forth.
 
     Raises:
         ValueError: If ``max_num`` or ``margin_m`` is out of range.
@@ -151,7 +152,7 @@ class MapCoder:
         orders = torch.arange(points.shape[1], device=points.device).repeat(len(points), 1)
         line_orders = shortest_orders(points[is_line].cpu().numpy())
         orders[is_line] = torch.from_numpy(line_orders).to(orders)
-        # (M, 1) and (M, P): point j of detection i is its point ``orders[i, j]``.
+        # (M, 1) and (M, P): the new point j of detection i is its previous point ``orders[i, j]``.
         rows = torch.arange(len(points), device=points.device)[:, None]
         return {name: values[rows, orders] for name, values in fields.items()}
 

@@ -1,4 +1,4 @@
-"""Hooks into the flow of a head.
+"""Hooks into the flow of a head, which are its steps from the initial queries to the losses.
 
 They add queries from previous frames (temporal memory), or queries with known matches (denoising).
 """

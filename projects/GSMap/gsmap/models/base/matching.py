@@ -75,8 +75,8 @@ class MapAssigner:
             The matches, min(N, K * repeats) of each sample in a layer.
 
         Raises:
-            FloatingPointError: If a cost is not finite, or a score of a sample without ground
-                truth.
+            FloatingPointError: If a cost is not finite, or if a score of a sample without ground
+                truth is not finite.
         """
         num_layers = len(predictions.layers)
         num_queries = predictions.scores.shape[1] // num_layers

@@ -11,7 +11,7 @@ from gsmap.models.gsmap.guidance import GaussianGuidance
 
 @MODELS.register_module()
 class GaussianDecoderLayer(MapDecoderLayer):
-    """Decoder layer conditioned on the Gaussians of its queries, with any attention.
+    """Decoder layer conditioned on the Gaussians of its queries, with attention of any class.
 
     Args:
         guide_sampling: Transform sampling offsets by the orientation and size of each Gaussian.
@@ -47,12 +47,12 @@ def add_guidance(decoder: PartConfig) -> PartConfig:
     """
     layer = decoder.get("layer", {})
     kind = class_of(with_defaults(decoder, type=MapDecoder))
-    has_own_layers = False
-    if kind is not None and issubclass(kind, MapDecoder):
-        has_own_layers = kind.layer_class is not MapDecoderLayer
-    # A decoder of `MapDecoderLayer` gets the guided layer class. Layers of another class get the
-    # guidance as their part.
-    if not has_own_layers:
+    has_other_layers = False
+    if kind is not None and issubclass(kind, MapDecoder):  # None for a name that is not registered
+        has_other_layers = kind.layer_class is not MapDecoderLayer
+    # By default the layers are of the guided class. If the decoder has a layer class other than
+    # `MapDecoderLayer`, its layers keep this class and get the guidance as a part.
+    if not has_other_layers:
         return {**decoder, "layer": with_defaults(layer, type=GaussianDecoderLayer)}
     guidance = layer.get("guidance", {})
     if guidance is not None:  # None switches the guidance off

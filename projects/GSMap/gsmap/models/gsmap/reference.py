@@ -42,6 +42,7 @@ class GaussianReference(PointReference, AddsWeights):
 
     space: GaussianSpace
     coder_class = GaussianCoder
+    # Prefixes of weights that a checkpoint may lack: their initial values have no effect.
     neutral_keys: tuple[str, ...] = ("gaussian_init.", "gaussian_branches.")
 
     outputs = ("pts", "scales", "rotations")
@@ -126,7 +127,7 @@ class GaussianReference(PointReference, AddsWeights):
         return torch.cat([transformed[..., :-1], theta], dim=-1)
 
     def errors(self, references: Tensor) -> Gaussians:
-        """Gaussians of the errors of points, here the rendered Gaussians.
+        """Gaussians that describe the errors of points. Here they are the rendered Gaussians.
 
         Args:
             references: References. (..., P, D)

@@ -98,7 +98,10 @@ class HDMapNetHead(DetectionHead):
         return {"pixel_m": settings["pixel_m"], "num_directions": settings["num_directions"]}
 
     def forward(self, bev_outputs: Tensors) -> LineMaps:
-        """Predict maps of all pixels from ``bev_feats``. (B, C, H, W)"""
+        """Predict maps of all pixels from ``bev_feats``. (B, C, H, W)
+
+        Rows of the predicted maps go from right to left, and columns from rear to front.
+        """
         feats = orient_forward(bev_outputs["bev_feats"], self.grid)
         if feats.shape[-2:] != self.map_size:
             feats = resize_map(feats, self.map_size)

@@ -20,8 +20,8 @@ def draw_elements(
 ) -> Tensor:
     """Draw elements softly, one channel per class.
 
-    A pixel at a squared distance D in pixels from a line takes exp(-D / softness); areas are
-    filled. Of several elements of a class, the largest value counts.
+    A pixel with the squared distance D from a line, in squared pixels, takes the value
+    exp(-D / softness). Areas are filled. Of several elements of a class, the largest value counts.
 
     Args:
         points_m: Points of the elements in metres. (n, P, 2)

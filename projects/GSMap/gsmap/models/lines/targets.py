@@ -41,7 +41,8 @@ def orient_line(line: Points, tolerance: float, sort_rings: bool = False) -> Poi
         ring = np.concatenate([ring, ring[:1]])
         u = ring[:, 0]
         v = ring[:, 1]  # increases to the right
-        # The shoelace formula with x = v and y = -u gives twice the area, here > 0 if clockwise.
+        # The shoelace formula gives twice the area, > 0 if a ring is anticlockwise. Here x = v and
+        # y = -u. The minus sign is left out, so the result is > 0 if the ring is clockwise.
         doubled_areas = v[:-1] * u[1:] - v[1:] * u[:-1]
         is_clockwise = doubled_areas.sum() > 0
         return ring if is_clockwise else ring[::-1]
@@ -95,7 +96,7 @@ class FormatLineTargets(BaseTransform):
         pixel_m: Side of a pixel of the masks in metres. Configs set ``mask_pixel_m`` of the head,
             and the head's `target_settings` set it here.
         thickness_px: Width of the lines in the masks in pixels.
-        step_m: Distance of the samples of a line, from which its key points are computed.
+        step_m: Distance in metres of the samples of a line, from which its key points are computed.
         sort_rings: Let rings start at their rearmost vertex and run clockwise. Otherwise they keep
             the annotated order.
 
@@ -120,7 +121,7 @@ class FormatLineTargets(BaseTransform):
             )
 
     def class_setting(self) -> tuple[str, Sequence[int]]:
-        """Name and value of the setting that has a number for each class."""
+        """Name and value of a setting with a number for each class, such as a number of points."""
         raise NotImplementedError
 
     def max_points(self) -> int:

@@ -131,10 +131,12 @@ class MapQRDecoderLayer(MapDecoderLayer):
     ) -> None:
         if embed_dims % 4:
             raise InputError(f"embed_dims must be divisible by 4, got {embed_dims}.")
+        # For the self-attention, an instance query is the query of an instance of one point.
+        self_attn_defaults = {"num_points": 1}
         cross_attn_defaults = {"type": "ScatterGatherAttention", "points_per_instance": num_points}
         super().__init__(
             embed_dims,
-            self_attn={"num_points": 1, **(self_attn or {})},
+            self_attn={**self_attn_defaults, **(self_attn or {})},
             cross_attn={**cross_attn_defaults, **(cross_attn or {})},
             **kwargs,
         )
@@ -163,7 +165,7 @@ class MapQRDecoderLayer(MapDecoderLayer):
         code = sine_code(reference[..., :2], query.shape[-1])
         position = self.position_proj(code)
         frames = None
-        if self.guidance is not None:
+        if self.guidance is not None:  # the layer is conditioned on the Gaussians of the points
             position = self.guidance.position(position, reference)
             frames = self.guidance.frames(reference, bev_feats)
         bev_context = self.cross_attn(

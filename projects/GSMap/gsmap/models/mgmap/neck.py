@@ -92,8 +92,8 @@ class EnhancedNeck(nn.Module):
 
         Returns:
             Fusion of all stages (B, C, H, W), and maps of four levels (B, C, h, w). The first three
-            levels are the outputs of the stages, each with its size. The fourth level is the
-            fusion, resized to the output of the stem, half of (H, W).
+            levels are the outputs of the stages at their sizes. The fourth level is the fusion,
+            resized to the size of the output of the stem, which is half of (H, W).
         """
         stem = self.stem(bev_feats)
         feats = stem

@@ -18,7 +18,7 @@ from gsmap.structures.line_update import nearest_places
 from gsmap.structures.polylines import resample_all
 from gsmap.utils.errors import InputError
 
-_CELL_M = 0.3  # side of the cells of a `PlaceMaps`; elements need none
+_CELL_M = 0.3  # side of the cells of the window of a `PriorModule`; elements need no cells
 
 
 @MODELS.register_module()
@@ -33,13 +33,14 @@ class ElementFusion(PriorModule):
     where m is ``missed_share``. The element replaces its detections, because the mean of many
     frames is more accurate than one frame. All other detections stay as they are. There are no
     weights and there is no training, so any trained model with a `MapHead` can use it. Without a
-    prior, the detections do not change. It is not part of a published method.
+    prior, the detections do not change. This module is not part of a published method.
 
     Args:
         head: Head of the detector, a `MapHead`.
         encoder: BEV encoder of the detector, which is not used.
-        gate_m: Largest distance between a detection and an element that belong together, in metres:
-            the mean distance of the points of each to the other, the larger of both.
+        gate_m: Largest distance between a detection and an element that belong together, in metres.
+            The distance is the larger of two means: the mean distance of the points of the
+            detection to the element, and of the points of the element to the detection.
         missed_share: Share of its confidence that is left to an element without a detection, in
             [0, 1].
 
@@ -68,7 +69,7 @@ class ElementFusion(PriorModule):
         self.missed_share = missed_share
 
     def maps_of(self, priors: Sequence[AnyPrior], update: bool = False) -> GivenMaps:
-        """Maps of a user (`PriorModule.maps_of`).
+        """Maps that `PriorModule.maps_of` makes of the priors of a user, after a check.
 
         Raises:
             ValueError: If a prior is no `ElementPrior`, has other classes, or is to be written.
@@ -91,19 +92,19 @@ class ElementFusion(PriorModule):
             metas: Metainfo of each sample.
 
         Returns:
-            Detections of each sample, highest score first; as they are without a prior.
+            Detections of each sample, highest score first. Without a prior, these are ``results``.
 
         Raises:
             ValueError: If the place of a sample is unknown or has no prior.
         """
-        maps = self._given
+        maps = self._given  # set by `PriorModule.use`; `GivenMaps` are the priors of a user
         if not isinstance(maps, GivenMaps):
             return list(results)
         updated = []
         for detections, meta in zip(results, metas, strict=True):
             place = maps.require_place(Place.of(meta))
             prior = maps.find(place)
-            assert isinstance(prior, ElementPrior)  # by `maps_of`
+            assert isinstance(prior, ElementPrior)  # `maps_of` has checked it
             elements = prior.read_elements(place.pose, self.window)
             updated.append(self._fuse_sample(detections, elements, sigma_m=prior.rule.sigma_m))
         return updated
@@ -116,7 +117,7 @@ class ElementFusion(PriorModule):
         Args:
             detections: Detections of the head.
             elements: Elements of the prior in the frame.
-            sigma_m: Standard deviation of their points across the line, in metres.
+            sigma_m: Standard deviation of the points of elements across their lines, in metres.
         """
         if not len(elements):
             return detections
@@ -133,9 +134,9 @@ class ElementFusion(PriorModule):
         distances = _distances(points, labels=detections.labels_3d, lines=lines, line_labels=labels)
         smallest_m, element_inds = distances.min(1)  # (N,)
         belongs = smallest_m < self.gate_m
-        scores_of_own = torch.where(belongs, detections.scores_3d, 0.0)
+        matched_scores = torch.where(belongs, detections.scores_3d, 0.0)
         best_scores = torch.zeros_like(confidences)
-        best_scores.scatter_reduce_(0, element_inds, scores_of_own, reduce="amax")
+        best_scores.scatter_reduce_(0, element_inds, matched_scores, reduce="amax")
         shares = self.missed_share + (1 - self.missed_share) * best_scores
         scores = 1 - (1 - shares * confidences) * (1 - best_scores)
         fields = {"pts": lines, "labels_3d": labels, "scores_3d": scores}
@@ -162,8 +163,9 @@ def _distances(points: Tensor, labels: Tensor, lines: Tensor, line_labels: Tenso
         line_labels: Classes of the elements. (E,)
 
     Returns:
-        Mean distance of the points of each to the line of the other, the larger of both; infinite
-        between two classes. (N, E)
+        For each pair the larger of two means: the mean distance of the points of the detection to
+        the line of the element, and of the points of the element to the line of the detection.
+        Infinite if the classes differ. (N, E)
     """
     rows, columns = (labels[:, None] == line_labels).nonzero(as_tuple=True)
     to_lines = nearest_places(points[rows], lines[columns]).distances.mean(-1)

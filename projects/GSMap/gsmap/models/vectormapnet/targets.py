@@ -132,7 +132,8 @@ class FormatPolylineTargets(BaseTransform):
             instances.pts = torch.from_numpy(pad_lines(lines_m)).float()
             instances.num_pts = torch.tensor(counts, dtype=torch.int64)
         instances.keypoints = torch.from_numpy((corners * canvas.size).reshape(-1, 4)).float()
-        # Pixel numbers from 0: unlike in `tokens`, no token 0 ends the sequence of four.
+        # Here a token is a pixel number from 0. In `tokens` it is this number plus 1, because there
+        # 0 is the stop token. The four tokens of a box need no stop token.
         instances.keypoint_tokens = torch.from_numpy(corners * canvas.steps).long().flatten(1)
         instances.tokens = stack_rows(tokens).long()
         instances.token_weights = stack_rows(weights).float()

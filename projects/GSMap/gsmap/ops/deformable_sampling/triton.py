@@ -14,7 +14,7 @@ import torch
 import triton
 import triton.language as tl
 
-BLOCK = 512  # values of a program: 16 bytes per thread in float32
+BLOCK = 512  # values of a program: 4 for each of its 128 threads, 16 bytes in float32
 OPTIONS = {"num_warps": 4, "enable_fp_fusion": True}
 
 
@@ -23,8 +23,8 @@ def _locate_sample(locations, weights, sample, valid, height, width):
     """Locate a sample among the centres of the four cells around it.
 
     Returns:
-        Column and row of the upper left cell, distance of the sample from its centre along x and y
-        in cells, and weight of the sample. (ROWS,) each
+        Column and row of the upper left cell, distance of the sample from the centre of this cell
+        along x and y in cells, and weight of the sample. (ROWS,) each
     """
     # The centre of cell 0 has the coordinate 0.5 of a cell.
     x = tl.load(locations + sample * 2, mask=valid, other=0.0) * width - 0.5
@@ -40,8 +40,8 @@ def find_corner(col, row, valid, height, width):
     """Find the flat index of a cell of a map.
 
     Args:
-        col: Column of the cell, a whole number, also outside of the map. (ROWS,)
-        row: Row of the cell. (ROWS,)
+        col: Column of the cell as a whole float; it may lie outside of the map. (ROWS,)
+        row: Row of the cell, in the same form. (ROWS,)
         valid: Whether the sample exists. (ROWS,)
         height: Number of rows of the map.
         width: Number of columns of the map.
@@ -136,8 +136,8 @@ def forward_kernel(
             channel_offsets = pixel_offset[:, None] + channel[None, :]
             mask = inside[:, None] & is_channel[None, :]
             pixel = tl.load(value + channel_offsets, mask=mask, other=0.0).to(tl.float32)
-            # The product passes on a NaN weight of a cell outside of the map, which tl.where would
-            # drop.
+            # A cell outside of the map has the weight 0. A NaN weight remains NaN in this product,
+            # but tl.where would replace it by 0.
             total += pixel * (corner_weight * inside.to(tl.float32))[:, None]
     out_pointers = out + row[:, None] * C + channel[None, :]
     tl.store(out_pointers, total, mask=valid[:, None] & is_channel[None, :])

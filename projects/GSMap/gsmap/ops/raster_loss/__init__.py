@@ -45,10 +45,11 @@ def raster_loss(
       element and of the raster. If small Gaussians lie metres off their line, the gradient makes
       them larger until they reach it, not smaller (`python -m benchmarks masks`).
     * ``"foreground"``: :math:`D_w` is divided by :math:`\sum w R^*`, and D-SSIM by the number of
-      pixels whose window covers part of R*. Both divisors are at least the values of a mask that
-      fills 0.5 % of the raster. If Gaussians lie 2 m off their line, the gradient makes them
+      pixels whose window covers part of R*. Both divisors are at least as large as for a mask
+      that fills 0.5 % of the raster. If Gaussians lie 2 m off their line, the gradient makes them
       smaller.
-    * ``"pixels"``: means over the raster, weighted by w.
+    * ``"pixels"``: :math:`D_w` is the mean over the raster weighted by w, and D-SSIM is the mean
+      without weights.
 
     Only the masks are saved for the backward pass; the other values are computed again.
 

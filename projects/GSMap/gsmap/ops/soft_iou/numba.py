@@ -62,7 +62,8 @@ def pairwise_minima(preds, targets):
     """Sum the minima of each pair of flat float32 masks. (N, pixels), (K, pixels) -> (N, K)"""
     minima = torch.empty(len(preds), len(targets), dtype=torch.float32)
     starts, indices, values = list_pixels(targets.contiguous().numpy())
-    # The work for one prediction is the number of listed pixels. `run_in_threads` decides from this
-    # number whether threads are worth their start.
+    # `run_in_threads` divides the predictions among threads, and gives the kernel their range
+    # (`first`, `last`). The work for one prediction is the number of listed pixels, from which
+    # `run_in_threads` decides whether threads are worth their start.
     run_in_threads(sum_minima, len(indices), preds, starts, indices, values, minima)
     return minima

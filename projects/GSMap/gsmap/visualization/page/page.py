@@ -94,8 +94,8 @@ def page_data(
 
     Args:
         annotations: Annotation file.
-        results: No, one or two result files by their names on the page. Without any, the page has
-            ground truth and cameras alone.
+        results: At most two result files, by their names on the page. If there is none, the page
+            has only ground truth and cameras.
         options: Content of the page.
 
     Returns:
