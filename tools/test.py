@@ -43,7 +43,7 @@ def parse_args() -> argparse.Namespace:
         "--out", type=output_file, metavar="FILE.json", help="write the predictions (MapTR's form)"
     )
     parser.add_argument(
-        "--metrics-out", type=output_file, metavar="FILE.json", help="write the figures"
+        "--metrics-out", type=output_file, metavar="FILE.json", help="write the metrics"
     )
     parser.add_argument("--show-dir", metavar="DIR", help="draw the samples into this folder")
     parser.add_argument(

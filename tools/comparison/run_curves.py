@@ -81,6 +81,7 @@ def _records(path: Path) -> list[dict[str, float]]:
                 if isinstance(value, int | float):
                     scalars[key] = float(value)
             records.append(scalars)
+        # An `InputError` is a ValueError. A number beyond the range of float is an OverflowError.
         except (ValueError, OverflowError) as error:
             if number == len(lines):
                 break
@@ -214,7 +215,7 @@ def plot_runs(runs: Sequence[RunLog]) -> Figure:
 
 
 def plot_series(runs: Sequence[RunLog], keys: Sequence[str]) -> Figure:
-    """Draw logged scalars of training, such as ``at_floor``: a panel each, one colour per run.
+    """Draw logged scalars of training: a panel for each scalar, one colour per run.
 
     Raises:
         ValueError: If no run has logged one of the scalars.
@@ -238,7 +239,7 @@ def plot_precision_recall(reports: Mapping[str, Sequence[MetricReport]]) -> Figu
     """Draw precision over recall at the middle threshold: a row per metric, a panel per class.
 
     Args:
-        reports: Reports of one run of each config, by name.
+        reports: Reports of one run of each config, one per metric, by the name of the config.
     """
     first = next(iter(reports.values()))
     style = MapStyle(tuple(first[0].detections))

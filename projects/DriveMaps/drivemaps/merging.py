@@ -49,7 +49,8 @@ def merge(drive: Drive, config: MergeConfig | None = None) -> MapElements:
         Lines and closed rings in the global frame, with their confidence as scores.
 
     Raises:
-        InputError: If the lines are too long or too close together to be merged in bounded time.
+        InputError: If the lines are too long or too close together to be merged in bounded time
+            (raised by `merge_lines`).
     """
     config = config or MergeConfig()
     drive = _without_duplicates(drive)

@@ -96,13 +96,14 @@ def divider_pieces(road: Road) -> list[tuple[float, float]]:
 
 
 def lane_divider_offsets(road: Road) -> list[float]:
-    """Offsets in metres of the lines between lanes of one direction, without the outer edges."""
+    """Offsets in metres of lines between lanes of one direction, not of its first and last edge."""
     return [*road.forward_edges[1:-1], *road.backward_edges[1:-1]]
 
 
 def divider_offsets(road: Road) -> list[float]:
     """Offsets in metres of all lines of divider paint, the centre line first."""
-    center = [road.shift_m] if road.has_center_line else []  # offset 0 before the shift
+    # The centre line has the offset 0, to which the shift of painted lines is added.
+    center = [road.shift_m] if road.has_center_line else []
     return [*center, *lane_divider_offsets(road)]
 
 
@@ -196,7 +197,10 @@ _ARROW = np.array(
 
 
 def _arrows(road: Road) -> list[Array]:
-    """Arrows in the lanes before a stop line, on roads with several lanes there. Each (7, 2)"""
+    """Arrows in the lanes, 7 m before a stop line. Each (7, 2)
+
+    A direction with one lane, and a road shorter than 40 m, have no arrows.
+    """
     arrows = []
     for stop, edges, sign in (
         (road.stop_forward, road.forward_edges, 1),

@@ -41,12 +41,14 @@ def source_in_memory(
     """Create a source with one sample from images and calibration in memory.
 
     Args:
-        images: BGR images by the name of the camera, from `bgr_by_name`. V x (H, W, 3)
+        images: BGR images by the name of the camera, from `bgr_by_name`. The sample contains their
+            names and sizes, not the images. V x (H, W, 3)
         intrinsics: Pinhole matrices in pixels, by name or in the order of the images. V x (3, 3)
         cam_from_frame: Transforms from ``frame`` to the cameras in metres, by name or in the order
             of the images. V x (4, 4)
         frame: ``vehicle`` (x ahead, y left, on the road below the rear axle), ``lidar`` or ``ego``.
-        mount: Place of the frame in the vehicle; None for the usual place.
+        mount: Place of the frame ``lidar`` or ``ego`` in the vehicle; None for the usual place, and
+            for the frame ``vehicle``.
 
     Raises:
         ValueError: If an array has another shape, a matrix is not a valid calibration, or the

@@ -7,7 +7,8 @@ from torch import Tensor
 
 from gsmap.structures.gaussians import Gaussians, covariances, with_covariances
 
-_SHORT = 1e-9  # square metres; a shorter segment has no direction
+# Smallest divisor, in square metres: a segment of length 0 gives a share of 0 instead of NaN.
+_MIN_SQUARED_LENGTH = 1e-9
 
 
 class LinePlaces(NamedTuple):
@@ -41,7 +42,7 @@ def nearest_places(points: Tensor, lines: Tensor) -> LinePlaces:
     starts = lines[:, :, None, :-1]
     steps = lines.diff(dim=-1)[:, :, None]
     offsets = points[..., None] - starts  # (K, 2, P, Q - 1)
-    shares = (offsets * steps).sum(1) / steps.square().sum(1).clamp(min=_SHORT)
+    shares = (offsets * steps).sum(1) / steps.square().sum(1).clamp(min=_MIN_SQUARED_LENGTH)
     clamped = shares.clamp(0.0, 1.0)
     squared = (offsets - clamped[:, None] * steps).square().sum(1)  # (K, P, Q - 1)
     squares, segments = squared.min(-1)
@@ -128,6 +129,7 @@ def update_from_known_lines(
     toward = covariance @ normal  # Sigma n, (N, P, 2, 1)
     gain = toward / (normal.mT @ (toward + line_covariance @ normal))
     means = now.means + (gain @ (normal.mT @ offset[..., None]))[..., 0]
+    # A covariance has several equivalent rotations. `near` selects the one closest to the old one.
     updated = with_covariances(means, covariance - gain @ toward.mT, near=now.rotations)
     belongs = (smallest_mean < gate_m)[:, None]
     is_updated = belongs & places.beside[pair] & (point_distances < gate_m)  # (N, P)

@@ -43,7 +43,7 @@ def exclude_from_compile(function: Callable[_Params, _Result]) -> Callable[_Para
 def constant(like: Tensor, values: Any, dtype: torch.dtype | None = None) -> Tensor:
     """Create a tensor of numbers that is uploaded once and cached.
 
-    ``like.new_tensor(values)`` waits for a GPU at every call.
+    The simpler ``like.new_tensor(values)`` would wait for a GPU at every call.
 
     Args:
         like: Tensor with the device, and by default the type, of the result.
@@ -218,9 +218,10 @@ def num_depth_bins(depth_range: tuple[float, float, float]) -> int:
 
 
 def tensor_versions(module: nn.Module) -> list[tuple[int, int]]:
-    """Address and version of each tensor of a module, which change with its values.
+    """Address and version of each tensor of a module, to find out whether its values have changed.
 
-    Tensors that were made in inference mode have no version, and get 0.
+    A change in place raises the version of a tensor. Tensors that were made in inference mode have
+    no version, and get 0.
     """
     tensors = [*module.parameters(), *module.buffers()]
     return [(t.data_ptr(), 0 if t.is_inference() else t._version) for t in tensors]
@@ -243,5 +244,5 @@ def matrix_products(in_tf32: bool) -> Iterator[None]:
 
 
 def is_recording(device_type: str) -> bool:
-    """Whether a CUDA graph is recorded now, for work on devices of a type."""
+    """Whether work on a device of this type is being recorded in a CUDA graph."""
     return device_type == "cuda" and torch.cuda.is_current_stream_capturing()

@@ -154,6 +154,7 @@ def plot_uncertainty(vertices: Vertices, classes: Sequence[str], law: str = "nor
             colour = style.colour(label)
             covered = coverage(errors, sigmas, law)
             left.plot(LEVELS, covered, label=title, color=colour, linewidth=1.3)
+            # Entry k - 1 of a curve is the mean error of the k vertices that remain.
             removed = 1 - np.arange(1, len(errors) + 1) / len(errors)
             optimum = sparsification(errors, errors)
             right.plot(removed, optimum, alpha=0.3, color=colour, linewidth=1.3)

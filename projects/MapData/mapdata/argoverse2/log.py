@@ -87,7 +87,7 @@ class Argoverse2Log:
 
     @cached_property
     def city(self) -> str:
-        """Short name of the city, such as ``PIT``; empty without a map file named by its city."""
+        """Short name of the city, such as ``PIT``; empty without a map file with such a name."""
         map_paths = (self.log_dir / "map").glob("log_map_archive_*____*.json")
         path = next(map_paths, None)
         if path is None:

@@ -87,7 +87,8 @@ class Resize:
 
     Args:
         size: Width and height after the step, in pixels.
-        rounded: Whether images with integer values have integer values after the step.
+        rounded: Whether the step on a GPU rounds the values of uint8 images and returns uint8, as
+            OpenCV always does on the host.
         kernel: ``bilinear``, the kernel of OpenCV, which reads four pixels, or ``bicubic``, the
             antialiased kernel of Pillow, whose results are integers.
     """
@@ -163,9 +164,9 @@ class Distortion:
     """Image step of a photometric distortion with separate parameters for each image.
 
     Args:
-        numbers: Parameters of each image, drawn by ``PhotoMetricDistortion3D``: place of the change
-            of contrast, five flags, brightness, contrast, saturation, hue and order of the
-            channels.
+        numbers: Parameters of each image, drawn by ``PhotoMetricDistortion3D``: 1 if the contrast
+            changes before the colours, five flags for the parameters that are used, brightness,
+            contrast, saturation, hue and order of the channels.
     """
 
     numbers: tuple[tuple[Any, ...], ...]
@@ -240,8 +241,8 @@ def distort_images(images: Tensor, numbers: Tensor) -> Tensor:
     angle = torch.where(value == red, hue_near_red, hue_not_near_red)
     angle = torch.where(angle < 0, angle + 360.0, angle) + hue  # degrees
     # Back to BGR:
-    # A channel is value - chroma * max(0, min(k, 4 - k, 1)) with k = (angle / 60 + n) mod 6, where
-    # n is 1 for blue, 3 for green and 5 for red.
+    # A channel is value - chroma * max(0, min(turn, 4 - turn, 1)) with
+    # turn = (angle / 60 + sector) mod 6, where the sector is 1 for blue, 3 for green and 5 for red.
     chroma = value * new_saturation
     channels = []
     for sector in (1.0, 3.0, 5.0):

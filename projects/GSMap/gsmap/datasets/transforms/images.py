@@ -22,7 +22,7 @@ from gsmap.datasets.transforms.image_steps import (
 )
 from gsmap.utils.errors import InputError
 
-# By larger factors, bilinear interpolation between four pixels skips some pixels of the image.
+# If an image shrinks by a larger factor, bilinear interpolation between four pixels skips pixels.
 _MAX_BILINEAR_SHRINKAGE = 2.0
 
 
@@ -222,6 +222,7 @@ class CropImages(BaseTransform):
         height, width = shape_after_steps(results)
         if height <= self.top:
             raise InputError(f"top={self.top} leaves nothing of images of {height} rows.")
+        # A projection gives (u z, v z, z), so the shift of v is multiplied by z.
         matrix = np.eye(4)
         matrix[1, 2] = -self.top
         take_step(results, CropTop(self.top))

@@ -43,8 +43,8 @@ class Quality(nn.Module):
 class DistanceQuality(Quality):
     r"""Quality by the distance of points: :math:`\exp(-s \sum_c \overline{|p_c - t_c|})`.
 
-    The mean is over the points of an element, the sum over coordinates c, both [0, 1] over the map
-    (DAMap).
+    The mean is over the points of an element, and the sum is over the coordinates c. Predictions p
+    and targets t are in [0, 1] over the map (DAMap).
 
     Args:
         scale: Factor s of the distance. DAMap takes the weight of its points loss, 5.

@@ -63,7 +63,7 @@ class ElementMasks:
 
     @property
     def of_points(self) -> bool:
-        """Whether the P points of the ground truth are drawn, in the matched order."""
+        """Whether the P points of the ground truth are drawn instead of its full polylines."""
         return self.source != "full"
 
     @property
@@ -98,7 +98,8 @@ class ElementMasks:
         """References for the rendering of predicted masks; a subclass may stop gradients here.
 
         Args:
-            references: References of the decoder, ``coords`` coordinates first. (M, P, D)
+            references: References of the decoder, whose first ``coords`` entries are the
+                coordinates of a point. (M, P, D)
             labels: Class indices of the matched ground truths. (M,)
             coords: Number of coordinates of a point.
         """

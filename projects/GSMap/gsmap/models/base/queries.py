@@ -18,7 +18,8 @@ class PointTable(nn.Embedding):
 
     Args:
         num_points: Points per instance P.
-        embed_dims: Channels C of a query; an embedding has 2 C channels.
+        embed_dims: Channels C of a query. An embedding has 2 C channels, for the query and its
+            position.
     """
 
     def __init__(self, num_points: int, embed_dims: int) -> None:

@@ -19,7 +19,7 @@ class _AttentionBlock(nn.Module):
         self.norm2 = nn.LayerNorm(embed_dims)
 
     def forward(self, query: Tensor, attn_mask: Tensor | None = None) -> Tensor:
-        """Apply both. The mask (Q, Q) is True where attention is blocked. (B, Q, C)"""
+        """Update queries (B, Q, C). The mask (Q, Q) is True where attention is blocked."""
         attended, _ = self.attention(query, query, query, attn_mask=attn_mask, need_weights=False)
         query = self.norm1(attended) + query
         return self.norm2(self.ffn(query)) + query
@@ -80,6 +80,7 @@ class GeometryDecoupledAttention(nn.Module):
                 f"got {count} queries."
             )
         num_instances = count // self.num_points
+        # The first step has no attention within an instance, so there must be another instance.
         blocked = torch.eye(num_instances, dtype=torch.bool, device=query.device)
         if attn_mask is not None:
             blocked = blocked | attn_mask

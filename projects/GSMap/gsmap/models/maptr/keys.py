@@ -45,11 +45,14 @@ CODE_WEIGHTS = {HEAD + "code_weights": torch.ones(4)}
 GRID_OFFSETS = (
     r"pts_bbox_head\.transformer\.encoder\.layers\.\d+\.attentions\.1\.attention\.grid_offsets"
 )
+# Cross-attention: prefixes (released, here) of the one with a fixed kernel, and the released prefix
+# of the deformable one.
 _KERNELS = (ENCODER_LAYER + "attentions.1.attention.", OUR_ENCODER_LAYER + "cross_attn.")
 _DEFORMABLE = ENCODER_LAYER + "attentions.1.deformable_attention."
 MAPTR = KeyMap(
     "maptr", (*_BEV_QUERY_RULES, _KERNELS), unused=CODE_WEIGHTS, ignored_pattern=GRID_OFFSETS
 )
+# Keys with the markers belong to the architecture with deformable cross-attention, not to MapTR.
 MAPTR_BEVFORMER = KeyMap(
     "maptr-bevformer",
     (*_BEV_QUERY_RULES, (_DEFORMABLE, OUR_ENCODER_LAYER + "cross_attn.")),

@@ -13,7 +13,9 @@ _EPS = 1e-12  # added to squared lengths, so that an edge of length 0 has no inf
 
 @MODELS.register_module()
 class PointsLoss(MapLoss):
-    """L1 distance of the points of matched pairs, [0, 1] over the map (MapTR Eq. 6, GSMap Eq. 11).
+    """L1 distance of the points of matched pairs (MapTR Eq. 6, GSMap Eq. 11).
+
+    Coordinates are in [0, 1] over the map.
 
     Args:
         loss_weight: Weight of the loss (lambda_v).

@@ -16,6 +16,7 @@ from gsmap.utils.errors import InputError
 # this distance along x and y, as in the code of Zhang et al.
 LANE_GAP_PX = 0.01
 DISTANCES = ("squared", "plain")
+# The lambda functions return the shape of the masks.
 _draw = fused_operator(
     "polyline_raster.draw_polylines",
     "Tensor polylines, Tensor filled, int height, int width, float[] frame, float half_width, "

@@ -50,7 +50,7 @@ def _ends(ring, edge, count):
 
 
 @triton.jit
-def _nearest_edges(ring, edges, count, x, y, eps, TILE: tl.constexpr):
+def _nearest_edges(ring, num_edges, count, x, y, eps, TILE: tl.constexpr):
     """Squared distances to the nearest edges, their indices, the inside, and a term for NaN.
 
     The term is added to the mask: it is NaN if a vertex is not finite, otherwise zero.
@@ -59,7 +59,7 @@ def _nearest_edges(ring, edges, count, x, y, eps, TILE: tl.constexpr):
     edge_index = tl.full((TILE, TILE), 0, dtype=tl.int32)
     inside = tl.full((TILE, TILE), 0, dtype=tl.int32)
     poison = 0.0
-    for edge in range(edges):
+    for edge in range(num_edges):
         x0, y0, edge_x, edge_y = _ends(ring, edge, count=count)
         poison += (edge_x - edge_x) + (edge_y - edge_y)
         length2 = tl.maximum(edge_x * edge_x + edge_y * edge_y + eps, SHORTEST)
@@ -259,9 +259,9 @@ def draw_kernel(
     x = x_min + (cols + 0.5) * step_x
     y = y_min + (rows + 0.5) * step_y
     closed = (tl.load(filled + n) != 0).to(tl.int32)
-    edges = count - 1 + closed  # the last to the first vertex of a filled polygon is an edge, too
+    num_edges = count - 1 + closed  # a filled polygon has an edge from its last to its first vertex
     squared, _, inside, poison = _nearest_edges(
-        polylines + n * count * 2, edges, count=count, x=x, y=y, eps=0.0, TILE=TILE
+        polylines + n * count * 2, num_edges, count=count, x=x, y=y, eps=0.0, TILE=TILE
     )
     distance = tl.sqrt(squared)
     # The edge of a polygon cuts the pixel at the signed distance from its centre.

@@ -114,8 +114,8 @@ def _blur_row(images, channels, row, span, window, line, out):
     """
     pitch = images.shape[1]
     pixels = span[1] - span[0]
-    # Because of the margin, these are not the row and column of the first pixel, but of the top
-    # left of its window.
+    # Index of the top left of the first pixel's window. It has the row and column that the first
+    # pixel has in the images without margin, since the margin is the radius of the window.
     first = row * pitch + span[0] * channels
     # The blur along the row reads the whole windows of the first to the last pixel of the span.
     size = (pixels + len(window)) * channels
@@ -149,7 +149,9 @@ def _dissimilarity(maps, pixels):
             p, t, squares=maps[4 * k + 2], product=maps[4 * k + 3]
         )
         total += ONE - (top_mean * top_cov) / (low_mean * low_var)
-        near_target += 1.0 if t > 0 else 0.0  # t is blurred: > 0 if the window covers a target
+        # The two numbers have different thresholds, as in the reference: any part of the target
+        # counts, but the coverage by either mask must exceed `MIN_COVERAGE`.
+        near_target += 1.0 if t > 0 else 0.0
         near_either += 1.0 if max(p, t) > COVERAGE else 0.0
     return total, near_target, near_either
 
@@ -181,7 +183,10 @@ def _derivatives(maps, pixels, out):
 
 @njit(nogil=True, cache=True)
 def _fill_products(pred, target, weight, out):
-    """Compute p, t, p^2 + t^2 and p t of a row, and sum w |p - t|, w p, w t and w - 1."""
+    """Compute p, t, p^2 + t^2 and p t of a row, and sum w |p - t|, w p, w t and w - 1.
+
+    The weight of a pixel is w = 1 + (weight - 1) t.
+    """
     l1 = 0.0
     predicted = 0.0
     foreground = 0.0
@@ -246,7 +251,8 @@ def loss_forward(preds, targets, window, radius, weight, results, first, last):
             multiple of ``TAPS``. (taps,)
         radius: Radius of the window in pixels.
         weight: Weight of a foreground pixel, relative to a background pixel, float32.
-        results: Output for the sums, float64. (n, 7)
+        results: Output for the sums of w |p - t|, w p, 1 - SSIM, w t and w - 1, the number of
+            pixels near the target, and the number of pixels near either mask, float64. (n, 7)
         first: First mask.
         last: One past the last mask.
     """
@@ -279,9 +285,9 @@ def _row_gradient(pred, target, maps, weight, factors, grad):
         t = target[k]
         # Derivative of the sums of w |p - t| and w p, without the factor w.
         slope = factors[0] * np.sign(p - t) + factors[1]
-        # Chain rule: `maps` contains the gradients with respect to p, p^2 and p t.
-        ssim = maps[3 * k] + TWO * p * maps[3 * k + 1] + t * maps[3 * k + 2]
-        grad[k] = (ONE + (weight - ONE) * t) * slope - factors[2] * ssim
+        # Chain rule: `maps` contains the gradients of SSIM with respect to p, p^2 and p t.
+        ssim_slope = maps[3 * k] + TWO * p * maps[3 * k + 1] + t * maps[3 * k + 2]
+        grad[k] = (ONE + (weight - ONE) * t) * slope - factors[2] * ssim_slope
 
 
 @njit(nogil=True, cache=True)
