@@ -199,7 +199,7 @@ def _changes(node: ast.expr) -> list[dict[str, object]]:
         case ast.BinOp(op=op) | ast.BoolOp(op=op) if type(op) in OPERATORS:
             return [{"op": OPERATORS[type(op)]()}]
         case ast.UnaryOp(op=ast.Not() | ast.Invert() | ast.USub() as op, operand=operand):
-            return [{"operand": ast.UnaryOp(op, operand)}]  # twice, it cancels itself
+            return [{"operand": ast.UnaryOp(op, operand)}]  # applied twice, as if removed
         case ast.Constant(value=bool(value)):
             return [{"value": not value}]
         case ast.Constant(value=int(value) | float(value)):

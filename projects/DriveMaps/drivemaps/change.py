@@ -117,7 +117,10 @@ class Shift:
         return abs(self.mean_m) >= max(smallest_m, _MIN_SIGMAS * self.std_m)
 
     def probability(self, smallest_m: float) -> float:
-        """Probability that the shift exceeds a distance, by its error and the old map's error."""
+        """Probability that the shift exceeds a distance.
+
+        The errors of the shift and of the old map are taken to be normally distributed.
+        """
         sigma = float(np.hypot(self.std_m, _MAP_SIGMA_M))
         return float(ndtr((abs(self.mean_m) - smallest_m) / sigma))
 

@@ -29,6 +29,7 @@ OVERLAP_DISTANCE_M = 5.0
 _DISTANCES_M = (5.0, 15.0, 30.0, 60.0)
 # Positions (x, y) of samples in metres, by split and by map name.
 Positions = Mapping[str, Mapping[str, list[np.ndarray]]]
+# Positions (x, y) of samples in metres, by map name.
 _ByMap = Mapping[str, Sequence[np.ndarray] | np.ndarray]
 
 

@@ -53,8 +53,8 @@ class GeometryKernelAttention(nn.Module):
     """
 
     offsets: Tensor
-    # Whether no size of a tensor depends on values, as CUDA graphs need. Then all pairs of a cell
-    # and a camera are computed, with weight 0 where the cell is not visible to the camera.
+    # True for CUDA graphs, in which the sizes of tensors must not depend on values. All pairs of a
+    # cell and a camera are then computed, with weight 0 where the camera does not see the cell.
     fixed_sizes = False
 
     def __init__(
@@ -136,7 +136,8 @@ class GeometryKernelAttention(nn.Module):
             summed = self._sum_pairs(
                 value.float(), shape=shape, uv=projection.uv, pairs=pairs, weights=weights
             )
-        # The number of cameras is that of the sample itself, also with `released_cells`. (B, Q)
+        # Number of cameras that see a cell. Also with `released_cells`, each sample has separate
+        # numbers. (B, Q)
         count = visible.sum(1).clamp(min=1)
         return self.output_proj(summed / count[..., None])
 

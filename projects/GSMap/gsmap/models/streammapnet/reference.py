@@ -70,7 +70,7 @@ class LineReference(PointReference):
 
         Args:
             layer: Number of the layer.
-            point_states: States of the instances. (B, N, C)
+            point_states: States of the instances, each for all points of its line. (B, N, C)
             reference: References of the previous layer; unused. (B, N * P, D)
 
         Returns:
