@@ -156,7 +156,7 @@ def describe_override(error: BaseException) -> str | None:
 
 
 def _frames(error: BaseException) -> Iterator[FrameType]:
-    """Yield frames from innermost to outermost, first of the cause of an error, then of the error."""
+    """Yield the frames of an error after the frames of its cause, both from the innermost one."""
     cause = error.__cause__ or error.__context__  # mmengine replaces errors of hooks
     if cause is not None:
         yield from _frames(cause)
