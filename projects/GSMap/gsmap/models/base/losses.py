@@ -22,7 +22,7 @@ class MapLoss(nn.Module, NeedsTargets):
         loss_weight: Weight of the loss, or a weight for each class, applied to the pairs of the
             class.
         last_layer_only: Compute the loss for the last decoder layer only.
-        first_group_only: Compute the loss for the first query group only, the only one that
+        first_group_only: Compute the loss for the first query group only. No other group
             predicts after the training.
 
     Attributes:

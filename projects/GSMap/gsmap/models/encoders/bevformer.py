@@ -31,8 +31,8 @@ class SpatialCrossAttention(SamplingAttention):
         ValueError: If ``num_points`` is not a multiple of ``num_heights``.
     """
 
-    # Whether invisible pairs of cell and camera are computed, too, with weight 0. The code that
-    # records CUDA graphs (`StepGraphs`, `StaticFrame`) sets it, since sizes in them are fixed.
+    # Whether invisible pairs of cell and camera are computed, too, with weight 0. `StaticStep` and
+    # `StaticFrame` set it before they record a CUDA graph, in which sizes of tensors are fixed.
     fixed_sizes = False
 
     def __init__(
