@@ -107,7 +107,8 @@ def _efficient_attention_backward(
         query: Queries. (B, heads, N, C)
         key: Keys. (B, heads, K, C)
         value: Values. (B, heads, K, C)
-        bias: Values added to the logits, or None. (B, heads, N, K)
+        bias: Values added to the logits, or None. They are an attention mask, whose gradient is not
+            needed. (B, heads, N, K)
         options: ``scale`` of the logits, by default 1 / sqrt(C).
 
     Returns:

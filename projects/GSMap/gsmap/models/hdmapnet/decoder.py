@@ -98,8 +98,9 @@ class LineMapDecoder(nn.Module):
     def forward(self, bev_feats: Tensor) -> LineMaps:
         """Predict at the resolution of the BEV features. (B, C, H, W) -> (B, ..., H, W) each"""
         first, _, last = self.stage_maps(bev_feats)
-        # Features for the classes, the embeddings and, unless they share a block with the
-        # embeddings, the directions. The last entry always serves the directions.
+        # Each block joins the maps of the first and the last stage. The first block is for the
+        # classes and the second one for the embeddings. The last one, which is the second or a
+        # third one, is for the directions.
         blocks = [block(first, last) for block in self.joined]
         semantic_branch, embedding_branch, direction_branch = self.maps
         return LineMaps(
