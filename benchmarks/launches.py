@@ -194,7 +194,7 @@ def _run_inside(
             return original(*args, **kwargs)
 
     # An attribute of the object hides the method of its class until the attribute is deleted. It is
-    # set by `object.__setattr__`, because `torch.nn.Module` treats attributes in a way of its own.
+    # set by `object.__setattr__`, because `torch.nn.Module` overrides the setting of attributes.
     object.__setattr__(owner, method, call_inside)
     try:
         yield

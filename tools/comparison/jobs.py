@@ -62,7 +62,7 @@ class Job:
     def __init__(self, run: Run, device: str | None) -> None:
         self.run = run
         self.device = device
-        comparison_folder = run.folder.parent.parent
+        comparison_folder = run.folder.parent.parent  # of <comparison>/<name>/seed_<seed>
         require_no_link(run.folder, below=comparison_folder)
         self._lock = lock_folder(run.folder, name=".lock", advice="wait for its end")
         write_text(run.folder / SETTINGS, json.dumps(plain(run.settings), indent=1))

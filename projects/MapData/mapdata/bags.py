@@ -375,7 +375,7 @@ def _span_text(times_ns: Sequence[int] | np.ndarray) -> str:
 def _write_images(
     bag: Bag, rig: Mapping[str, RigCamera], frames: Sequence[RigFrame], frames_dir: Path
 ) -> list[str]:
-    """Write the images of frames that do not exist yet, with notes on unusable images."""
+    """Write the missing image files of frames, with notes on unusable images."""
     missing = {}
     for frame in frames:
         for name, (path, time_ns) in frame.images.items():

@@ -79,6 +79,7 @@ def load_model(
     model.training_dataset = _training_dataset(contents, name=checkpoint)
     model.rig = {} if contents is None else trained_rig(contents)
     if model.temporal is not None:
+        # A stream that was saved continues only with a model of equal name.
         model.temporal.name = f"{cfg.filename or 'a config'} with {checkpoint or 'initial weights'}"
     return model.to(device).eval()
 
