@@ -310,7 +310,7 @@ def rendering_cells(
 
 
 def training_table(args: argparse.Namespace) -> str:
-    """Measure the work of a training step beside rendering, by the reference and by fused kernels.
+    """Measure the other work of a training step, by the reference and by the fused kernels.
 
     Args:
         args: Parsed options of ``add_arguments``.

@@ -140,6 +140,7 @@ def smooth(values: np.ndarray) -> np.ndarray:
 
 def _draw_training(ax: Axes, runs: Sequence[RunLog], key: str, title: str) -> None:
     """Draw a scalar of training for each run: all values faintly, and a smoothed curve."""
+    # Here and below, colours are repeated in case there are more curves than colours.
     for run, colour in zip(runs, RUN_COLOURS * len(runs), strict=False):
         steps, values = run.series(key)
         ax.plot(steps, values, color=colour, alpha=0.25, linewidth=0.8)

@@ -77,6 +77,8 @@ def area_changes(
         is_removed = 2 * num_missing > num_in_view
         if is_removed:
             # Frames that do not show the area. A detection counts as much as its score.
+            # `smooth_share` is the share of the frames, lowered where few frames have the area in
+            # view.
             num_without = views - score_sum
             change = Change(
                 REMOVED,
@@ -125,6 +127,7 @@ def _added(
         for line, _, score in elements.rows:
             for area in _polygons([line]):
                 outline = _outline(area)
+                # The old map says nothing about ground far from all of its elements.
                 if _overlaps(area, known_areas) or not on_known_ground(outline, old).any():
                     continue
                 in_view = _passes_in_view(outline, passes)

@@ -70,13 +70,13 @@ class _Evidence:
 
     @property
     def is_missing(self) -> BoolArray:
-        """Whether most passes in view do not see a vertex. (M,)"""
+        """Whether most passes with a vertex in view do not see it. (M,)"""
         num_missing = (self.is_in_view & ~self.is_seen).sum(axis=0)
         return 2 * num_missing > self.is_in_view.sum(axis=0)
 
     @property
     def is_present(self) -> BoolArray:
-        """Whether most passes in view see a vertex. (M,)"""
+        """Whether most passes with a vertex in view see it. (M,)"""
         num_seen = (self.is_in_view & self.is_seen).sum(axis=0)
         return 2 * num_seen > self.is_in_view.sum(axis=0)
 
@@ -289,6 +289,7 @@ def _added(old: MapElements, passes: list[Pass], label: int) -> list[Change]:
             continue
         evidence = _Evidence.of_points(lines.points, passes, label)
         is_new = ~near_lines(lines.points, known_lines, within_m=REACH_M)
+        # The old map says nothing about ground far from all of its elements.
         is_new &= on_known_ground(lines.points, old) & evidence.is_present
         views = evidence.views.sum(axis=0)
         for part in _parts(lines, is_new):

@@ -100,6 +100,7 @@ def _listed_parts(folder: Path) -> list[Path]:
     text = _read_metadata(folder / _METADATA)
     listed_parts = []
     for part in parts_in(folder):
+        # The text is searched and not parsed, since it may be damaged (`damage_in` reports that).
         # The name must not be a part of a longer name.
         if re.search(rf"(?<![\w.-]){re.escape(part.name)}(?![\w.-])", text):
             listed_parts.append(part)

@@ -379,6 +379,7 @@ def odometry_poses(
         if not child or not vehicle:
             candidates.append((_OF_UNKNOWN_FRAME, number, np.eye(4)))
             continue
+        # The body takes the place of the vehicle in `between`, which gives the pose in its frame.
         child_from_vehicle = tree.between(child, vehicle) if child in tree.frames else None
         if child_from_vehicle is None:
             notes.append(

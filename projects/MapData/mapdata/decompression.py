@@ -82,7 +82,7 @@ def _bound(module: Any) -> None:
 
 
 def _remaining_bytes() -> int:
-    """Number of bytes that the current bag may still become by decompression."""
+    """Number of further bytes to which the current bag may be decompressed."""
     return FREE_BYTES + TIMES * _Bag.packed - _Bag.unpacked
 
 

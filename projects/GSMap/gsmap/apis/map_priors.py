@@ -33,8 +33,8 @@ def maps_for(model: Any, priors: "Sequence[AnyPrior]", update: bool = False) -> 
         update: Write the prediction of each frame to the prior of its place.
 
     Returns:
-        Object for `use` and `using` of the prior module of the model (``model.prior``), which takes
-        the prior of each sample from it.
+        Maps to pass to ``model.prior.use``, or to the context manager ``model.prior.using``. The
+        prior module of the model takes the prior of each sample from them.
 
     Raises:
         ValueError: If the model takes no prior, or a prior does not fit it.
@@ -86,7 +86,7 @@ def open_priors(
             with model.prior.new_prior(new_place) as empty:
                 empty.save(path)
         prior = open_prior(path, update=update)
-        if isinstance(prior, MapPrior):  # a `GaussianPrior` keeps no file open
+        if isinstance(prior, MapPrior):  # priors of other types keep no file open
             stack.enter_context(prior)
         priors.append(prior)
     return priors

@@ -73,7 +73,8 @@ def pixel_range(low, high, origin, step, size):  # type: ignore[no-untyped-def]
     """
     first = (low - origin) / step - 0.5
     last = (high - origin) / step - 0.5
-    # The limits lie in [0, size] and [-1, size - 1]: the range is empty beside the raster.
+    # `first` is limited to [0, size] and `last` to [-1, size - 1], so the range of an interval
+    # outside of the raster is empty.
     start = math.ceil(min(max(first, 0.0), size))
     end = math.floor(max(min(last, size - 1.0), -1.0)) + 1
     return start, end

@@ -61,7 +61,8 @@ class ElementPrior:
         settings: Classes, place and tiles of the file; the size of cells is not used.
         elements: Lines and areas in the global frame, in metres. Heights are dropped, and an
             element without a score has a confidence of 1.
-        rule: Settings of the elements; ``ElementRule()`` by default.
+        rule: Standard deviation of the points, and width of the drawn lines; ``ElementRule()`` by
+            default.
 
     Attributes:
         content: Name of the stored things, for messages.
@@ -104,17 +105,17 @@ class ElementPrior:
             ValueError: If the file is no valid prior of elements, or has other settings.
         """
         path = Path(path)
-        content = path.read_bytes()
-        if not content:
+        file_bytes = path.read_bytes()
+        if not file_bytes:
             raise InputError(f"{path} is empty: copy or build it again.")
-        found, rule, entries = read_header(content, path, magic=ELEMENT_MAGIC)
+        found, rule, entries = read_header(file_bytes, path, magic=ELEMENT_MAGIC)
         if settings is not None:
             settings.require_equal(found, str(path))
         polylines: list[FloatArray] = []
         labels: list[int] = []
         scores: list[float] = []
         for offset, length, crc in entries.values():
-            packed = content[offset : offset + length]
+            packed = file_bytes[offset : offset + length]
             stored, lines = _unpack(packed, crc=crc, path=path)
             polylines += lines
             labels += stored["label"].tolist()
@@ -122,6 +123,7 @@ class ElementPrior:
         try:
             elements = MapElements.from_polylines(polylines, labels=labels, scores=scores)
             return cls(found, elements, rule)
+        # An `InputError` of the constructor is a ValueError, so it gets the path of the file here.
         except ValueError as error:
             text = str(error).rstrip(".")
             raise InputError(f"{path} is damaged: {text}; build it again.") from error
@@ -178,7 +180,7 @@ class ElementPrior:
         )
 
     def read(self, pose: Pose, grid: BEVGrid) -> Tensor:
-        """Draw the elements in the cells of a frame, as `MapPrior.read` does.
+        """Draw the elements in the cells of a frame, a raster like the one of `MapPrior.read`.
 
         Closed elements of `AREA_CLASSES` are filled. A cell has the confidence of the element that
         covers it, times the covered share of its area. Of several elements of a class, the largest
@@ -269,12 +271,13 @@ def _unpack(content: bytes, crc: int, path: Path) -> tuple[NDArray[np.void], lis
     num_vertices = int(counts["vertices"])
     if num_elements > _MOST_ELEMENTS or num_vertices > _MOST_VERTICES_OF_TILE:
         raise damage
-    packed = content[_COUNTS.itemsize :]  # its checksum was checked with the counts
+    # The checksum of the whole tile was checked above, so `unpack_tile` gets a checksum that fits.
+    packed = content[_COUNTS.itemsize :]
     num_bytes_of_elements = num_elements * _STORED.itemsize
     num_bytes = num_bytes_of_elements + num_vertices * 2 * _VERTEX.itemsize
-    states = unpack_tile(packed, crc=zlib.crc32(packed), num_bytes=num_bytes, path=path)
-    stored = np.frombuffer(states[:num_bytes_of_elements], dtype=_STORED)
-    vertices = np.frombuffer(states[num_bytes_of_elements:], dtype=_VERTEX).reshape(-1, 2)
+    unpacked = unpack_tile(packed, crc=zlib.crc32(packed), num_bytes=num_bytes, path=path)
+    stored = np.frombuffer(unpacked[:num_bytes_of_elements], dtype=_STORED)
+    vertices = np.frombuffer(unpacked[num_bytes_of_elements:], dtype=_VERTEX).reshape(-1, 2)
     if int(stored["num_vertices"].sum(dtype=np.int64)) != num_vertices:
         raise damage
     ends = np.cumsum(stored["num_vertices"], dtype=np.int64)

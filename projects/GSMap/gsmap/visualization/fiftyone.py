@@ -55,7 +55,8 @@ def write_fiftyone(
     file = AnnotationFile(annotations)
     root = Path(data_root or Path(annotations).parent).resolve()
     predictions = None
-    places = {}  # place of each sample in the result file, by token; elements are loaded in turn
+    # Place of each sample in the result file, by token. Elements are loaded sample by sample below.
+    places = {}
     if results is not None:
         predictions = SampleFile(results, key="results", classes=file.meta.classes)
         places = {token: place for token, _, place in predictions}

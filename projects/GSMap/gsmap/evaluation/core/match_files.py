@@ -34,6 +34,7 @@ def require_own_matches(target: Path, shard: Shard) -> None:
     Raises:
         ValueError: If another program's file has the name of the shard or of its manifest.
     """
+    # The array of notes is the first one in the file, so its name is near the start.
     shard.require_own(target, mark=b"notes.npy")
 
 

@@ -69,8 +69,8 @@ class RasterPrior(PriorModule, AddsWeights):
         released_pixels: Draw predictions half a cell off, as the release does.
         train_rule: Name of the rule of writing in training as ``name``, and its settings.
         test_rule: Rule of writing in tests.
-        test_memory: Frames of a test that share a map: those of a place (``"kept"``), of a scene
-            (``"scene"``), or none (``"none"``).
+        test_memory: Frames of a test that share a map: all frames of a place (``"kept"``) or of a
+            scene (``"scene"``), or none (``"none"``).
         train_drop: Probability that a sample of a training reads an empty map, so that the model
             also works without one; 0 as published.
         neutral_start: Initialise the weights so that the prior has no effect (``residual`` of
@@ -87,7 +87,7 @@ class RasterPrior(PriorModule, AddsWeights):
         ValueError: If head, encoder or a setting does not fit.
     """
 
-    reads_window: ClassVar[bool] = True
+    reads_window: ClassVar[bool] = True  # an exported model has a window of the map as input
 
     def __init__(
         self,
@@ -162,7 +162,8 @@ class RasterPrior(PriorModule, AddsWeights):
         bev_is_neutral = self.bev is None or self.bev.output_conv is not None
         queries_are_neutral = self.queries is None or self.queries.zero_init
         if bev_is_neutral and queries_are_neutral:
-            self.neutral_keys = ("",)  # the prefix of all keys
+            # A checkpoint may lack all weights of the prior: "" is the prefix of all keys.
+            self.neutral_keys = ("",)
         self._pending: list[_Pending] = []
         self._maps = self.new_maps()
 
@@ -177,7 +178,7 @@ class RasterPrior(PriorModule, AddsWeights):
 
     @property
     def maps(self) -> PlaceMaps:
-        """Maps that are read and written."""
+        """Maps that are read and written: the maps given by a user, or the maps of the model."""
         return self._maps if self._given is None else self._given
 
     def new_maps(self) -> PlaceMaps:
@@ -247,7 +248,7 @@ class RasterPrior(PriorModule, AddsWeights):
         calibration: Mapping[str, Tensor],
         img_shape: tuple[int, int],
     ) -> dict[str, Any]:
-        """Fuse the outputs of the encoder with a window, by operations of fixed sizes.
+        """Fuse the outputs of the encoder with a window, by operations of fixed sizes for export.
 
         Args:
             outputs: Outputs of the encoder.

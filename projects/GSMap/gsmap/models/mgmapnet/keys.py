@@ -13,9 +13,9 @@ _INTERACTION = (
     "cross_attn.=attn. linear1.=ffn.layers.0.0. linear2.=ffn.layers.1. norm1.=norms.0. "
     "norm3.=norms.1."
 )
-# Pairs of key prefixes (released, ours), and names of parameters that the release never uses.
+# Key prefixes (released, ours) of a module that only this architecture has.
 _DOWN_SAMPLING = (TRANSFORMER + "bev_downsample.", "map_head.decoder.bev_pyramid.merges.0.")
-_IDLE = "attentions.1.output_proj_instance"
+_IDLE = "attentions.1.output_proj_instance"  # a projection that the release never calls
 _NORM = ("weight", "bias", "running_mean", "running_var")
 MGMAPNET = KeyMap(
     "mgmapnet",
@@ -62,7 +62,8 @@ MGMAPNET = KeyMap(
         **zeros(
             DECODER,
             {
-                # the reference code of the first layer, which uses the learned position instead
+                # encoding of the reference points in the first layer, which uses the learned
+                # position instead
                 "gen_pos_embed.0.0.weight": (256, 40),
                 "gen_pos_embed.0.0.bias": (256,),
                 "gen_pos_embed.0.2.weight": (256, 256),

@@ -15,7 +15,7 @@ from gsmap.structures.line_update import update_from_known_lines
 from gsmap.structures.past import Past
 from gsmap.utils.errors import InputError
 
-PREFIX = "element_"  # prefix of the names of these tensors in the memory of a stream
+PREFIX = "element_"  # begins the names of remembered elements in the memory of a stream
 
 
 @MODELS.register_module()
@@ -83,12 +83,12 @@ class ElementMemory:
             scales=past.memory[f"{PREFIX}scales"],
             rotations=past.memory[f"{PREFIX}rotations"],
         )
-        scale = past.seconds.sqrt()
+        sqrt_seconds = past.seconds.sqrt()  # a standard deviation grows with the root of the time
         previous = move_gaussians(
             remembered,
             motion=past.now_from_then,
-            drift_m=self.noise_m * scale,
-            drift_rad=self.noise_rad * scale,
+            drift_m=self.noise_m * sqrt_seconds,
+            drift_rad=self.noise_rad * sqrt_seconds,
         )
         updated = []
         for index, continues in enumerate(past.continues.tolist()):
