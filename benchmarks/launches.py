@@ -39,7 +39,8 @@ PARTS = (
     ("map_head", "loss_by_feat", "losses"),
     ("map_head", "statistics", "statistics"),
     ("map_head", "predict_by_feat", "decoding"),
-    ("temporal", "over", "memory"),  # features and queries of previous frames
+    ("temporal", "recall", "memory"),  # fusion with features and queries of previous frames
+    ("temporal", "collect_memory", "memory"),
     ("", "parse_losses", "figures"),  # losses for the log
 )
 
