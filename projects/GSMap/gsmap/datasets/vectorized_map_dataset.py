@@ -317,12 +317,12 @@ class VectorizedMapDataset(BaseDataset):
             idx: Index of the sample.
 
         Returns:
-            Values by key. ``images``, ``lidar_points``, ``lidar_sweeps`` and ``timestamp`` are as in
-            mmdet3d's multi-view pipelines. ``map_instances`` has the elements at full resolution,
-            with ``dim`` coordinates per point in metres. ``map_heights`` has the heights of the n
-            points of each element in metres, (n,), or None for a file without heights. Further
-            keys are ``dim`` and those that become the metainfo of the packed sample. In names such
-            as ``lidar2global``, ``lidar`` is the annotation frame, as in mmdet3d.
+            Values by key. ``images``, ``lidar_points``, ``lidar_sweeps`` and ``timestamp`` are those
+            of mmdet3d's multi-view pipelines. ``map_instances`` has the elements at full
+            resolution, with ``dim`` coordinates per point in metres. ``map_heights`` has the
+            heights of the n points of each element in metres, (n,), or None for a file without
+            heights. Further keys are ``dim`` and the metainfo of the packed sample, in which
+            ``lidar`` is the annotation frame, as in mmdet3d: ``lidar2global``, for example.
 
         Raises:
             BrokenSampleError: If the sample lacks a camera of ``cameras``.
