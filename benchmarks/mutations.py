@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> None:
     """
     rng = np.random.default_rng(args.seed)
     rows = []
-    for number, room in enumerate(args.rooms):
+    for room_index, room in enumerate(args.rooms):
         modules = {}
         places = []
         for name, path in modules_of(room).items():
@@ -77,8 +77,9 @@ def run(args: argparse.Namespace) -> None:
             modules[name] = path
             for index in range(count_places(path.read_text())):
                 places.append((name, index))
-        # Over all rooms, these numbers add up to `args.number`.
-        num_mutants = (args.number + number) // len(args.rooms)
+        # `args.number` mutants are spread evenly. If the division leaves a remainder of n, each of
+        # the last n rooms gets one mutant more, so that the sum over the rooms is `args.number`.
+        num_mutants = (args.number + room_index) // len(args.rooms)
         order = rng.permutation(len(places))
         # No module has an empty name, so the tests run on the code as it is.
         unchanged = verdict(module="", source="", tests=tests_of(room, None), seconds=None)
@@ -252,6 +253,7 @@ def verdict(module: str, source: str, tests: Sequence[str], seconds: float | Non
     child.join(seconds)
     if child.exitcode is None:
         with suppress(ProcessLookupError):  # the child has no process group yet
+            # The child was started, so `pid` is not None; `or 0` is only for the type checker.
             os.killpg(child.pid or 0, signal.SIGKILL)
         child.kill()
         child.join()

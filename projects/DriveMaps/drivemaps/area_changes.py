@@ -76,9 +76,9 @@ def area_changes(
         # More than half of the passes with the area in view do not have it in their map.
         is_removed = 2 * num_missing > num_in_view
         if is_removed:
-            # Frames that do not show the area. A detection counts as much as its score.
-            # `smooth_share` is the share of the frames, lowered where few frames have the area in
-            # view.
+            # This is the number of frames that do not show the area. A frame with a detection of
+            # score s counts as 1 - s frames without the area. `smooth_share` divides the number by
+            # the number of frames with the area in view, and lowers the share if these are few.
             num_without = views - score_sum
             change = Change(
                 REMOVED,
@@ -125,6 +125,7 @@ def _added(
     for one_pass in passes:
         elements = one_pass.elements.select(one_pass.elements.labels == label)
         for line, _, score in elements.rows:
+            # The map of a pass has no heights that would have to be left out (see `_scored_areas`).
             for area in _polygons([line]):
                 outline = _outline(area)
                 # The old map says nothing about ground far from all of its elements.
@@ -136,12 +137,17 @@ def _added(
                 is_present = 2 * num_seen > in_view.sum()  # in more than half of the passes
                 if not is_present:
                     continue
-                views = float(views_of_passes(outline, passes).sum(axis=0).mean())
+                # Frames of all passes that have a point of the outline in range, as the mean over
+                # the points.
+                views_of_points = views_of_passes(outline, passes).sum(axis=0)  # (n,)
+                views = float(views_of_points.mean())
+                # The score stands for the share of the frames that support the area.
+                support = score * views
                 change = Change(
                     ADDED,
                     label,
                     line=shapely.get_coordinates(area.exterior),
-                    confidence=smooth_share(score * views, views),
+                    confidence=smooth_share(support, views),
                     passes_in_view=int(in_view.sum()),
                     num_passes=num_seen,
                 )
@@ -151,7 +157,10 @@ def _added(
 
 
 def _polygons(rings: list[FloatArray]) -> list[shapely.Polygon]:
-    """Convert rings to valid polygons; a ring that crosses itself becomes several."""
+    """Convert rings to valid polygons, with `polygons_of`.
+
+    A ring that crosses itself becomes several polygons. `polygons_of` would make one multipolygon.
+    """
     polygons = []
     for part in shapely.get_parts(np.array(polygons_of(rings), dtype=object)):
         if isinstance(part, shapely.Polygon):
@@ -163,6 +172,7 @@ def _scored_areas(elements: MapElements, label: int) -> list[tuple[shapely.Polyg
     """Areas of one class of a map with their scores."""
     scored = []
     for line, _, score in elements.select(elements.labels == label).rows:
+        # An old map may have heights, which are left out.
         for area in _polygons([line[:, :2]]):
             scored.append((area, score))
     return scored
@@ -232,6 +242,8 @@ def _detections(passes: list[Pass], label: int, config: MergeConfig) -> list[_De
             variances = []
             for index in np.flatnonzero(elements.labels == label).tolist():
                 vertices = slice(elements.offsets[index], elements.offsets[index + 1])
+                # An area that crosses itself becomes one multipolygon here. Its parts are not
+                # separated as in `_polygons`, because only overlaps and the centre are used.
                 for area in polygons_of([elements.points[vertices]]):
                     areas.append(area)
                     scores.append(float(elements.confidence[index]))

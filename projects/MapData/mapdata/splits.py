@@ -78,8 +78,9 @@ def split_names(dataset: str) -> tuple[str, ...]:
 def _read_family(name: str) -> Any:
     """Read a file of published lists.
 
-    It holds, by data set, groups of scenes (``scenes``), and the names of the groups in each part
-    of its splits (``splits``).
+    It holds two entries for each data set. ``scenes`` lists the scenes of each group, by the name
+    of the group. ``splits`` lists the names of groups by the name of a split and by the part of
+    the split: ``{"splits": {SPLIT: {"train": [GROUP, ...], ...}}, "scenes": {GROUP: [...]}}``.
     """
     return read_json(Path(str(files("mapdata").joinpath(f"split_lists/{name}.json"))))
 
@@ -106,9 +107,9 @@ def published_split(name: str, dataset: str) -> SplitList:
 def read_split_file(path: Path) -> SplitList:
     """Read a split file, in JSON or as text.
 
-    In JSON it is an object with a list of scene names or tokens for each split, as in
-    ``splits.json`` of the nuScenes devkit. A text file (``.txt``) has the scenes of one split, one
-    per line, and the name of the split in its file name, such as ``av2_val.txt``.
+    In JSON it is an object with a list of scene names or tokens for each part, such as ``train``
+    and ``val``, as in ``splits.json`` of the nuScenes devkit. A text file (``.txt``) has the scenes
+    of one part, one per line, and the name of the part in its file name, such as ``av2_val.txt``.
 
     Returns:
         The list, with the name of the file.
@@ -121,12 +122,14 @@ def read_split_file(path: Path) -> SplitList:
         raise FileNotFoundError(f"no split file at {path}.")
     try:
         is_text = path.suffix.lower() == ".txt"
-        splits = _read_lines(path) if is_text else read_json(path)
+        scenes = _read_lines(path) if is_text else read_json(path)  # by part
     except ValueError as error:
         raise InputError(f"{str(error).rstrip('.')}; a split file is JSON like {_FORM}.") from error
-    if not isinstance(splits, dict) or not all(map(_is_list_of_names, splits.values())):
+    if not isinstance(scenes, dict) or not all(map(_is_list_of_names, scenes.values())):
         raise InputError(f"split file {path} must look like {_FORM}.")
-    return SplitList(name=file_name(path.stem)[:100], scenes=splits)
+    # The name becomes a part of `SplitList.identity`, which has at most 100 characters of a name,
+    # all of them letters, digits and ``_.+=-``. `file_name` replaces all other characters.
+    return SplitList(name=file_name(path.stem)[:100], scenes=scenes)
 
 
 def _is_list_of_names(value: Any) -> bool:
@@ -134,7 +137,7 @@ def _is_list_of_names(value: Any) -> bool:
 
 
 def _read_lines(path: Path) -> dict[str, list[str]]:
-    """Read the scenes of one split, whose name is a word of the file's name."""
+    """Read the scenes of one part of a split. The name of the part is a word of the file's name."""
     words = [word for word in re.split(r"[^a-z]+", path.stem.lower()) if word in _PARTS]
     if len(set(words)) != 1:
         raise InputError(f"the name of {path} must have one of the words {', '.join(_PARTS)}")
@@ -169,29 +172,29 @@ def requested_split(options: Any, dataset: str) -> SplitList | None:
 def resolve_scenes(
     splits: Mapping[str, Collection[str]], names: Mapping[str, str]
 ) -> tuple[dict[str, str], list[str]]:
-    """Find the split of each scene of a data set.
+    """Find the part of a split, such as ``train``, to which each scene of a data set belongs.
 
     Args:
-        splits: Names or tokens of scenes, by split.
+        splits: Names or tokens of scenes, by part, as in ``SplitList.scenes``.
         names: Name of each scene of the data set, by token.
 
     Returns:
-        Split of each scene, by its name, and the entries that the data set does not have.
+        Part of each scene, by the scene's name, and the entries that the data set does not have.
 
     Raises:
-        ValueError: If a scene is in two splits, by its name or its token.
+        ValueError: If a scene is in two parts, by its name or its token.
     """
     # An entry of a list is the name or the token of a scene.
     name_of = {name: name for name in names.values()} | dict(names)
-    split_of: dict[str, str] = {}
+    part_of: dict[str, str] = {}
     missing = []
-    for split, entries in splits.items():
+    for part, entries in splits.items():
         for entry in entries:
             if entry not in name_of:
                 missing.append(entry)
                 continue
             name = name_of[entry]
-            other = split_of.setdefault(name, split)
-            if other != split:
-                raise InputError(f"scene {name} is in both {other} and {split}.")
-    return split_of, missing
+            other = part_of.setdefault(name, part)
+            if other != part:
+                raise InputError(f"scene {name} is in both {other} and {part}.")
+    return part_of, missing

@@ -57,19 +57,20 @@ class Terrain:
         grid: Height of the ground.
         columns: Image columns in pixels. (c,)
         distances_m: Horizontal distances of the height samples in metres, ascending. (RINGS,)
-        lowest_row: Smallest image row, that is the topmost one, that shows ground up to each
-            distance, in pixels. (RINGS, c)
+        skyline_rows: Image row of the skyline of the ground up to each distance, in pixels. It is
+            the topmost row that shows this ground, so it never increases with the distance.
+            (RINGS, c)
     """
 
     camera: Camera
     grid: HeightGrid
     columns: Array
     distances_m: Array
-    lowest_row: Array
+    skyline_rows: Array
 
     def horizon(self) -> Array:
         """Image row of the skyline of the ground in every image column. (W,)"""
-        return np.interp(np.arange(self.camera.width), self.columns, self.lowest_row[-1])
+        return np.interp(np.arange(self.camera.width), self.columns, self.skyline_rows[-1])
 
     def distances(self, rows: Array) -> Array:
         """Horizontal distance to the ground along the rays of ``columns``.
@@ -82,17 +83,17 @@ class Terrain:
         """
         reach = np.empty((len(rows), len(self.columns)))
         # Rows descend with the distance. np.interp needs ascending ones, hence both are reversed.
-        for i, profile in enumerate(self.lowest_row.T):
+        for i, profile in enumerate(self.skyline_rows.T):
             reach[:, i] = np.interp(rows, profile[::-1], self.distances_m[::-1])
-        direction, fall = self._rays(rows)
+        direction, rise = self._rays(rows)  # rise per metre, < 0 if the ray descends
         eye = self.camera.center
         # Newton's method for the distance at which the ray is 0 m above the ground.
         for _ in range(NEWTON_STEPS):
             step = 0.02 * reach + 0.02  # of the finite difference that gives the derivative
             here = sample_height(self.grid, eye[:2] + reach[..., None] * direction)
             ahead = sample_height(self.grid, eye[:2] + (reach + step)[..., None] * direction)
-            above = eye[2] + reach * fall - here
-            closing = fall - (ahead - here) / step  # derivative of `above` by the distance
+            above = eye[2] + reach * rise - here  # height of the ray above the ground
+            closing = rise - (ahead - here) / step  # derivative of `above` by the distance
             # `closing` is kept away from 0, and a step changes the distance by at most a tenth.
             move = -above / np.where(np.abs(closing) < 1e-3, -1e-3, closing)
             reach = np.clip(reach + np.clip(move, -0.1 * reach, 0.1 * reach), 0.1, FARTHEST_M)
@@ -122,7 +123,8 @@ class Terrain:
         """Directions of the rays of ``columns`` at image rows (h,).
 
         Returns:
-            Horizontal unit directions (h, c, 2), and the rise per horizontal metre (h, c).
+            Horizontal unit directions (h, c, 2), and the rise per horizontal metre (h, c), which is
+            negative if the ray descends.
         """
         u, v = np.meshgrid(self.columns, rows)
         rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ self.camera.world_from_pixel.T
@@ -169,7 +171,7 @@ def make_terrain(camera: Camera, grid: HeightGrid) -> Terrain:
         grid=grid,
         columns=columns,
         distances_m=distances,
-        lowest_row=np.minimum.accumulate(rows, axis=0),
+        skyline_rows=np.minimum.accumulate(rows, axis=0),
     )
 
 
@@ -199,5 +201,5 @@ def terrain_footprints(terrain: Terrain) -> Footprints:
         along=np.median(np.abs(np.diff(edges, axis=0)), axis=1),
         across=distance / camera.intrinsics[0, 0],
         distance=distance,
-        visible=np.arange(camera.height) > terrain.lowest_row[-1].min(),
+        visible=np.arange(camera.height) > terrain.skyline_rows[-1].min(),
     )

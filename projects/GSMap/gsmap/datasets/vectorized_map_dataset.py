@@ -317,8 +317,8 @@ class VectorizedMapDataset(BaseDataset):
             idx: Index of the sample.
 
         Returns:
-            Values by key. ``images``, ``lidar_points``, ``lidar_sweeps`` and ``timestamp`` are those
-            of mmdet3d's multi-view pipelines. ``map_instances`` has the elements at full
+            Values by key. ``images``, ``lidar_points``, ``lidar_sweeps`` and ``timestamp`` have
+            the form of mmdet3d's multi-view pipelines. ``map_instances`` has the elements at full
             resolution, with ``dim`` coordinates per point in metres. ``map_heights`` has the
             heights of the n points of each element in metres, (n,), or None for a file without
             heights. Further keys are ``dim`` and the metainfo of the packed sample, in which

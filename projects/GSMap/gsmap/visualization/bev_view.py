@@ -23,8 +23,10 @@ _SCORE_PT = 6.5  # font size of scores
 # Points are complex numbers x + iy, so that a factor of i turns them by a quarter of the circle.
 _HANDLE = 4 / 3 * (np.sqrt(2) - 1)  # distance of an inner control point from its end point
 _FIRST_QUARTER = np.array([1, 1 + 1j * _HANDLE, _HANDLE + 1j])
-_QUARTERS = _FIRST_QUARTER * 1j ** np.arange(5)[:, None]
-# Four quarters of three points each, and the first point of a fifth one, which closes the circle.
+# Factors that turn the first quarter by 0 to 4 quarters of the circle: 1, i, -1, -i, and 1 again.
+_TURNS = 1j ** np.arange(5)
+_QUARTERS = _FIRST_QUARTER * _TURNS[:, None]  # (5, 3)
+# The points of four quarters, and the first point of the fifth one, which closes the circle.
 _CIRCLE = _QUARTERS.ravel()[:13].view(np.float64).reshape(13, 2)
 _CIRCLE_CODES = [Path.MOVETO, *[Path.CURVE4] * 12]
 
@@ -298,7 +300,9 @@ def raster_picture(rasters: np.ndarray, labels: np.ndarray, style: MapStyle) -> 
 def _draw_rasters(ax: Axes, picture: np.ndarray, view: FrameView) -> None:
     """Draw the picture of the rasters in place of the background."""
     if view.forward == "x":
-        picture = picture.transpose(1, 0, 2)[:, ::-1]  # from (y, x) to rows of x and columns of -y
+        # Rows of the picture are y (left) and its columns x (ahead), but the display has x upwards
+        # and -y (right) to the right. So the axes are swapped, and then the columns reversed.
+        picture = picture.transpose(1, 0, 2)[:, ::-1]
     extent = (*ax.get_xlim(), *ax.get_ylim())
     ax.imshow(picture, origin="lower", extent=extent, interpolation="bilinear", zorder=1)
     ax.grid(False)

@@ -23,7 +23,9 @@ from gsmap.visualization.camera_projection import project_polygon, project_segme
 from gsmap.visualization.style import MapStyle
 
 _STEP_M = 2.0  # largest length of a segment, which has one depth and so one line width
-_WIDTH_STEP = 0.2  # logarithm of the ratio of successive line widths; few widths make few paths
+# Logarithm of the ratio of successive line widths. Widths are rounded to such steps, because all
+# segments of a class with equal widths are drawn together, as one path.
+_WIDTH_STEP = 0.2
 _NOMINAL_SIZE_IN = 2.4  # square root of the area of a panel on which line widths are not scaled
 _OPEN_PATHS: dict[str, Any] = {"facecolors": "none", "capstyle": "round", "joinstyle": "round"}
 

@@ -139,10 +139,10 @@ def _select_splits(options: NuScenesOptions) -> tuple[SplitList, str]:
 def _resolve_splits(
     split_list: SplitList, options: NuScenesOptions, scenes: list[_Scene]
 ) -> tuple[dict[str, str], list[str]]:
-    """Find the split of each scene.
+    """Find the part of the list of splits, such as ``train``, to which each scene belongs.
 
     Returns:
-        Split by name of the scene, and a note if scenes of the list are missing in the data set.
+        Part by name of the scene, and a note if scenes of the list are missing in the data set.
     """
     names = {}
     for scene, _ in scenes:

@@ -54,8 +54,9 @@ def _read_frames(samples: SampleFile, annotations: AnnotationFile) -> list[Drive
     track_ids: dict[str, IntArray | None] = {}
     last_token: dict[bool, str] = {}  # last sample with tracks (True) and without (False)
     items = items_of(results, RESULTS_KEY, "give a result file")
-    # Both read the file; `zip` advances `samples` first. So `samples` raises the error about a
-    # malformed item, and `item` is known to be well-formed.
+    # The file is read twice in step: `samples` checks and converts each item, `items` yields it as
+    # it is, with its tracks. `samples` must be the first argument of `zip`, which is advanced
+    # first: if an item is malformed, `samples` raises the error before `item` is used.
     for (token, elements, _), (item, _) in zip(samples, items, strict=True):
         values = [vector.get(TRACK_KEY) for vector in item["vectors"]]
         ids = _convert_tracks(values, results=results, token=token)
@@ -103,8 +104,8 @@ def _convert_tracks(values: list[object], results: Path, token: str) -> IntArray
     for track in values:
         if type(track) is not int or not -1 <= track < 2**31:
             raise InputError(
-                f"{results}, sample {token!r}: {TRACK_KEY} must be an integer from -1 (no track), "
-                f"got {track!r:.40}."
+                f"{results}, sample {token!r}: {TRACK_KEY} must be an integer >= 0 and < 2**31, "
+                f"or -1 for no track, got {track!r:.40}."
             )
     return np.array(values, dtype=np.int64)
 

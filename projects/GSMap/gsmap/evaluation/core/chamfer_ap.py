@@ -109,7 +109,7 @@ class ChamferConfig(Metric):
 
     @property
     def counts_heights(self) -> bool:
-        """Whether distances are in space rather than in the plane."""
+        """Whether heights (z) count in the metric: distances are in space, not in the plane."""
         return self.dim == 3
 
     def match(self, sample: Sample) -> FrameMatches:

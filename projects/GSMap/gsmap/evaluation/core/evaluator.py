@@ -133,7 +133,7 @@ class MapEvaluator:
 
     @property
     def counts_heights(self) -> bool:
-        """Whether a metric measures distances in space rather than in the plane."""
+        """Whether heights (z) count in a metric, as in distances in space."""
         return any(metric.counts_heights for metric in self.metrics)
 
     def match(

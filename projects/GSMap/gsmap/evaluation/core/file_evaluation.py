@@ -289,7 +289,7 @@ class SamplePairs:
         """Return notes on ignored elements, heights, range and samples, after iterating.
 
         Args:
-            counts_heights: Whether a metric uses heights.
+            counts_heights: Whether heights (z) count in a metric; if not, a note says so.
             canvas: Canvas of a metric that draws elements.
         """
         notes = list(self._mismatches)

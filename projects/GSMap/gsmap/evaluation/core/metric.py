@@ -185,7 +185,7 @@ class Metric(ABC):
 
     @property
     def counts_heights(self) -> bool:
-        """Whether distances are in space rather than in the plane."""
+        """Whether heights (z) count in the metric, as in distances in space. By default False."""
         return False
 
 

@@ -50,7 +50,7 @@ class Heights(Metric):
 
     @property
     def counts_heights(self) -> bool:
-        """Always True: both sides need heights."""
+        """Whether heights (z) count in the metric. This is True, as it compares heights."""
         return True
 
     def match(self, sample: Sample) -> SampleValues:

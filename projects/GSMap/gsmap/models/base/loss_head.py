@@ -49,7 +49,9 @@ class LossHead(DetectionHead):
         batch_img_metas: Metas,
         hooks: Sequence[FlowHook] = (),
     ) -> Tensors:
-        """Losses of every decoder layer and query group.
+        """Losses of every decoder layer and query group, from the annotations of the samples.
+
+        This method prepares the ground truth and calls `losses_by_feat`.
 
         Names of losses have the prefix ``d<layer>.`` in all layers but the last, and the name of
         the group as suffix in all groups but the first.
@@ -76,11 +78,13 @@ class LossHead(DetectionHead):
         metas: Metas,
         hooks: Sequence[FlowHook] = (),
     ) -> Tensors:
-        """Losses of every decoder layer and query group, as in `loss_by_feat`.
+        """Losses of every decoder layer and query group, from prepared ground truth.
+
+        `loss_by_feat` prepares the ground truth and calls this method.
 
         Args:
             outputs: Predictions of each layer, of all query groups.
-            truths: Ground truth of the batch.
+            truths: Ground truth of the batch, from `prepare_gts`.
             metas: Meta dict of each sample.
             hooks: Hooks that receive the matches of the first query group.
 

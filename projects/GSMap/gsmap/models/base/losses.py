@@ -15,8 +15,9 @@ from gsmap.utils.targets import NeedsTargets
 class MapLoss(nn.Module, NeedsTargets):
     """Loss of matched pairs: the weighted sum of `values`, divided by ``pairs.avg_factor``.
 
-    A subclass overrides `values` for a sum over pairs, or `forward` for any other loss. In the
-    first case, the pairs of all decoder layers are processed at once.
+    A subclass overrides one of three methods. A loss that is a sum over pairs overrides `values`;
+    the pairs of all decoder layers are then processed at once. Any other loss overrides `forward`,
+    which computes one layer, or `by_layer`, which computes all layers at once.
 
     Args:
         loss_weight: Weight of the loss, or a weight for each class, applied to the pairs of the
@@ -29,9 +30,10 @@ class MapLoss(nn.Module, NeedsTargets):
         name: Name of the loss, unique in a head. It is logged as ``loss_<name>``.
 
     Raises:
-        TypeError: If a subclass has a bool as a class attribute: flags are passed to the
-            constructor, which refuses misspelt names. Also if a loss that is not a sum over pairs
-            has a weight for each class.
+        TypeError: If a loss that is not a sum over pairs has a weight for each class. Also if a
+            class attribute of a subclass is a bool. Flags such as ``last_layer_only`` must be
+            passed to the constructor instead, because it refuses misspelt names, and a class
+            attribute with a misspelt name would be ignored.
     """
 
     name: str
@@ -78,7 +80,8 @@ class MapLoss(nn.Module, NeedsTargets):
 
     def forward(self, pairs: MatchedPairs) -> Tensor:
         """Weighted loss of one layer. Without pairs, it is 0 with a gradient of 0. ()"""
-        # If a subclass overrides this method, `by_layer` calls it instead, for each layer.
+        # This is no endless recursion: `by_layer` calls `forward` only if a subclass overrides it,
+        # and then this code does not run.
         (loss,) = self.by_layer(pairs)
         return loss
 
@@ -86,8 +89,8 @@ class MapLoss(nn.Module, NeedsTargets):
         """Weighted loss of each layer.
 
         Args:
-            pairs: Pairs of all layers. If a subclass overrides `forward`, it is called for the
-                pairs of each layer.
+            pairs: Pairs of all layers. If a subclass overrides `forward`, `forward` is called for
+                the pairs of each layer. Otherwise `values` is called once.
 
         Returns:
             The losses. (L,)

@@ -95,18 +95,22 @@ class BEVMaskHead(nn.Sequential, NeedsTargets):
         )
 
     def loss(self, bev_outputs: dict[str, Any], batch_data_samples: Samples) -> Tensor:
-        """Weighted loss of the features of the encoder. ()
+        """Weighted loss of the masks that are predicted from the features of the encoder.
 
         Args:
             bev_outputs: Outputs of the BEV encoder.
             batch_data_samples: Samples with targets.
+
+        Returns:
+            The loss. ()
 
         Raises:
             ValueError: If a sample has no target, or a target of another number of masks.
         """
         feats = bev_outputs[self.feats]
         target = stack_targets(self, batch_data_samples, name=self.target, device=feats.device)
-        # All axes before (masks, H, W) become one axis, of B masks or of B * V for V cameras.
+        # All axes before the last three, (masks, H, W), become one. BEV targets keep their axis of
+        # B samples; targets of V cameras, (B, V, masks, h, w), get one axis of B * V images.
         target = target.flatten(0, -4)
         if self.num_masks == 1:
             target = target.amax(1, keepdim=True)

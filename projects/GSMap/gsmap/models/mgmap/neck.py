@@ -1,4 +1,4 @@
-"""MGMap's neck: BEV features of three stages and their fusion, which is the fourth level."""
+"""MGMap's neck, whose output has four levels: BEV features of three stages, and their fusion."""
 
 from typing import Any
 

@@ -1,6 +1,7 @@
-"""StreamMapNet's head, with one query per element and branches shared by all layers.
+"""StreamMapNet's head, with one query per element and one class branch for all layers.
 
-The memory of earlier frames is implemented in `gsmap.models.streams`.
+The layers also share one regression branch, which is part of `LineReference`. The memory of
+earlier frames is implemented in `gsmap.models.streams`.
 """
 
 from typing import Any
@@ -59,7 +60,8 @@ class StreamMapNetHead(MapHead):
         num_queries = sum(group.num for group in self.query_groups)
         self.instance_embedding = nn.Embedding(num_queries, self.embed_dims)
         branch = nn.Linear(self.embed_dims, len(self.classes))
-        self.cls_branches = nn.ModuleList([branch] * len(self.cls_branches))  # one shared module
+        # All decoder layers share the class branch. `LineReference` shares its regression branch.
+        self.cls_branches = nn.ModuleList([branch] * len(self.cls_branches))
         # By default all queries are kept, also those with points far beyond the map.
         coder_settings: PartConfig = {"max_num": self.query_groups[0].num, "margin_m": None}
         coder_settings |= coder or {}

@@ -114,22 +114,25 @@ def bev_pool_conv3x3(
     table = table.view(-1, weight.shape[0])  # row = pixel * 9 + tap
     starts = counts.flatten().cumsum(0).view_as(counts) - counts  # first point of each cell
     # An output cell sums the points of its 3 x 3 neighbours, in the order of the filter's taps. The
-    # points of a neighbour are a range of the sorted points: `firsts` and `lengths`, (B H W 9,).
-    # `order` lists the points of all these ranges, one range after the other; a range begins at
-    # entry `range_starts` of the list. So entry i of the list, if it lies in range r, is the sorted
-    # point firsts[r] + (i - range_starts[r]). `shift` is firsts[r] - range_starts[r] for each i.
+    # points of one neighbour are successive sorted points. Their number and the index of the first
+    # one, for each output cell and neighbour r, (B H W 9,):
     lengths = _neighbours(counts)
     firsts = _neighbours(starts)
+    # The points of all neighbours are written into one list, one neighbour after the other. The
+    # points of neighbour r begin at entry range_starts[r] of the list.
     total = int(lengths.sum())
     range_starts = lengths.cumsum(0) - lengths
+    # Entry i of the list, which belongs to a neighbour r, is the sorted point
+    # firsts[r] + (i - range_starts[r]) = i + shift[i].
     shift = torch.repeat_interleave(firsts - range_starts, repeats=lengths, output_size=total)
     tap = torch.repeat_interleave(
         torch.arange(9, device=cells.device).repeat(counts.numel()),
         repeats=lengths,
         output_size=total,
     )
-    order = torch.arange(total, device=cells.device) + shift
-    bag_ends = lengths.view(-1, 9).sum(-1).cumsum(0)  # a bag is the nine ranges of an output cell
+    order = torch.arange(total, device=cells.device) + shift  # index of the sorted point
+    # `embedding_bag` sums over bags. A bag is the entries of the nine neighbours of an output cell.
+    bag_ends = lengths.view(-1, 9).sum(-1).cumsum(0)
     sums = F.embedding_bag(
         pixels[order] * 9 + tap,
         table,

@@ -91,7 +91,8 @@ def score_result(
         meta: Metadata of the annotation file.
         allow_mismatch: Whether samples may differ from the ground truth. A sample without results
             then counts as without predictions, and results without ground truth are ignored.
-        allow_other_split: Whether the model may be of another split than the ground truth.
+        allow_other_split: Whether the model may have been trained on another list of scenes than
+            the list of the ground truth, or the results be for such other data.
         law: Distribution of the errors, ``normal`` or ``laplace``; by default the distribution of
             the model's calibration in the file, or ``normal`` without a calibration.
 
@@ -108,14 +109,17 @@ def score_result(
     for token, elements, _ in file:
         predictions[token] = elements
     if not allow_other_split:
+        # Refuse results for other data, or of a model that was trained on another list of scenes.
         require_results_of(meta.split_list, about=file.about, path=path)
     try:
         notes = mismatch_notes(predictions, truth, allowed=allow_mismatch)
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error
-    # Number of predictions by unknown class, and number of samples with heights (`THREE_D`).
+    # `file.ignored` has the number of predictions of each unknown class, by the name of the class.
+    # Its entry `THREE_D` is no class: it is the number of samples whose predictions have heights.
     num_ignored = dict(file.ignored)
-    if num_ignored.pop(THREE_D, 0):
+    num_samples_with_heights = num_ignored.pop(THREE_D, 0)
+    if num_samples_with_heights:
         notes.append("some predictions have heights, which no figure here counts")
     for class_name, count in sorted(num_ignored.items()):
         notes.append(f"{count} predictions of class {class_name!r} are not scored")
@@ -129,7 +133,7 @@ def score_result(
         )
         chamfer = cast(FrameMatches, values["chamfer"])
         sample_values.append(values)
-        matches[chamfer.token] = chamfer
+        matches[token] = chamfer
     return ScoredResult(
         name,
         predictions=predictions,
