@@ -307,5 +307,5 @@ def _shift_of(area: shapely.Polygon, matches: _Matches) -> Shift:
     weights = np.array(matches.scores) / variances
     mean = weights @ shifts / weights.sum()  # (2,)
     direction = mean / max(float(np.linalg.norm(mean)), 1e-9)
-    # Distances along the direction of the mean shift.
+    # Only the part of each shift along the direction of the mean shift counts as its distance.
     return Shift.of_frames(shifts @ direction, variances=variances, weights=weights)

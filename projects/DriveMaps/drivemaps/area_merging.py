@@ -34,7 +34,7 @@ def merge_areas(drive: Drive, label: int, config: MergeConfig) -> list[tuple[Flo
         Closed ring in metres in the global frame, (n, 2), and mean confidence in [0, 1] of each
         area.
     """
-    # One entry for each detection.
+    # Each list has one entry for each detection.
     areas: list[shapely.Geometry] = []
     frames: list[int] = []
     scores: list[float] = []

@@ -126,7 +126,17 @@ class Shift:
 
 
 def smooth_share(support: float, views: float) -> float:
-    """Share of the frames that support a change, as if two more frames were against it."""
+    """Share of the frames that support a change, as if two more frames were against it.
+
+    So the share is low if few frames have the element in view.
+
+    Args:
+        support: Number of frames that support the change. A frame may count in part, by a score.
+        views: Number of frames that have the element in view.
+
+    Returns:
+        ``support / (views + 2)``, clipped to [0, 1].
+    """
     return float(np.clip(support / (views + _PRIOR_VIEWS), 0, 1))
 
 

@@ -56,7 +56,7 @@ def border_distances(
     Returns:
         Distances in metres, infinite where there is no border. (n,)
     """
-    # A ray from each vertex across the line.
+    # A ray starts at each vertex and goes across the line, to the given side.
     across = side * reach_m * rotate_to_left(line_directions(line))
     rays = shapely.linestrings(np.stack([line, line + across], axis=1))
     rows, border_indices = borders.query(rays, predicate="intersects")

@@ -31,9 +31,9 @@ _REPEAT_M = 1.5
 _MOST_POINTS = 25  # number of points after which a centre line is cut, as the width of lanes varies
 _LEAST_POINTS = 3  # smallest number of points between two cuts of a centre line
 _MIN_PARALLEL_COSINE = 0.7  # smallest cosine between the directions of two passes through one lane
-# Kinds of lanes between two points.
-_OUTSIDE = 0
-_BORDERED = 1
+# The lane between two points of a track has one of these kinds.
+_OUTSIDE = 0  # no lane, such as where the vehicle changes lanes
+_BORDERED = 1  # a lane with a border on each side
 _OPEN = 2  # without borders, between two lanes
 
 

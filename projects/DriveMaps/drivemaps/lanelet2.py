@@ -95,7 +95,7 @@ class _OSMFile:
 
     def __init__(self, origin: MapOrigin | MapGrid) -> None:
         self._origin = origin
-        # The kinds are written in this order.
+        # The elements of a file are sorted by kind, in the order of these keys.
         self._elements_of_kind: dict[str, list[ElementTree.Element]] = {
             "node": [],
             "way": [],

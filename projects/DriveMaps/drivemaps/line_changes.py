@@ -129,7 +129,7 @@ def line_changes(
     num_old = len(lines.points)
     matches = match_vertices(joined, normals, queries=np.arange(num_old))
     evidence = _Evidence.of_points(lines.points, passes, label)
-    # Sum of the scores of the predictions that match each old vertex.
+    # The support of an old vertex is the sum of the scores of the predictions that match it.
     scores = joined.scores[matches.segments]
     support = np.bincount(matches.vertices, scores, minlength=num_old)
     changes = []
@@ -138,9 +138,10 @@ def line_changes(
         in_view, num_agreeing = evidence.count_passes(part, seen=False)
         if not num_agreeing:
             continue
-        num_without = float((views - support)[part].mean())  # a match counts by its score
+        # This is the mean number of frames that do not show a vertex of the part. A frame with a
+        # match of score s counts as 1 - s frames without the part.
+        num_without = float((views - support)[part].mean())
         old_score = float(lines.scores[part].mean())
-        # `smooth_share` is the share of the frames, lowered where few frames have the part in view.
         change = Change(
             REMOVED,
             label,
@@ -298,11 +299,13 @@ def _added(old: MapElements, passes: list[Pass], label: int) -> list[Change]:
                 continue
             num_views = float(views[part].mean())
             score = float(lines.scores[part].mean())
+            # The score stands for the share of the frames that support the part.
+            support = score * num_views
             change = Change(
                 ADDED,
                 label,
                 line=lines.points[part],
-                confidence=smooth_share(score * num_views, num_views),
+                confidence=smooth_share(support, num_views),
                 passes_in_view=in_view,
                 num_passes=num_agreeing,
             )

@@ -64,8 +64,8 @@ def merge_lines(drive: Drive, label: int, config: MergeConfig) -> list[tuple[Flo
     num_frames = drive.count_frames_in_range(lines.points)
     share = score_sum / np.maximum(num_frames, 1)
     # A vertex at a sharp corner has no match. The median of three gives it its neighbours' share.
-    smooth_share = median_filter(share, 3)
-    confidence = np.minimum(smooth_share, 1.0)
+    filtered_share = median_filter(share, 3)
+    confidence = np.minimum(filtered_share, 1.0)
     is_confident = confidence >= config.min_confidence
     parts = _select_parts(lines, matches=matches, confidence=confidence, is_confident=is_confident)
     columns = np.column_stack([lines.points, confidence])  # x, y, confidence. (M, 3)

@@ -164,7 +164,7 @@ def figures_table(figures: Mapping[str, Mapping[str, Mapping[str, float]]]) -> s
         A table with a row per figure and map, and a column per class, in percent.
     """
     first_figures = next(iter(figures.values()))
-    # Classes of all figures, in the order in which they first occur.
+    # The columns are the classes of all figures, in the order in which they first occur.
     columns: list[str] = []
     for values in first_figures.values():
         columns += [key for key in values if key not in (*columns, "mean")]

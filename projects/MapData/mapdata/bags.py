@@ -224,7 +224,8 @@ def _choose_vehicle(content: BagContent, wanted: str | None) -> str:
     try:
         return content.tree.choose_vehicle(wanted)
     except ValueError as error:
-        # Topics of which no message can be read, and topics of which some messages cannot be read.
+        # `unreadable` topics have no message that can be read. `unread` topics have some messages
+        # that cannot be read.
         topics = [*content.unreadable, *content.unread]
         if not topics:
             raise

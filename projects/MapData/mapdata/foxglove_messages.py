@@ -70,6 +70,7 @@ def _transforms(message: Any) -> Any:
 
 
 def _transform(item: Any) -> Any:
+    """Convert one of the transforms of a message."""
     header = _header(item)
     header.frame_id = item.parent_frame_id
     transform = SimpleNamespace(translation=item.translation, rotation=item.rotation)

@@ -125,9 +125,9 @@ class LanePaths:
                     )
         nodes: list[int] = []
         path_of_node: list[int] = []
-        for number, path in enumerate(paths):
+        for path_index, path in enumerate(paths):
             nodes += path
-            path_of_node += [number] * len(path)
+            path_of_node += [path_index] * len(path)
         points = self._points[np.array(nodes, dtype=np.int64)]
         lines = shapely.linestrings(points, indices=np.array(path_of_node, dtype=np.int64))
         self._last_key = key

@@ -162,11 +162,11 @@ class OutlineIndex:
     def __init__(self, rings: np.ndarray) -> None:
         self._chunks = []
         owners = []
-        for number, ring in enumerate(rings):
+        for ring_index, ring in enumerate(rings):
             points = shapely.get_coordinates(ring)
             for start in range(0, len(points) - 1, _CHUNK_SEGMENTS):
                 self._chunks.append(points[start : start + _CHUNK_SEGMENTS + 1])
-                owners.append(number)
+                owners.append(ring_index)  # the owner of a chunk is its ring
         self._owners = np.array(owners, np.int64)
         self._tree = shapely.STRtree([shapely.LineString(points) for points in self._chunks])
 
@@ -187,8 +187,8 @@ class OutlineIndex:
         x_range = (x0 + margin_m, x1 - margin_m)
         y_range = (y0 + margin_m, y1 - margin_m)
         pieces = []
-        for number in np.unique(self._owners[near]):
-            for run in self._runs(near[self._owners[near] == number]):
+        for ring_index in np.unique(self._owners[near]):
+            for run in self._runs(near[self._owners[near] == ring_index]):
                 parts = [self._chunks[run[0]]]
                 for chunk in run[1:]:
                     parts.append(self._chunks[chunk][1:])  # chunks share a point

@@ -255,14 +255,14 @@ def run(arguments: argparse.Namespace) -> str:
         lines.append(f"{share:7.1%} of {len(rows)} within 5 m on map {name!r}")
     if arguments.out:
         samples = []
-        for number, row in enumerate(nearest):
-            has_training = row >= 0
+        for val_row, train_row in enumerate(nearest):
+            has_training = train_row >= 0
             sample = {
-                "token": str(val.tokens[number]),
-                "scene": str(val.scenes[number]),
-                "map": str(val.maps[number]),
-                "distance_m": round(float(distance[number]), 3) if has_training else None,
-                "nearest": str(train.tokens[row]) if has_training else None,
+                "token": str(val.tokens[val_row]),
+                "scene": str(val.scenes[val_row]),
+                "map": str(val.maps[val_row]),
+                "distance_m": round(float(distance[val_row]), 3) if has_training else None,
+                "nearest": str(train.tokens[train_row]) if has_training else None,
             }
             samples.append(sample)
         write_text(arguments.out, json.dumps(samples, indent=1) + "\n")

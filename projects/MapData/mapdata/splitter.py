@@ -93,7 +93,7 @@ def split_scenes(
     rng = np.random.default_rng(seed)
     parts: dict[str, list[str]] = {"train": [], "val": []}
     for rows in places.by_map().values():
-        # Names of the scenes on this map, and the index of the scene of each sample.
+        # `names` are the scenes on this map, and `scenes` is the index of each sample's scene.
         names, scenes = np.unique(places.scenes[rows], return_inverse=True)
         count = round(val_share * len(names))
         if not count:

@@ -175,7 +175,7 @@ def _draw_polylines(
     nearness = np.log(10 / np.maximum(depth_m, 0.1))  # 0 at 10 m
     # Widths are proportional to depth to the power of -0.6, in steps of _WIDTH_STEP.
     width_level = np.rint(0.6 * nearness / _WIDTH_STEP).astype(int)
-    # One path for each class and width.
+    # All segments of one class and one width make one path, so that few paths are drawn.
     keys = np.c_[segment_labels[index], width_level]
     kinds, kind_of_segment = np.unique(keys, axis=0, return_inverse=True)
     paths = []

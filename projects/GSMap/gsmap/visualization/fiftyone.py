@@ -177,7 +177,7 @@ def _visible_parts(line: np.ndarray, camera: CameraRecord) -> list[list[list[flo
     breaks = [i + 1 for i, (before, after) in enumerate(pairwise(index)) if after != before + 1]
     parts = []
     for run in np.split(shares, breaks):
-        # The start of each segment, and the end of the last one.
+        # The points are the start of each segment, and the end of the last one.
         vertices = np.concatenate([run[:, 0], run[-1:, 1]])
         parts.append(vertices.tolist())
     return parts

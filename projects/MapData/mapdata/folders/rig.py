@@ -110,7 +110,7 @@ class RigCamera:
         lens = cv2.fisheye if self.model in FISHEYE_MODELS else cv2
         width, height = self.size_px
         small_intrinsics = np.diag([_GRID / width, _GRID / height, 1.0]) @ self.intrinsics
-        # Position in the original image of each pixel of a small rectified image.
+        # x and y are the position of each pixel of a small rectified image in the original image.
         x, y = lens.initUndistortRectifyMap(
             self.intrinsics,
             self.distortion,
@@ -203,7 +203,7 @@ class PoseTrack:
         matrices = np.array(list(poses), dtype=np.float64)
         if not len(times) or not np.isfinite(matrices).all():
             raise InputError("poses must be finite, at least one.")
-        # Distinct times, ascending, and the index of the first pose at each of them.
+        # Times become distinct and ascending. If a time has several poses, the first one is kept.
         self.times_ns, first = np.unique(times, return_index=True)
         self.poses = matrices[first]
         self.gap_ns = gap_ns

@@ -70,11 +70,13 @@ class _PlainUnpickler(pickle._Unpickler):
         self._top(CheckedArray, CheckedDtype).__setstate__(state)
 
     def _set_item(self) -> None:
+        """Add the key and the value on top of the stack to a dict (opcode ``SETITEM``)."""
         value = self.stack.pop()
         key = self.stack.pop()
         _fill(self._top(dict), [key, value])
 
     def _set_items(self) -> None:
+        """Add all keys and values since the last mark to a dict (opcode ``SETITEMS``)."""
         items = self.pop_mark()
         _fill(self._top(dict), items)
 

@@ -272,8 +272,8 @@ class Log:
             rows = {}
             for camera in self.cameras:
                 rows[camera.name] = self._sync[camera.key].to_pylist()
-        for number, time in enumerate(times):
+        for frame_index, time in enumerate(times):
             row_of_camera = {}
             for name, column in rows.items():
-                row_of_camera[name] = column[number]
+                row_of_camera[name] = column[frame_index]
             yield 1000 * int(time), row_of_camera

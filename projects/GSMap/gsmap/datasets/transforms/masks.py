@@ -129,18 +129,18 @@ class MakeInstanceMasks(BaseTransform):
             )
         masks = np.zeros((len(instances), *self.size), dtype=np.uint8)
         gaps = np.zeros_like(masks)
-        for number, instance in enumerate(instances):
+        for index, instance in enumerate(instances):
             cells = bev_cells(instance, results, size=self.size)
-            _draw_line(masks[number], cells, thickness_px=self.thickness_px)
-            _draw_line(gaps[number], cells, thickness_px=self.gap_px)
+            _draw_line(masks[index], cells, thickness_px=self.thickness_px)
+            _draw_line(gaps[index], cells, thickness_px=self.gap_px)
         labels = np.array([instance.label for instance in instances])
-        for number, label in enumerate(labels):
-            later_masks = masks[number + 1 :]
-            later_labels = labels[number + 1 :]
+        for index, label in enumerate(labels):
+            later_masks = masks[index + 1 :]
+            later_labels = labels[index + 1 :]
             later_of_class = later_masks[later_labels == label]
             gaps_of_higher_labels = gaps[labels > label]
             blocked = np.concatenate([later_of_class, gaps_of_higher_labels])
-            masks[number] &= ~blocked.any(0)
+            masks[index] &= ~blocked.any(0)
         masks = masks[..., ::-1] if self.mirrored else masks
         results["gt_instances_3d"].masks = torch.from_numpy(masks.astype(bool))
         return results

@@ -112,7 +112,7 @@ def _convert_tracks(values: list[object], results: Path, token: str) -> IntArray
 
 def _check_tracks(ids: IntArray, elements: MapElements, results: Path, token: str) -> None:
     """Raise ValueError if two elements of a class have equal tracks."""
-    # Different pairs of a label and a track, one per column.
+    # A column of `pairs` is a label and a track. Each pair that occurs has one column.
     pairs, counts = np.unique([elements.labels, ids], axis=1, return_counts=True)
     tracks = pairs[1]
     repeated = tracks[(counts > 1) & (tracks >= 0)]

@@ -251,7 +251,7 @@ def _nearest(sample: Sample, config: ChamferConfig) -> tuple[IntArray, FloatArra
 
 
 def _match(sample: Sample, config: ChamferConfig) -> FrameMatches:
-    """Match the predictions of one sample with its ground truth."""
+    """Match the predictions of one sample, as `match_chamfer`, with the cache of the sample."""
     token = sample.token
     predictions = sample.predictions
     ground_truth = sample.ground_truth

@@ -236,7 +236,7 @@ def _check_lengths(elements: MapElements) -> None:
     max_step = 2 * float(max_coordinate) * points.shape[1] ** 0.5
     if max_step * len(points) <= MAX_LENGTH_M:
         return
-    # Length of the step to each vertex from the one before it, 0 for the first of a line.
+    # A step leads to a vertex from the one before it. Its length is 0 for the first of a line.
     steps = np.linalg.norm(np.diff(points, axis=0, prepend=points[:1]), axis=1)
     starts = elements.offsets[:-1]
     first_vertices = starts[starts < len(steps)]  # lines without vertices may be at the end

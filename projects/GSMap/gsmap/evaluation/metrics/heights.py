@@ -76,7 +76,7 @@ class Heights(Metric):
             nearest = distance.argmin(axis=1)
             errors[index, 0] = pred[:, 2] - gt[nearest, 2]
             errors[index, 1] = distance.min(axis=1)
-        # Columns of the table from which `reports` computes the means.
+        # These arrays become columns of the table from which `reports` computes the means.
         return SampleValues(token, {"labels": matches.labels[rows], "errors": errors})
 
     def _resample(self, elements: MapElements) -> FloatArray:

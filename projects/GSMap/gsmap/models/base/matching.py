@@ -136,7 +136,7 @@ class MapAssigner:
         """
         num_layers = len(predictions.layers)
         num_queries = predictions.scores.shape[1] // num_layers
-        # Index of the first query of each layer among the queries of all layers.
+        # Among the queries of all layers, query i of layer l has the index first_query[l] + i.
         first_query = num_queries * torch.arange(num_layers)[:, None]
         indices = []
         counts = []

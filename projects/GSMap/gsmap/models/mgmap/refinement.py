@@ -28,10 +28,10 @@ def crop_patches(feats: Tensor, centres: Tensor) -> Tensor:
     """
     height, width = feats.shape[2:]
     size = constant(centres, [width, height])
-    # Sampling points in [0, 1] over a patch.
+    # Compute the sampling points in [0, 1] over a patch.
     steps = (torch.arange(BINS * SAMPLES, device=feats.device) + 0.5) / (BINS * SAMPLES)
     grid = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), dim=-1)  # (10, 10, 2)
-    # Sampling points in cells of the map.
+    # Convert the sampling points to cells of the map.
     corners = (centres.clamp(max=1.0) - _PATCH_SHARE / 2) * size
     patch_size = (_PATCH_SHARE * size).clamp(min=1.0)
     samples = corners[:, :, None, None] + grid * patch_size  # (B, Q, 10, 10, 2)
