@@ -153,9 +153,9 @@ class Drive:
         points = elements.points[:, :2]
         low = np.minimum.reduceat(points, starts)  # (N, 2)
         high = np.maximum.reduceat(points, starts)  # (N, 2)
-        # Whether bounding boxes overlap the square around the frame, by axis. (N, 2)
-        starts_before = low <= frame.origin + self.reach_m
-        ends_after = high >= frame.origin - self.reach_m
+        # An element is near if its bounding box overlaps the square around the frame on both axes.
+        starts_before = low <= frame.origin + self.reach_m  # (N, 2)
+        ends_after = high >= frame.origin - self.reach_m  # (N, 2)
         is_near = (starts_before & ends_after).all(axis=1)
         return elements.select(nonempty[is_near])
 

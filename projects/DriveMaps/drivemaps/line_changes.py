@@ -230,7 +230,7 @@ def _moved(
         label: Index of the class.
     """
     num_old = len(normals)
-    # Shift of each vertex: mean distance over the passes, smoothed along its line.
+    # The shift of a vertex is its mean distance over the passes, smoothed along its line.
     shifts = moves.shifts(num_old)
     for start, end in zip(lines.offsets[:-1], lines.offsets[1:], strict=True):
         shifts[start:end] = median_filter(shifts[start:end], _WINDOW, mode="nearest")

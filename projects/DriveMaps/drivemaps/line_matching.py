@@ -283,7 +283,8 @@ def _select_matches(lines: DenseLines, candidates: Matches) -> Matches:
         is_selected &= distances <= nearest_rival_m[rows] / 2.0
     matches = candidates.select(is_selected)
     frames = lines.frames[matches.segments]
-    # Sort by vertex, then by frame, distance and segment; the first of each vertex and frame stays.
+    # Matches are sorted by vertex, then by frame, distance and segment. For each vertex and frame,
+    # only the first one is kept, which is the nearest.
     order = np.lexsort((matches.segments, np.abs(matches.distances), frames, matches.vertices))
     matches = matches.select(order)
     is_new_vertex = np.diff(matches.vertices, prepend=-1) != 0

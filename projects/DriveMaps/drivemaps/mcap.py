@@ -174,7 +174,7 @@ class _Log:
         if moment.ellipses is None:
             return
         messages = self._messages
-        # One ellipse for each vertex of the predictions: (M, 3), (M, 2) and (M, 4)
+        # Each of the M vertices of the predictions has one ellipse. (M, 3), (M, 2) and (M, 4)
         centres, half_axes, quaternions = moment.ellipses
         vertex_labels = np.repeat(elements.labels, elements.num_points)
         spheres = []

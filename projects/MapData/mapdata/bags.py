@@ -78,7 +78,7 @@ def _read_samples(bag: Bag, path: Path, options: InputOptions) -> Source:
     listing = _listing(bag)
     calibration = options.calibration
     notes = list(bag.notes)
-    # Pose of the ground below the vehicle in the vehicle's frame. (4, 4)
+    # This is the pose of the ground below the vehicle, in the vehicle's frame. (4, 4)
     ground = rigid(np.eye(3), (0, 0, options.vehicle_ground_z_m or 0.0))
     check_topics(kinds, options.topics, listing=listing, needs_info=calibration is None)
     if calibration is None:

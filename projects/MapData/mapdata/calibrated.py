@@ -131,5 +131,5 @@ def _in_frame(sample: MapSample, record: Mapping[str, Any], meta: AnnotationMeta
         sample_with_mount = replace(sample, ego_from_frame=np.asarray(ego_from_frame, np.float64))
         ground = ground_from_frame(sample_with_mount, meta.frame, ground_z_m=ground_z_m)
         mount = Mount(meta.frame, ground_z_m=ground_z_m, ground_from_frame=ground)
-    # From the frame "ego" of the given sample to the annotation frame
+    # The given sample is in the frame "ego"; `mount` defines the annotation frame.
     return change_frame(sample, "ego", mount)

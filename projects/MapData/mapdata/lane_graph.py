@@ -68,16 +68,18 @@ class LanePaths:
             if not np.isfinite(line).all():
                 raise InputError(f"polylines[{i}] holds NaN or infinity.")
         rounded = np.round(np.concatenate([np.empty((0, 3)), *polylines]), decimals=ROUND_DECIMALS)
-        # Distinct points, the id of the point at each vertex of all lanes, and the number of
-        # vertices at each point.
+        # Vertices at one place become one point. `nodes` is the index of the point of each vertex,
+        # and `uses` the number of vertices of each point.
         self._points, nodes, uses = np.unique(
             rounded, axis=0, return_inverse=True, return_counts=True
         )  # (nodes, 3)
-        # Ids of the points of each lane; `split` returns an empty part after the last lane.
+        # A lane is the list of the indices of its points. `split` also returns an empty part after
+        # the last lane, which is dropped.
         ends = np.cumsum(list(map(len, polylines)), dtype=np.int64)
         lanes = [lane.tolist() for lane in np.split(nodes, ends)[:-1]]
         self._edges = [_fold_points(lane, uses=uses) for lane in lanes]
-        # For each lane its links: the two lanes, and the edge between them with its start point.
+        # Each lane has a list of links. A link is two lanes that follow each other, and the edge
+        # between them with its start point.
         self._links: list[list[tuple[int, int, tuple[int, Edge]]]] = []
         for lane_links in links:
             link_edges: list[tuple[int, int, tuple[int, Edge]]] = []

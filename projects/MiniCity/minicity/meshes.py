@@ -185,7 +185,7 @@ def patches(face: Array, left: Array, right: Array, bottom: Array, top: Array) -
     Returns:
         Corners of each part in the order of ``face``, in metres. (n, 4, 3)
     """
-    # Shares of the width and of the height for the four corners of each part. (n, 4, 1)
+    # The four corners of a part are at these shares of the width and of the height. (n, 4, 1)
     across = np.stack([left, right, right, left], axis=1)[..., None]
     upward = np.stack([bottom, bottom, top, top], axis=1)[..., None]
     foot = face[0] + across * (face[1] - face[0])

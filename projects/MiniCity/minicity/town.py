@@ -293,7 +293,8 @@ def _add_buildings(town: Town, blocked: Polygon, rng: np.random.Generator) -> No
     centers = np.zeros((0, 2))  # centres of the houses that have been added
     for road in town.roads:
         dense = rng.random() < 0.75
-        # Side of the road, 1 for left and -1 for right, and distance of its kerb.
+        # `sign` is the side of the road, 1 for left and -1 for right. `kerb` is the distance of its
+        # kerb from the centre line.
         for sign, kerb in ((1, road.section.left_m), (-1, -road.section.right_m)):
             arc_m = float(rng.uniform(low=0, high=10))
             while arc_m < road.length_m - 5:
@@ -311,7 +312,7 @@ def _add_buildings(town: Town, blocked: Polygon, rng: np.random.Generator) -> No
                 arc_m += front + float(gap)
                 outline = Polygon(house.footprint)
                 center = house.footprint.mean(axis=0)
-                # The larger one of the distances in x and in y.
+                # Houses are near if both their distances, in x and in y, are small.
                 distances = np.abs(centers - center).max(axis=1, initial=0.0)
                 neighbours = np.flatnonzero(distances < LARGEST_HOUSE_M)
                 if blocked.intersects(outline) or _touches_building(town, outline, neighbours):

@@ -143,8 +143,8 @@ def vehicle_mesh(vehicles: list[Vehicle]) -> FrozenMesh:
     quads = np.concatenate([t.quads for t in templates])
     discs = np.concatenate([t.discs for t in templates])
     discs[:, :3] += floor[disc_groups]  # no rotation: the disc of a head lies on the vertical axis
-    # Rotation of each of the four corners of a quad. (F, 4, 3)
-    turned_quads = np.einsum("fij,fkj->fki", turn[quad_groups], quads)
+    # Each of the four corners k of a quad f is rotated by the matrix of the quad's vehicle.
+    turned_quads = np.einsum("fij,fkj->fki", turn[quad_groups], quads)  # (F, 4, 3)
     world_quads = turned_quads + floor[quad_groups][:, None]
     return FrozenMesh(
         quads=world_quads,

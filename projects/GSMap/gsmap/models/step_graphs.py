@@ -231,7 +231,7 @@ class _Replay(torch.autograd.Function):
         param_grads = []
         for grad in recording.param_grads:
             param_grads.append(None if grad is None else grad.detach())
-        # None for the recording, the number of inputs, and the inputs.
+        # The recording, the number of inputs, and the inputs have no gradient.
         return (None, None, *[None] * ctx.num_inputs, *param_grads)
 
 

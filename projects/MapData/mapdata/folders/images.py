@@ -215,7 +215,8 @@ def _group_images(
     rate = rate_hz or _RATE_HZ
     first_images = next(iter(images.values()))
     time_of = {}
-    # Path and time in nanoseconds of each camera's image, by the name without suffix.
+    # An entry has the path and the time in nanoseconds of the image of each camera. Its key is the
+    # name of these images without suffix.
     images_by_stem: dict[str, dict[str, tuple[str, int]]] = {}
     for i, path in enumerate(first_images):
         time_of[path.stem] = round(i * 1e9 / rate)

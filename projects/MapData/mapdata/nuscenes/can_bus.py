@@ -31,7 +31,7 @@ def signals_at(timestamp_ns: int, global_from_ego: np.ndarray, messages: Message
     """
     signals = pose_signals(global_from_ego)
     times_us, measurements = messages
-    # Index of the latest message at or before the time; -1 without one.
+    # The latest message at or before the time counts. Its index is -1 if there is none.
     latest = int(np.searchsorted(times_us, timestamp_ns // 1000, side="right")) - 1
     if latest >= 0:
         signals[7:16] = measurements[latest]  # after the position (3) and the quaternion (4)

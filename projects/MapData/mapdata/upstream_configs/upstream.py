@@ -463,7 +463,7 @@ def _rendered_mask_settings(fields: Fields, settings: dict[str, Any]) -> None:
     settings[_HEAD + "dice_cost"] = {"weight": dice_cost_weight}
     cost_weight = settings[_HEAD + "match_costs.1.weight"]
     if points_weight != cost_weight:
-        # GSMap has one weight for loss and cost, so a different cost weight counts as unplaced
+        # GSMap has one weight for loss and cost, so a different cost weight counts as unplaced.
         fields.section(f"{_COSTS}.pts_cost")["weight"] = cost_weight
 
 
@@ -477,7 +477,7 @@ def _margin_settings(fields: Fields, settings: dict[str, Any], sides: tuple[floa
         settings: Converted settings, to which the margin is added.
         sides: Smallest and largest x, then y, of the map in metres.
     """
-    # Smallest x and y of both corners of a prediction's box, then their largest x and y.
+    # The limits are the smallest x and y of both corners of a prediction's box, then the largest.
     limits = fields.section(f"{_PTS_HEAD}.bbox_coder").get("post_center_range", ())
     if len(limits) != 8:
         return

@@ -52,7 +52,7 @@ class AnnotatedTruth:
         missing = [name for name in classes if name not in names]
         if missing:
             raise InputError(f"{path} has the classes {names}, not {missing}.")
-        # Label in ``classes`` by the label in the file.
+        # The entry of a label of the file is the label in ``classes``, or -1 for other classes.
         self._labels = np.full(len(names), fill_value=-1)
         for label, name in enumerate(names):
             if name in classes:

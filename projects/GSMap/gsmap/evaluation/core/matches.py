@@ -249,7 +249,7 @@ class MatchTable:
         for label, (name, class_thresholds) in enumerate(thresholds.items()):
             places = np.flatnonzero(labels == label)
             samples_of_class = samples[places]  # ascending
-            # Place of the first prediction of each prediction's sample.
+            # The rank of a prediction is counted from the first prediction of its sample.
             first_of_sample = np.searchsorted(samples_of_class, samples_of_class)
             ranks = np.arange(len(places)) - first_of_sample
             by_score = np.argsort(-scores[places], kind="stable")

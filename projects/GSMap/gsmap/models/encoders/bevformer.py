@@ -73,7 +73,7 @@ class SpatialCrossAttention(SamplingAttention):
         for feats, offset, weight in zip(levels, offsets, weights, strict=True):
             height, width = feats.shape[-2:]
             offset = offset / constant(query, [width, height])
-            # Shape (B, V, h * w, heads, C / heads).
+            # The shape of `value` is (B, V, h * w, heads, C / heads).
             value = self.values(feats.flatten(3).transpose(2, 3)).float()
             if self.fixed_sizes:
                 summed = summed + _sample_all_pairs(

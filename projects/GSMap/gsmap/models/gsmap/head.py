@@ -135,8 +135,8 @@ class GSMapHead(MapHead):
         detections = super().select_detections(fields, best)
         if self.temperatures is None:
             return detections
-        # The temperatures of the class of each detection, (M, 2): along and across the line.
-        factors = constant(detections["scales"], self.temperatures)[best.labels]
+        # A detection is stretched along and across the line, by the temperatures of its class.
+        factors = constant(detections["scales"], self.temperatures)[best.labels]  # (M, 2)
         gaussians = Gaussians(
             means=detections["pts"][..., :2],
             scales=detections["scales"],

@@ -39,7 +39,7 @@ def dense_clusters(points: Points, eps: float, min_neighbours: int) -> Indices:
     high = np.searchsorted(points[0], points[0] + eps, side="right")
     seeds = np.argsort(order)  # position of each given point in the sorted order
     labels = np.empty(len(order), dtype=np.int64)
-    # Labels of the sorted points, written to the positions of the given points.
+    # The labels of the sorted points are written to the positions of the given points.
     labels[order] = _clusters(points, seeds, low, high, eps**2, min_neighbours)
     return labels
 

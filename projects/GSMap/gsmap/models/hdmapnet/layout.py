@@ -37,7 +37,7 @@ def pixels_from_metres(points: NDArray[Any], grid: BEVGrid) -> NDArray[np.float6
     pixels = (points.astype(np.float64) - low) * scale
     if grid.forward == "x":
         return pixels
-    # Columns along y, and rows from the largest x, as in `orient_forward`.
+    # Columns run along y, and rows are counted from the largest x, as in `orient_forward`.
     return np.stack([pixels[..., 1], grid.width - pixels[..., 0]], axis=-1)
 
 

@@ -236,7 +236,7 @@ class PivotBEVEncoder(CameraEncoder):
             inside the image of their camera. (B, H * W)
         """
         matrices = img_from_ground.float()
-        # From (x from the left, y from the front) to (from the front, from the left).
+        # `flip` changes (position from the left, position from the front) to the reverse order.
         cell_centres = centres([front_size(self.grid)], matrices.device).flip(-1)
         points = F.pad(self.grid.metres_from_front(cell_centres), (0, 1))  # z = 0
         points = F.pad(points, (0, 1), value=1.0)  # (Q, 4)

@@ -97,7 +97,7 @@ class PivotLosses(LineLosses):
         points = np.arange(num_points)
         for pair, (row, col) in enumerate(zip(rows.tolist(), cols.tolist(), strict=True)):
             line = pivots[col, : counts[col]]
-            # Index of the point for each pivot, ascending.
+            # `path` has the index of the point for each pivot, in ascending order.
             path = match_pivots(differences[row, col, : len(line)])
             is_pivot[pair, path] = True
             # The targets of the points between two pivots are spaced evenly between them.

@@ -301,7 +301,7 @@ class Propagation(FlowHook):
             # Distributed training requires a gradient of every parameter in every step.
             parameters = [parameter.sum() for parameter in self.memory.parameters()]
             return 0.0 * torch.stack(parameters).sum()
-        # The references of the propagated queries, refined by the branch of the first layer.
+        # The branch of the first layer refines the references of the propagated queries.
         state = _flatten_instances(self.propagated.state)
         pred = head.reference.refine(
             0,

@@ -182,7 +182,7 @@ class KeyPointHead(DetectionHead):
             KeyPointLayer(embed_dims, **layer_settings) for _ in range(num_layers)
         )
         self.cls_branch = nn.Linear(_CORNERS * embed_dims, len(classes))
-        # The layers of a classification branch, with two outputs: the x and y of a corner.
+        # The corner branch has the layers of a classification branch, but two outputs: x and y.
         self.corner_branch = classification_branch(embed_dims, num_classes=2)
         focal_loss = {"type": "mmdet.FocalLoss", "use_sigmoid": True, "loss_weight": cls_weight}
         self.loss_cls = MODELS.build(focal_loss)
