@@ -113,9 +113,8 @@ def run(args: argparse.Namespace) -> None:
             reason = lines[-1] if lines else ""
             cells = [f"failed: {type(error).__name__}: {reason:.200}"]
             correct = False
-        if not correct:
-            verdicts[case.kernel] = False
-        verdicts.setdefault(case.kernel, True)
+        # A kernel is correct if all of its cases are.
+        verdicts[case.kernel] = correct and verdicts.get(case.kernel, True)
         publish_line("| " + " | ".join([case.kernel, case.size, *cells]) + " |")
     correct_kernels = [name for name, correct in verdicts.items() if correct]
     wrong_kernels = sorted(verdicts.keys() - set(correct_kernels))
@@ -286,21 +285,26 @@ def sampling_cases(reduced: bool) -> Iterator[Case]:
 
 
 def random_locations(shape: tuple[int, ...], size: tuple[int, int]) -> Tensor:
-    """Random locations on a map, none on the border between cells, where the gradient jumps.
+    """Random locations on a map, none where the gradient of bilinear sampling jumps.
+
+    It jumps on the lines through the centres of pixels. Between these lines are squares with a
+    pixel centre at each corner: square i, from -1, reaches from the centre of pixel i to that of
+    pixel i + 1. Each location is inside such a square.
 
     Args:
         shape: Shape of the locations.
         size: Rows and columns of the map.
 
     Returns:
-        Locations (x, y), some up to half a cell outside of [0, 1]. (*shape, 2)
+        Locations (x, y), some up to half a pixel outside of the map, which is [0, 1]. (*shape, 2)
     """
     rows, columns = size
     column = torch.randint(-1, columns, shape)
     row = torch.randint(-1, rows, shape)
     within = 0.02 + 0.96 * torch.rand((*shape, 2))
-    cells = torch.stack([column, row], dim=-1)
-    return (cells + within + 0.5) / torch.tensor([columns, rows])
+    squares = torch.stack([column, row], dim=-1)
+    # The centre of pixel i, where square i starts, is at i + 0.5.
+    return (squares + within + 0.5) / torch.tensor([columns, rows])
 
 
 def kernel_sampling_cases(reduced: bool) -> Iterator[Case]:
@@ -310,10 +314,11 @@ def kernel_sampling_cases(reduced: bool) -> Iterator[Case]:
     y, x = torch.meshgrid(
         torch.linspace(-30, 30, rows), torch.linspace(-15, 15, columns), indexing="ij"
     )
-    turns = torch.arange(6) / 6  # six cameras around, each of 70 degrees
-    angle = torch.atan2(y, x).flatten()[None] / (2 * math.pi) - turns[:, None]
-    angle = (angle - angle.round()) * 360 / 70  # (V, Q), in [-0.5, 0.5] inside the image
-    visible = angle.abs() < 0.5
+    camera_turns = torch.arange(6) / 6  # directions of six cameras, as parts of a full turn
+    turns = torch.atan2(y, x).flatten()[None] / (2 * math.pi) - camera_turns[:, None]
+    # Distance from the middle of the image, in image widths of 70 degrees. (V, Q)
+    from_middle = (turns - turns.round()) * 360 / 70
+    visible = from_middle.abs() < 0.5
     depth = (x.square() + y.square()).sqrt().flatten().clamp(min=1.0)
     for size, bilinear, heads, samples in (("MapTR", False, 4, 15), ("MapQR", True, 8, 8)):
 
@@ -332,10 +337,13 @@ def kernel_sampling_cases(reduced: bool) -> Iterator[Case]:
 
         # Image positions of a point at several heights above each BEV cell, one for each head.
         v = 0.5 + torch.linspace(-2, 2, heads) / depth[:, None]  # (Q, heads)
-        u = (angle + 0.5)[..., None].expand(-1, -1, heads)
+        u = (from_middle + 0.5)[..., None].expand(-1, -1, heads)
         uv = torch.stack([u, v.clamp(0.01, 0.99).expand_as(u)], dim=-1)
         if not bilinear:
-            uv = uv.half().float()  # so that float32 and float64 round to equal pixels
+            # Without `bilinear`, positions are rounded to pixels, and float32 and float64 must give
+            # equal ones. Values with the 11 bits of float16 have exact products with the size of
+            # the map in both.
+            uv = uv.half().float()
         index = torch.arange(samples)
         offsets = torch.stack([index // 3 - 2, index % 3 - 1], dim=-1)  # rows of three pixels
         value = torch.randn(1, 6, shape[0] * shape[1], heads, 256 // heads)
@@ -349,7 +357,7 @@ def kernel_sampling_cases(reduced: bool) -> Iterator[Case]:
 
 
 def raster_cases(reduced: bool) -> Iterator[Case]:
-    """Rasters of 15 and of 60 elements in six layers."""
+    """Rasters of all six layers of a decoder, with 15 or 60 elements in each."""
     height, width = (21, 33) if reduced else (200, 100)
     grid = BEVGrid((-15.0, 15.0), (-30.0, 30.0), height=height, width=width)
 
@@ -365,9 +373,10 @@ def raster_cases(reduced: bool) -> Iterator[Case]:
         return draw_polylines(lines, grid, backend=backend)
 
     def loss(backend: str, preds: Tensor, targets: Tensor) -> Tensor:
+        # Targets have no gradient, as in training. Where one is requested, it counts as 0.
         return raster_loss(preds, targets.detach(), backend=backend)
 
-    counts = (2,) if reduced else (90, 360)
+    counts = (2,) if reduced else (6 * 15, 6 * 60)
     for count in counts:
         lines = random_polylines(count, grid)
         means, scales, rotations = gaussians_along(lines, (1.0, 0.4))

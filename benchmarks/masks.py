@@ -57,7 +57,8 @@ def run(args: argparse.Namespace) -> None:
     parts.append("Loss of a miss, by the length of the element:\n")
     parts.append(missed_line_table())
     parts.append(
-        "IoU of a crossing of 10 x 4 m with the polygon of the centres that fit its mask:\n"
+        "Gaussians are fitted to the mask of a crossing of 10 x 4 m. IoU of the polygon through "
+        "their centres with the crossing, for two kinds of mask:\n"
     )
     outline_iou = fit_crossing(False)
     filled_iou = fit_crossing(True)

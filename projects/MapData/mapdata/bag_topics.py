@@ -25,7 +25,8 @@ def parse_topics(words: Sequence[str]) -> dict[str, tuple[str, str]]:
     """Parse ``NAME=IMAGES,INFO`` of each camera. ``,INFO`` may be absent.
 
     Returns:
-        Topics of the images and of the camera info, which may be empty, by camera.
+        Topic of the images and topic of the camera info of each camera. The second is empty if it
+        is absent.
 
     Raises:
         ValueError: If a word has another form, or the name of a camera repeats.
@@ -52,7 +53,8 @@ def check_topics(
 
     Args:
         kinds: Message type of each topic of the bag.
-        topics: Topics of the images and of the camera info, which may be empty, by camera.
+        topics: Topic of the images and topic of the camera info of each camera. The second may be
+            empty.
         listing: Topics of the bag as text, for error messages.
         needs_info: Whether each camera must have a topic of camera info.
 
@@ -137,9 +139,12 @@ def camera_topics(kinds: Mapping[str, str], listing: str) -> dict[str, tuple[str
             )
         claims[candidates[topic][0]].append(name)
     topics = {}
+    # A camera info belongs to one camera: to the one whose topic has the same words, or else to the
+    # only one that it may belong to. Other cameras that could have it are left out.
     for info, names in claims.items():
         matching_names = [name for name in names if _words(cameras[name]) == _words(info)]
-        # A camera info in the root namespace could belong to any camera.
+        # A camera info in the root namespace could belong to any camera. Without equal words, it is
+        # accepted only if no camera has another camera info.
         is_in_root = info.count("/") == 1
         has_other_infos = len(claims) > 1
         if len(matching_names) == 1:

@@ -257,18 +257,19 @@ def in_our_names(checkpoint: Any) -> Any:
         checkpoint: Contents of the published file.
 
     Returns:
-        The weights by their new keys. Contents in another format keep their keys; of a mapping with
-        ``model`` and without ``state_dict``, the value of ``model`` is returned.
+        The weights by their new keys. Contents in another format keep their keys. They are returned
+        as they are, or as the value of ``model`` if they have ``model`` but no ``state_dict``.
     """
     if not isinstance(checkpoint, Mapping):
         return checkpoint
-    state = checkpoint
+    state = checkpoint  # the mapping with the weights
     if isinstance(checkpoint.get("state_dict"), Mapping):
         state = checkpoint["state_dict"]
     elif isinstance(checkpoint.get("model"), Mapping):
-        # mmengine reads the weights from ``state_dict``, but not from ``model``.
-        checkpoint = checkpoint["model"]
-        state = checkpoint
+        state = checkpoint["model"]
+        # mmengine finds weights in ``state_dict``, but not in ``model``. Weights in another format
+        # are therefore returned without ``model`` around them.
+        checkpoint = state
     if "_conv_stem.weight" in state:
         renamed: dict[str, Tensor] = {}
         for key, value in state.items():
@@ -281,7 +282,7 @@ def in_our_names(checkpoint: Any) -> Any:
         return _select_weights(state, pattern=_DETECTRON)
     if any(key.startswith(_SWIN_PREFIX) for key in keys):
         return _select_weights(state, pattern=_SWIN)
-    return checkpoint
+    return checkpoint  # another format
 
 
 def _select_weights(state: Mapping[str, Tensor], pattern: re.Pattern[str]) -> dict[str, Tensor]:

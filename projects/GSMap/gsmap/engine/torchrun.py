@@ -37,11 +37,15 @@ def _cause(error: ChildFailedError) -> tuple[int, ProcessFailure]:
     def order(rank: int) -> tuple[bool, bool, bool, float, int]:
         failure = error.failures[rank]
         code = failure.exitcode
+        # Times are in whole seconds, so the limit has a tolerance of one second.
         is_late = failure.timestamp - first_s >= STOP_TIMEOUT_S - 1
         was_killed_late = code == -signal.SIGKILL and is_late
         stopped_by_torchrun = code == -signal.SIGTERM or was_killed_late
-        # False comes before True: ranks that torchrun stopped are last.
-        return stopped_by_torchrun, code >= 0, code != INTERRUPTED, failure.timestamp, rank
+        was_killed = code < 0  # by a signal
+        was_interrupted = code == INTERRUPTED
+        # False sorts before True. Ranks that torchrun stopped are therefore last. Before them are
+        # killed ranks, then interrupted ranks, then all others.
+        return stopped_by_torchrun, not was_killed, not was_interrupted, failure.timestamp, rank
 
     first_rank = min(error.failures, key=order)
     return first_rank, error.failures[first_rank]

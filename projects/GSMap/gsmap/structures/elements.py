@@ -178,9 +178,9 @@ class MapElements:
     def to_frame(self, transform: FloatArray) -> "MapElements":
         """Transform the elements to another frame, by the position and yaw of a pose.
 
-        Roll and pitch are ignored; they would move a point 30 m away by centimetres. Ground truth
-        is cut out of a map by position and yaw, too, so this transform back to the frame of the map
-        restores the coordinates of the map.
+        Roll and pitch are ignored: at 30 m from the origin, they change x and y by centimetres.
+        Ground truth is cut out of a map by position and yaw, too, so this transform back to the
+        frame of the map restores the coordinates of the map.
 
         Args:
             transform: Transform from the frame of the elements to the other one, in metres. (4, 4)
@@ -210,7 +210,9 @@ class MapElements:
         rows = np.flatnonzero(index) if index.dtype == np.bool_ else np.asarray(index)
         counts = self.num_points[rows]
         offsets = np.append(0, np.cumsum(counts))
-        # The vertices of a selected element move from ``self.offsets`` to ``offsets``.
+        # Each selected element starts at one of ``offsets`` in the result, and at one of
+        # ``self.offsets`` here. The difference, added to the index of a vertex in the result, gives
+        # its index in ``self.points``.
         shifts = np.repeat(self.offsets[rows] - offsets[:-1], counts)
         vertices = shifts + np.arange(offsets[-1])  # indices of the selected vertices
         return MapElements(
@@ -224,7 +226,13 @@ class MapElements:
 
 
 def _require(valid: BoolArray, offsets: IntArray, fault: str) -> None:
-    """Raise ValueError naming the first element with an invalid vertex. (M,), (N + 1,)"""
+    """Raise ValueError naming the first element with an invalid vertex.
+
+    Args:
+        valid: Whether each vertex is valid. (M,)
+        offsets: Index of the first vertex of each element, then M. (N + 1,)
+        fault: What an invalid vertex has, for the error message.
+    """
     if not valid.all():
         first_invalid = valid.argmin()
         index = np.searchsorted(offsets, first_invalid, side="right") - 1
@@ -238,16 +246,15 @@ def _concatenate(polylines: PerElement) -> FloatArray:
         return np.empty((0, 2))
     are_arrays = isinstance(nonempty[0], np.ndarray)
     if are_arrays:
-        rows = []
         dims = {polyline.shape[1] for polyline in nonempty}
     else:
-        rows = list(chain.from_iterable(nonempty))
-        dims = set(map(len, rows))
+        dims = set(map(len, chain.from_iterable(nonempty)))
     if not dims <= {2, 3}:
         raise InputError(f"points have {sorted(dims)} coordinates")
     if are_arrays:
         dim = min(dims)
         return np.concatenate([polyline[:, :dim] for polyline in nonempty], dtype=np.float64)
+    rows = list(chain.from_iterable(nonempty))
     if len(dims) > 1:
         rows = [row[:2] for row in rows]
     return np.array(rows, dtype=np.float64)

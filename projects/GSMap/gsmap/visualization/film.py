@@ -153,13 +153,15 @@ def _draw_frames(
         cameras = []
         if root is not None:
             cameras = camera_views(sample.cameras, root, sample.token)
-        view = frame_view(meta.frame, meta.ground_z_m)
+        # The axes and the ground plane of the elements' coordinate frame. The sensor's mounting on
+        # the vehicle tilts this plane.
+        view = frame_view(meta.frame, meta.ground_z_m).with_mounting(sample.ego_from_frame)
         seconds = (sample.timestamp_ns - start_ns) / 1e9
         figure = compose_figure(
             cameras,
             panels,
             grid=BEVGrid(meta.x_range, meta.y_range),
-            view=view.with_mounting(sample.ego_from_frame),
+            view=view,
             style=style,
             camera_elements=elements_over_cameras,
             title=f"{sample.scene}, {seconds:.1f} s",

@@ -97,7 +97,10 @@ class _Loader(yaml.SafeLoader):
     """YAML loader that refuses merge keys (``<<``), which can expand without a limit."""
 
     def flatten_mapping(self, node: yaml.MappingNode) -> None:
-        """Leave merge keys in the mapping, where they are unknown keys."""
+        """Do nothing, instead of replacing merge keys by the keys of the mapping that they name.
+
+        PyYAML then raises a ``YAMLError``, as it cannot construct a merge key itself.
+        """
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """Construct a mapping; repeated keys raise a ``ValueError``."""

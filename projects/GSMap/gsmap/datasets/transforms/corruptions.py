@@ -32,7 +32,8 @@ Image = NDArray[np.uint8]
 _TURNS_DEG = (0.25, 0.5, 1.0, 2.0, 4.0)
 _SHIFTS_M = (0.02, 0.05, 0.1, 0.2, 0.4)
 _VISIBILITY_M = (200.0, 100.0, 60.0, 40.0, 25.0)  # limit of visibility in fog
-_RAIN_DENSITIES = (0.001, 0.002, 0.0035, 0.0055, 0.008)  # share of pixels with a streak of rain
+# Number of streaks of rain per pixel. Each streak covers many pixels.
+_RAIN_DENSITIES = (0.001, 0.002, 0.0035, 0.0055, 0.008)
 _EXPOSURES = (0.6, 0.4, 0.25, 0.15, 0.08)  # at night, relative to day
 _NIGHT_NOISE = 12.0  # standard deviation in grey levels at an exposure of 0
 _BLUR_LENGTHS = (0.01, 0.02, 0.03, 0.045, 0.06)  # relative to the width of the image
@@ -177,14 +178,14 @@ def rain(image: Image, level: int, rng: np.random.Generator) -> Image:
         rng: Generator for the places of the streaks.
     """
     height, width = image.shape[:2]
-    has_drop = rng.random((height, width)) < _RAIN_DENSITIES[level]
-    drops = has_drop.astype(np.float32)
+    is_centre = rng.random((height, width)) < _RAIN_DENSITIES[level]
+    centres = is_centre.astype(np.float32)  # of the streaks
     length = max(3, round(0.06 * height))
     streak = np.zeros((length, length), dtype=np.float32)
     top = (length * 2 // 5, 0)  # (column, row)
     bottom = (length * 3 // 5, length - 1)  # the streak is nearly vertical
     cv2.line(streak, top, bottom, color=(1.0,))
-    streaks = cv2.filter2D(drops, ddepth=-1, kernel=streak)
+    streaks = cv2.filter2D(centres, ddepth=-1, kernel=streak)
     opacity = np.clip(streaks, 0, 1)[..., None] * _STREAK_OPACITY
     greyness = 0.04 * (level + 1)
     grey_image = image * (1 - greyness) + 128 * greyness

@@ -15,8 +15,9 @@ from gsmap.utils.errors import InputError
 class GaussianGuidance(Guidance, AddsWeights):
     """Conditioning of a decoder layer on the Gaussians of its queries, for any attention.
 
-    It starts without effect: the matrices of the offsets are identities and the embedding is zero,
-    so that a layer with the weights of MapTR has the output of MapTR.
+    It starts without effect, so that a layer with the weights of MapTR has the output of MapTR.
+    `init_weights` sets the last layer of the embedding to zero. The matrices of the offsets are
+    identities for the Gaussians that a decoder starts from (`GaussianSpace.frames`).
 
     Args:
         space: Encoding of Gaussians in references.

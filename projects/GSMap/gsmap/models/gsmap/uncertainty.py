@@ -36,7 +36,8 @@ class ErrorReference(GaussianReference):
 
     After each layer, a network predicts the sigmas of the error from the state and the Gaussian of
     the point. These inputs are detached, so that the loss of the sigmas does not change the points.
-    `errors` and `decode` return the Gaussians of the errors.
+    `errors` returns the Gaussians of the errors. The inherited `decode` calls it, so that
+    predictions have these Gaussians, too.
 
     Args:
         grid: Extent of the map.
@@ -50,7 +51,8 @@ class ErrorReference(GaussianReference):
     def __init__(self, grid: BEVGrid, embed_dims: int = 256, **kwargs: Any) -> None:
         super().__init__(grid, embed_dims, **kwargs)
         self.error_space = GaussianSpace(grid, min_scale_m=0.05, max_scale_m=20.0, activation="exp")
-        # Statistics of predictions count the sigmas at this lower bound.
+        # Predictions carry the smallest sigma, here the 0.05 m, so that an evaluation can count the
+        # Gaussians whose sigmas are close to it.
         self.metainfo = {"min_scale_m": self.error_space.floor_m}
         self.error_branches = nn.ModuleList(
             layers.mlp(embed_dims + GAUSSIAN_FEATURES, embed_dims, 2) for _ in self.branches
@@ -105,6 +107,8 @@ class ErrorReference(GaussianReference):
         Returns:
             Points as centres, sigmas in metres, and angles of the line in radians. (..., P)
         """
+        # The means depend only on the first two entries, x and y. The sigmas of the error follow
+        # them and need not be removed.
         means = self.space.decode(references).means
         scales = self.error_space.scales(references[..., -5:-3])  # the sigmas of the error
         return Gaussians(means, scales, angles_of_line(means))
@@ -152,7 +156,8 @@ class GaussianNLLLoss(MapLoss):
         gaussians = reference.errors(pairs.pred_references)
         points = gaussians.means.detach() if self.detach_points else gaussians.means
         sigma = extents_along_line(gaussians._replace(means=points))  # (M, P, 2)
-        errors = line_errors(points, pairs.gt_pts_m[..., :2])  # along, across (M, P, 2)
+        # Absolute errors along and across. (M, P, 2)
+        errors = line_errors(points, pairs.gt_pts_m[..., :2])
         distribution: Laplace | Normal
         if self.laplace:
             # A Laplace distribution of scale b has the standard deviation sqrt(2) b.

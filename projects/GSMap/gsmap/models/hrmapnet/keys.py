@@ -10,7 +10,8 @@ from gsmap.models.maptrv2.keys import LIFTED_MARKER, LIFTED_UNUSED, MAPTRV2
 
 _BEV_LAYER = "prior.bev.layer."
 _MAP_LAYER = TRANSFORMER + "map_encoder.layers.{i}."
-_LABELS = (HEAD + "label_encoder.", "prior.queries.label_encoder.")
+# Prefixes of the label encoder, released and here.
+_LABEL_ENCODER = (HEAD + "label_encoder.", "prior.queries.label_encoder.")
 # The MapTRv2 release has modules that it never calls. The BEV layer of HRMapNet calls these three.
 _USED_AGAIN = ("positional_encoding.", "transformer.level_embeds", "transformer.cams_embeds")
 _UNUSED = {
@@ -23,7 +24,7 @@ HRMAPNET = KeyMap(
     "hrmapnet",
     (
         *MAPTRV2.rules,
-        _LABELS,
+        _LABEL_ENCODER,
         *rules_of(HEAD, "prior.queries.", "query_attention.attn.=attention."),
         *rules_of(TRANSFORMER, "prior.bev.", "map_feats_conv.=conv."),
         *rules_of(HEAD, _BEV_LAYER, "bev_embedding. positional_encoding."),
@@ -36,7 +37,9 @@ HRMAPNET = KeyMap(
         ),
     ),
     unused=_UNUSED,
-    markers=(LIFTED_MARKER, _LABELS),
+    # A checkpoint is recognised as one of HRMapNet if it has keys of both of these parts: of the
+    # encoder that lifts features by their predicted depth, and of the label encoder.
+    markers=(LIFTED_MARKER, _LABEL_ENCODER),
 )
 
 KEY_MAPS = (HRMAPNET,)

@@ -54,9 +54,11 @@ class RasterPrior(PriorModule, AddsWeights):
     """Raster of earlier predictions at a place, as an input of a `MapDetector` (HRMapNet).
 
     Before a frame, a window of the map is read at its pose. The BEV features are fused with it, and
-    the queries start from it. After the frame, the predictions are drawn and written. Training and
-    test begin with empty maps, so the map of a training is emptied at each epoch. Samples need
+    the queries start from it. After the frame, the predictions are drawn and written. Samples need
     ``lidar2global`` and ``map_name``; a sample without a pose reads an empty map.
+
+    The maps are emptied whenever the mode of the module is set to training or test (`train`).
+    mmengine sets it at the start of each epoch and of each test.
 
     Args:
         head: Head of the detector, a `MapHead`.
@@ -159,6 +161,8 @@ class RasterPrior(PriorModule, AddsWeights):
                 self.positions = LearnedPositionalEncoding(
                     embed_dims // 2, bev_grid.height, bev_grid.width
                 )
+        # A fusion with an output convolution adds its result to the features through this
+        # convolution, whose weights start at 0.
         bev_is_neutral = self.bev is None or self.bev.output_conv is not None
         queries_are_neutral = self.queries is None or self.queries.zero_init
         if bev_is_neutral and queries_are_neutral:
@@ -253,7 +257,7 @@ class RasterPrior(PriorModule, AddsWeights):
         Args:
             outputs: Outputs of the encoder.
             window: Values of the map, [0, 1]. (B, classes, h, w)
-            calibration: A tensor for each name in ``calibration``. (B, ...)
+            calibration: A tensor for each name in ``self.calibration``. (B, ...)
             img_shape: Rows and columns of the padded images.
 
         Returns:
@@ -282,7 +286,7 @@ class RasterPrior(PriorModule, AddsWeights):
         Args:
             outputs: Outputs of the encoder.
             cells: Map in each cell. (B, M, H, W)
-            calibration: A tensor for each name in ``calibration``. (B, ...)
+            calibration: A tensor for each name in ``self.calibration``. (B, ...)
             img_shape: Rows and columns of the padded images.
 
         Returns:
@@ -360,9 +364,9 @@ class RasterPrior(PriorModule, AddsWeights):
         )
 
     def _is_dropped(self) -> bool:
-        """Draw whether a sample reads an empty map (``train_drop``)."""
+        """Decide at random whether a sample reads an empty map (``train_drop``)."""
         if not self.training or self.train_drop == 0:
-            return False  # without a draw, which would change the random numbers of a training
+            return False  # without a random number, which would change all later ones of a training
         return bool(torch.rand(()) < self.train_drop)
 
     def _select_keys(self, cells: Tensor) -> list[Tensor]:

@@ -53,8 +53,9 @@ class PointReference(nn.Module, RefinedReference):
         num_layers: Number of decoder layers.
         coords: 2, or 3 for points with height.
         z_range: Lowest and highest z in metres, for points with height.
-        points_per_state: Number of points n that one query initialises and one state refines. With
-            more than one, the networks are larger.
+        points_per_state: Number of points n of each query of the decoder. The initial points come
+            from the positional query, and each layer refines them from the state of the query. With
+            more than one point, the networks are larger.
 
     Raises:
         ValueError: If ``coords`` is not 2 or 3, or 3 without a valid ``z_range``.

@@ -83,10 +83,15 @@ def _nearest_edges(ring, num_edges, count, x, y, eps, TILE: tl.constexpr):
 
 @triton.jit
 def _distance(squared, min_distance, PLAIN: tl.constexpr):
-    """D from the squared distance: unchanged, or its root, at least ``min_distance``, if PLAIN."""
+    """Distance D that a mask fades with, from the squared distance of a pixel to its nearest edge.
+
+    If PLAIN, D is the root of the squared distance, and at least ``min_distance``. Otherwise D is
+    the squared distance itself.
+    """
+    distance = squared
     if PLAIN:
-        squared = tl.maximum(tl.sqrt(squared), min_distance)
-    return squared
+        distance = tl.maximum(tl.sqrt(squared), min_distance)
+    return distance
 
 
 @triton.jit
@@ -205,10 +210,14 @@ def soft_backward_kernel(
             t = tl.minimum(tl.maximum(along, 0.0), 1.0)
             dx = offset_x - t * edge_x
             dy = offset_y - t * edge_y
-            # The gradient is derived in `_scatter` of ``numba.py``. EPS and rounding move t off the
-            # nearest point of the edge, so the derivative by t is not 0 between the ends. The slip
-            # is the negative of this derivative, divided by the squared length of the edge. It is
-            # computed from (dx, dy) instead of EPS, so that it also covers rounding.
+            # The squared distance is S = d . d with d = o - t e: e is the edge, from its start to
+            # its end, and o is the offset of the pixel from the start. Between the ends,
+            # t = o . e / L with L = e . e + EPS. For EPS = 0, t would be the nearest point, and
+            # dS/dt = -2 d . e would be 0. EPS and rounding change t a little, so that dS/dt counts:
+            # slip = -(dS/dt) / L. With dt/de = (o - 2 t e) / L and dt/do = e / L, the derivatives
+            # are dS/de = -2 t d - slip (o - 2 t e) and dS/do = 2 d - slip e.
+            # As e = end - start and o = pixel - start, the gradient is dS/de for the end (`end_x`,
+            # `end_y`), and -dS/do - dS/de for the start.
             between = (along >= 0) & (along <= 1)
             slip = tl.where(between, 2 * (dx * edge_x + dy * edge_y) / length2, 0.0)
             share = tl.where(edge_index == edge, weight, 0.0)
@@ -264,7 +273,9 @@ def draw_kernel(
         polylines + n * count * 2, num_edges, count=count, x=x, y=y, eps=0.0, TILE=TILE
     )
     distance = tl.sqrt(squared)
-    # The edge of a polygon cuts the pixel at the signed distance from its centre.
+    # Share of the pixel that a polygon covers. The nearest edge is taken as a line parallel to a
+    # side of the pixel: half the pixel is covered if the edge goes through its centre, and more if
+    # the centre is inside.
     area = tl.minimum(0.5 + tl.where(inside, distance, -distance) / pixel, 1.0)
     # Overlap of two intervals across the line, in pixels: the line, `half_width` to both sides of
     # `distance`, and the pixel, -0.5 to 0.5.
