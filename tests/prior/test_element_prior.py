@@ -3,6 +3,7 @@
 import os
 import struct
 import zlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ import torch
 
 from gsmap.prior import ElementPrior, ElementRule, MapPrior, PriorSettings, open_prior
 from gsmap.prior.element_prior import _COUNTS, _STORED, _pack
-from gsmap.prior.file_format import _FOOTER, ELEMENT_MAGIC, read_header, write_tiles
+from gsmap.prior.file_format import _FOOTER, _INDEX, ELEMENT_MAGIC, read_header, write_tiles
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.rigid import invert_rigid, rigid
@@ -102,17 +103,45 @@ def test_a_file_holds_everything(tmp_path):
     assert len(found.elements) == len(found.read_elements(pose_at(), GRID)) == 0
 
 
+def crossed_ring(num_vertices):
+    points = np.random.default_rng(0).uniform(-14, 14, (num_vertices, 2))
+    return np.concatenate([points, points[:1]])
+
+
+def scored(score):
+    elements = MapElements.from_polylines([SQUARE], [0], scores=[0.5])
+    return replace(elements, scores=np.array([score]))
+
+
 @pytest.mark.parametrize(
     ("elements", "message"),
     [
         (MapElements.from_polylines([SQUARE], [3]), r"labels of elements must be in \[0, 3\)"),
         (MapElements.from_polylines([SQUARE[:1]], [0]), "need two vertices or more"),
         (MapElements.from_polylines([SQUARE * 1e7], [0]), "must be within 1e"),
+        (replace(scored(0.5), points=SQUARE * np.nan), "must be within 1e"),
+        (scored(7.0), r"scores of elements must be in \[0, 1\]"),
+        (scored(np.nan), r"scores of elements must be in \[0, 1\]"),
+        (MapElements.from_polylines([SQUARE[[0, 0]]], [0]), "need a length"),
+        (MapElements.from_polylines([crossed_ring(250)], [1]), "251 vertices crosses itself"),
     ],
 )
 def test_elements_out_of_range_are_refused(elements, message):
     with pytest.raises(ValueError, match=message):
         ElementPrior(SETTINGS, elements)
+
+
+def test_long_rings_and_short_crossed_ones_are_areas():
+    angles = np.linspace(0, 2 * np.pi, 500)
+    circle = 5 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    circle[-1] = circle[0]
+    rings = [circle, crossed_ring(10), SQUARE[[0, 2, 0]]]
+    prior = ElementPrior(SETTINGS, MapElements.from_polylines(rings, [1, 1, 1]))
+    found = prior.read_elements(pose_at(), GRID)
+    assert len(found) >= 3
+    assert shapely.Polygon(found.polylines[0]).area == pytest.approx(np.pi * 25, rel=1e-3)
+    flat = ElementPrior(SETTINGS, MapElements.from_polylines(rings[2:], [1]))
+    assert flat.read(pose_at(), GRID).max() > 0.5  # a line, as for `read_elements`
 
 
 def test_settings_and_poses_out_of_range_are_refused():
@@ -158,6 +187,16 @@ def flipped(content, at):
     return content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :]
 
 
+def shared(content):
+    """Let the second tile of a file begin with the first one; checksums fit."""
+    offset, count, _, header_crc, magic = _FOOTER.unpack(content[-_FOOTER.size :])
+    rows = np.frombuffer(content[offset : -_FOOTER.size], _INDEX).copy()
+    rows["offset"][1] = rows["offset"][0]
+    index = rows.tobytes()
+    footer = _FOOTER.pack(offset, count, zlib.crc32(index), header_crc, magic)
+    return content[:offset] + index + footer
+
+
 HOSTILE = {
     "nothing": (lambda c, p: p.write_bytes(b""), "is empty"),
     "text": (lambda c, p: p.write_bytes(b"<!doctype html>" * 20), "it is a web page"),
@@ -168,6 +207,7 @@ HOSTILE = {
     "a changed index": (
         lambda c, p: p.write_bytes(flipped(c, len(c) - _FOOTER.size - 9)), "a checksum is wrong",
     ),
+    "tiles that share bytes": (lambda c, p: p.write_bytes(shared(c)), "tiles outside of the file"),
     "another class": (lambda c, p: rewritten(c, p, set_stored("label", 3)), "labels of elements"),
     "a score above 1": (lambda c, p: rewritten(c, p, set_stored("score", 1.5)), "the score 1.5"),
     "no score": (lambda c, p: rewritten(c, p, set_stored("score", np.nan)), "the score nan"),

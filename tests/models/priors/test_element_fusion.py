@@ -131,6 +131,10 @@ def test_other_priors_places_and_settings_are_refused(plain_head):
     high.pts = torch.cat([high.pts, torch.zeros(1, 20, 1)], -1)
     with pytest.raises(ValueError, match="needs detections without heights"):
         fused(plain_head, prior, high)
+    further = detections((1.0, 0, 0.9))
+    further.width = torch.ones(1)
+    with pytest.raises(ValueError, match="cannot make 'width' of detections"):
+        fused(plain_head, prior, further)
 
 
 def test_a_model_reads_elements_and_learns_as_before():

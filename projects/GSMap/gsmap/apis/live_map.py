@@ -98,7 +98,7 @@ class LiveMap:
         self._priors = () if prior is None else (prior,)
         self._update_prior = update_prior
         if prior is not None:
-            maps_for(inferencer.model, self._priors)
+            maps_for(inferencer.model, self._priors, update=update_prior)
         self._inferencer = inferencer
         self._config = inferencer.cfg.test_dataloader.dataset
         self._intrinsics = intrinsics

@@ -2,10 +2,12 @@
 
 import zlib
 from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
 import numpy as np
+import shapely
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -31,7 +33,8 @@ from gsmap.utils.errors import InputError
 from gsmap.utils.files import atomic_write
 
 _MOST_ELEMENTS = 1_000_000
-_MOST_VERTICES_OF_TILE = 1_000_000
+_MOST_VERTICES = 4_000_000  # of all elements together
+_MOST_VERTICES_OF_CROSSED_AREA = 50  # whose repair takes longer with the number of crossings
 _FARTHEST_M = 1e7  # largest coordinate of a vertex
 _COUNTS = np.dtype([("elements", "<u4"), ("vertices", "<u4")])
 _STORED = np.dtype([("label", "<u2"), ("score", "<f4"), ("num_vertices", "<u4")])
@@ -68,8 +71,8 @@ class ElementPrior:
         content: Name of the stored things, for messages.
 
     Raises:
-        ValueError: If a label or a vertex is out of range, or an element has fewer than two
-            vertices.
+        ValueError: If a label, a score or a vertex is out of range, an element has no length, the
+            outline of an area is long and crosses itself, or there are too many elements.
     """
 
     content: ClassVar[str] = "elements"
@@ -86,12 +89,22 @@ class ElementPrior:
         if (elements.num_points < 2).any():
             raise InputError("elements of a prior need two vertices or more.")
         flat = elements.with_coordinates(2)
-        if np.abs(flat.points).max(initial=0.0) > _FARTHEST_M:
+        if len(flat.points) > _MOST_VERTICES:
+            raise InputError(f"a prior has at most {_MOST_VERTICES} vertices: split the map.")
+        is_near = np.abs(flat.points) <= _FARTHEST_M  # False for NaN
+        if not is_near.all():
             raise InputError(f"vertices must be within {_FARTHEST_M:g} m of the origin.")
+        confidence = flat.confidence
+        if not ((confidence >= 0) & (confidence <= 1)).all():
+            raise InputError("scores of elements must be in [0, 1].")
+        bounds = _bounds(flat)
+        if (bounds.low == bounds.high).all(axis=1).any():
+            raise InputError("elements of a prior need a length: all vertices of one are equal.")
+        _check_areas(flat, settings.classes)
         self.settings = settings
         self.rule = ElementRule() if rule is None else rule
         self.elements = flat
-        self._bounds = _bounds(flat)
+        self._bounds = bounds
 
     @classmethod
     def load(cls, path: str | Path, settings: PriorSettings | None = None) -> "ElementPrior":
@@ -114,9 +127,11 @@ class ElementPrior:
         polylines: list[FloatArray] = []
         labels: list[int] = []
         scores: list[float] = []
+        num_vertices_left = _MOST_VERTICES
         for offset, length, crc in entries.values():
             packed = file_bytes[offset : offset + length]
-            stored, lines = _unpack(packed, crc=crc, path=path)
+            stored, lines = _unpack(packed, crc=crc, path=path, most_vertices=num_vertices_left)
+            num_vertices_left -= int(stored["num_vertices"].sum(dtype=np.int64))
             polylines += lines
             labels += stored["label"].tolist()
             scores += stored["score"].tolist()
@@ -203,7 +218,8 @@ class ElementPrior:
             is_filled = []
             for line, label, _ in elements.rows:
                 is_area = self.settings.classes[label] in AREA_CLASSES
-                is_filled.append(is_area and is_closed(line))
+                # A closed line of three vertices runs back and forth and has no area.
+                is_filled.append(is_area and len(line) > 3 and is_closed(line))
             masks = draw_polylines(
                 torch.from_numpy(pad_lines(elements.polylines)).float(),
                 grid,
@@ -252,13 +268,33 @@ def _pack(elements: MapElements) -> bytes:
     return counts.tobytes() + zlib.compress(stored.tobytes() + vertices.tobytes(), level=1)
 
 
-def _unpack(content: bytes, crc: int, path: Path) -> tuple[NDArray[np.void], list[FloatArray]]:
+def _check_areas(elements: MapElements, classes: Sequence[str]) -> None:
+    """Check that areas can be cut in bounded time: long outlines must not cross themselves.
+
+    Raises:
+        ValueError: If the outline of an area is long and crosses itself.
+    """
+    is_area = np.array([name in AREA_CLASSES for name in classes])
+    is_long = elements.num_points > _MOST_VERTICES_OF_CROSSED_AREA
+    for row in np.flatnonzero(is_area[elements.labels] & is_long):
+        outline = shapely.Polygon(elements.polylines[row])
+        if not shapely.is_valid(outline):
+            raise InputError(
+                f"an area with {elements.num_points[row]} vertices crosses itself: at most "
+                f"{_MOST_VERTICES_OF_CROSSED_AREA} are possible then; repair it."
+            )
+
+
+def _unpack(
+    content: bytes, crc: int, path: Path, most_vertices: int
+) -> tuple[NDArray[np.void], list[FloatArray]]:
     """Decompress a tile of an untrusted file, in bounded memory.
 
     Args:
         content: Tile of the file.
         crc: Expected checksum of ``content``.
         path: Name of the file, for messages.
+        most_vertices: Largest number of vertices, and of elements, that the tile may have.
 
     Returns:
         Stored elements (N,), and the vertices of each one. N x (P, 2)
@@ -269,7 +305,7 @@ def _unpack(content: bytes, crc: int, path: Path) -> tuple[NDArray[np.void], lis
     counts = np.frombuffer(content[: _COUNTS.itemsize], dtype=_COUNTS)[0]
     num_elements = int(counts["elements"])
     num_vertices = int(counts["vertices"])
-    if num_elements > _MOST_ELEMENTS or num_vertices > _MOST_VERTICES_OF_TILE:
+    if max(num_elements, num_vertices) > most_vertices:
         raise damage
     # The checksum of the whole tile was checked above, so `unpack_tile` gets a checksum that fits.
     packed = content[_COUNTS.itemsize :]

@@ -180,10 +180,14 @@ def _parse_index(index: bytes, path: Path, start: int, end: int) -> dict[TileKey
     tile_columns = np.abs(rows["column"].astype(np.int64))
     tile_rows = np.abs(rows["row"].astype(np.int64))
     inside &= (tile_columns <= FARTHEST_TILE) & (tile_rows <= FARTHEST_TILE)
+    # Tiles that share bytes would let a small file become a large map.
+    by_offset = rows[np.argsort(offsets, kind="stable")]
+    tile_ends = by_offset["offset"].astype(np.int64) + by_offset["length"]
+    overlap = (tile_ends[:-1] > by_offset["offset"][1:].astype(np.int64)).any()
     entries = {}
     for column, row, offset, length, crc in rows.tolist():
         entries[column, row] = (offset, length, crc)
-    if not inside.all() or len(entries) != len(rows):
+    if not inside.all() or overlap or len(entries) != len(rows):
         raise InputError(
             f"{path} is damaged: its index names tiles outside of the file or twice; build it "
             "again."

@@ -144,6 +144,12 @@ class ElementFusion(PriorModule):
             gaussians = gaussians_along(lines, across_m=sigma_m)
             fields["scales"] = gaussians.scales.to(detections.scales)
             fields["rotations"] = gaussians.rotations.to(detections.rotations)
+        unknown = sorted(set(detections.keys()) - set(fields))
+        if unknown:
+            raise InputError(
+                f"ElementFusion cannot make {unknown[0]!r} of detections for elements: leave out "
+                "model.prior."
+            )
         others = detections[~belongs]
         joined = {}
         for name, values in fields.items():
