@@ -18,11 +18,11 @@ from gsmap.prior.file_format import (
     ELEMENT_MAGIC,
     FARTHEST_TILE,
     TileKey,
-    read_header,
+    read_file,
+    save_file,
     unpack_tile,
-    write_tiles,
 )
-from gsmap.prior.inputs import Pose, planar_pose, reserve_file
+from gsmap.prior.inputs import Pose, planar_pose
 from gsmap.prior.settings import PriorSettings
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.cutting import cut_to_range
@@ -30,7 +30,6 @@ from gsmap.structures.elements import FloatArray, MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import is_closed, pad_lines
 from gsmap.utils.errors import InputError
-from gsmap.utils.files import atomic_write
 
 _MOST_ELEMENTS = 1_000_000
 _MOST_VERTICES = 4_000_000  # of all elements together
@@ -118,18 +117,13 @@ class ElementPrior:
             ValueError: If the file is no valid prior of elements, or has other settings.
         """
         path = Path(path)
-        file_bytes = path.read_bytes()
-        if not file_bytes:
-            raise InputError(f"{path} is empty: copy or build it again.")
-        found, rule, entries = read_header(file_bytes, path, magic=ELEMENT_MAGIC)
-        if settings is not None:
-            settings.require_equal(found, str(path))
+        content, file_settings, rule, entries = read_file(path, settings, magic=ELEMENT_MAGIC)
         polylines: list[FloatArray] = []
         labels: list[int] = []
         scores: list[float] = []
         num_vertices_left = _MOST_VERTICES
         for offset, length, crc in entries.values():
-            packed = file_bytes[offset : offset + length]
+            packed = content[offset : offset + length]
             stored, lines = _unpack(packed, crc=crc, path=path, most_vertices=num_vertices_left)
             num_vertices_left -= int(stored["num_vertices"].sum(dtype=np.int64))
             polylines += lines
@@ -137,7 +131,7 @@ class ElementPrior:
             scores += stored["score"].tolist()
         try:
             elements = MapElements.from_polylines(polylines, labels=labels, scores=scores)
-            return cls(found, elements, rule)
+            return cls(file_settings, elements, rule)
         # An `InputError` of the constructor is a ValueError, so it gets the path of the file here.
         except ValueError as error:
             text = str(error).rstrip(".")
@@ -152,14 +146,8 @@ class ElementPrior:
         Raises:
             RuntimeError: If the file is reserved by another process.
         """
-        path = Path(path)
-        owner = reserve_file(path)
-        try:
-            tiles = self._packed_tiles()
-            with atomic_write(path, mode="wb") as file:
-                write_tiles(file, self.settings, rule=self.rule, tiles=tiles, magic=ELEMENT_MAGIC)
-        finally:
-            owner.close()
+        tiles = self._packed_tiles()
+        save_file(Path(path), self.settings, rule=self.rule, tiles=tiles, magic=ELEMENT_MAGIC)
 
     def read_elements(self, pose: Pose, grid: BEVGrid) -> MapElements:
         """Read the elements in the range of a frame.

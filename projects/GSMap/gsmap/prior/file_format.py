@@ -18,10 +18,11 @@ import numpy as np
 
 from gsmap.prior.element_rule import ELEMENT_RULES
 from gsmap.prior.gaussian_rule import GAUSSIAN_RULES
+from gsmap.prior.inputs import reserve_file
 from gsmap.prior.rules import RULES, rule_from_settings, rule_settings
 from gsmap.prior.settings import PriorSettings
 from gsmap.utils.errors import InputError
-from gsmap.utils.files import fetch_advice
+from gsmap.utils.files import atomic_write, fetch_advice
 
 VERSION = 1
 TileKey = tuple[int, int]
@@ -64,6 +65,58 @@ _KINDS = {
     GAUSSIAN_MAGIC: _Kind("Gaussian prior", "GaussianPrior", rules=GAUSSIAN_RULES),
     ELEMENT_MAGIC: _Kind("prior of elements", "ElementPrior", rules=ELEMENT_RULES),
 }
+
+
+def save_file(
+    path: Path,
+    settings: PriorSettings,
+    rule: Any,
+    tiles: Iterable[tuple[TileKey, bytes]],
+    magic: bytes,
+) -> None:
+    """Write a file, which replaces ``path`` when it is complete.
+
+    Args:
+        path: File to create or replace.
+        settings: Classes, place and cells.
+        rule: Rule of the stored states.
+        tiles: Place and compressed states of each tile.
+        magic: First bytes of the kind of file.
+
+    Raises:
+        RuntimeError: If the file is reserved by another process.
+    """
+    owner = reserve_file(path)
+    try:
+        with atomic_write(path, mode="wb") as file:
+            write_tiles(file, settings, rule=rule, tiles=tiles, magic=magic)
+    finally:
+        owner.close()
+
+
+def read_file(
+    path: Path, settings: PriorSettings | None, magic: bytes
+) -> tuple[bytes, PriorSettings, Any, dict[TileKey, TileEntry]]:
+    """Read an untrusted file, and check everything but its tiles.
+
+    Args:
+        path: The file.
+        settings: Classes, place and tiles that it must have; None to accept any.
+        magic: First bytes of the kind of file.
+
+    Returns:
+        Content of the file, its settings and rule, and the entry of each tile.
+
+    Raises:
+        ValueError: If the file is no valid prior of this kind, or has other settings.
+    """
+    content = path.read_bytes()
+    if not content:
+        raise InputError(f"{path} is empty: copy or build it again.")
+    file_settings, rule, entries = read_header(content, path, magic=magic)
+    if settings is not None:
+        settings.require_equal(file_settings, str(path))
+    return content, file_settings, rule, entries
 
 
 def write_tiles(

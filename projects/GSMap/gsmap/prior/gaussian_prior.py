@@ -14,9 +14,9 @@ from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.prior.file_format import (
     GAUSSIAN_MAGIC,
     TileKey,
-    read_header,
+    read_file,
+    save_file,
     unpack_tile,
-    write_tiles,
 )
 from gsmap.prior.gaussian_rule import GaussianRule
 from gsmap.prior.gaussian_updates import (
@@ -27,12 +27,11 @@ from gsmap.prior.gaussian_updates import (
     measure,
     sample_lines,
 )
-from gsmap.prior.inputs import PlanarPose, Pose, Raster, planar_pose, reserve_file, to_numpy
+from gsmap.prior.inputs import PlanarPose, Pose, Raster, planar_pose, to_numpy
 from gsmap.prior.settings import PriorSettings
 from gsmap.structures.elements import FloatArray, MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.errors import InputError
-from gsmap.utils.files import atomic_write
 
 Stored = NDArray[np.void]
 """Gaussians of a tile; positions are relative to its corner."""
@@ -107,12 +106,7 @@ class GaussianPrior:
             ValueError: If the file is no valid Gaussian prior, or has other settings.
         """
         path = Path(path)
-        content = path.read_bytes()
-        if not content:
-            raise InputError(f"{path} is empty: copy or build it again.")
-        file_settings, rule, entries = read_header(content, path, magic=GAUSSIAN_MAGIC)
-        if settings is not None:
-            settings.require_equal(file_settings, str(path))
+        content, file_settings, rule, entries = read_file(path, settings, magic=GAUSSIAN_MAGIC)
         prior = cls(file_settings, rule)
         for key, (offset, length, crc) in entries.items():
             packed = content[offset : offset + length]
@@ -130,17 +124,9 @@ class GaussianPrior:
         Raises:
             RuntimeError: If the file is reserved by another process.
         """
-        path = Path(path)
         with self._lock:
-            owner = reserve_file(path)
-            try:
-                packed = [(key, _pack(self._tiles[key])) for key in sorted(self._tiles)]
-                with atomic_write(path, mode="wb") as file:
-                    write_tiles(
-                        file, self.settings, rule=self.rule, tiles=packed, magic=GAUSSIAN_MAGIC
-                    )
-            finally:
-                owner.close()
+            tiles = [(key, _pack(self._tiles[key])) for key in sorted(self._tiles)]
+            save_file(Path(path), self.settings, rule=self.rule, tiles=tiles, magic=GAUSSIAN_MAGIC)
 
     @property
     def num_gaussians(self) -> int:
