@@ -9,6 +9,7 @@ from model_cases import build_small, make_images, make_samples, straight_element
 from prior_cases import pose_at
 
 from gsmap.apis.export import ExportedDetector
+from gsmap.models.priors import element_fusion
 from gsmap.models.priors.element_fusion import ElementFusion
 from gsmap.prior import ElementPrior, ElementRule, MapPrior, PriorSettings
 from gsmap.structures.elements import MapElements
@@ -96,12 +97,18 @@ def test_gaussians_of_elements_have_the_width_of_the_prior(gaussian_head):
     torch.testing.assert_close(result.rotations[1], torch.full((20,), torch.pi / 2))
 
 
-def test_without_elements_or_a_prior_nothing_changes(plain_head):
+def test_without_elements_or_a_prior_nothing_changes(plain_head, monkeypatch):
+    messages = []
+    monkeypatch.setattr(element_fusion, "print_log", lambda text, **_: messages.append(text))
     found = detections((1.0, 0, 0.9))
     fusion = ElementFusion(plain_head)
     assert fusion.update_detections([found], [{"token": "a"}]) == [found]
+    assert fusion.update_detections([found], [{"token": "b"}]) == [found]
+    assert len(messages) == 1
+    assert "ElementFusion has no prior" in messages[0]
     prior = prior_of(plain_head)
     assert fused(plain_head, prior, found) is found
+    assert len(messages) == 1
     nothing = fused(plain_head, prior_of(plain_head, (1.0, 0, 0.5)), found[torch.tensor([False])])
     assert rows_of(nothing) == [(1.0, 0, 0.25)]
 

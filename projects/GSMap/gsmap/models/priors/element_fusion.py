@@ -1,10 +1,12 @@
 """Fusion of detections with the elements of earlier drives."""
 
+import logging
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from mmdet3d.registry import MODELS
+from mmengine.logging import print_log
 from mmengine.structures import InstanceData
 from torch import Tensor
 
@@ -33,7 +35,8 @@ class ElementFusion(PriorModule):
     where m is ``missed_share``. The element replaces its detections, because the mean of many
     frames is more accurate than one frame. All other detections stay as they are. There are no
     weights and there is no training, so any trained model with a `MapHead` can use it. Without a
-    prior, the detections do not change. This module is not part of a published method.
+    prior, the detections do not change, and a warning is logged. This module is not part of a
+    published method.
 
     Args:
         head: Head of the detector, a `MapHead`.
@@ -67,6 +70,7 @@ class ElementFusion(PriorModule):
         self.has_gaussians = "scales" in head.reference.outputs
         self.gate_m = gate_m
         self.missed_share = missed_share
+        self._has_warned = False
 
     def maps_of(self, priors: Sequence[AnyPrior], update: bool = False) -> GivenMaps:
         """Maps that `PriorModule.maps_of` makes of the priors of a user, after a check.
@@ -99,6 +103,7 @@ class ElementFusion(PriorModule):
         """
         maps = self._given  # set by `PriorModule.use`; `GivenMaps` are the priors of a user
         if not isinstance(maps, GivenMaps):
+            self._warn_once()
             return list(results)
         updated = []
         for detections, meta in zip(results, metas, strict=True):
@@ -108,6 +113,16 @@ class ElementFusion(PriorModule):
             elements = prior.read_elements(place.pose, self.window)
             updated.append(self._fuse_sample(detections, elements, sigma_m=prior.rule.sigma_m))
         return updated
+
+    def _warn_once(self) -> None:
+        """Log that there is no prior, at the first batch without one."""
+        if not self._has_warned:
+            print_log(
+                "ElementFusion has no prior, so detections stay as they are: give one (--prior).",
+                logger="current",
+                level=logging.WARNING,
+            )
+        self._has_warned = True
 
     def _fuse_sample(
         self, detections: InstanceData, elements: MapElements, sigma_m: float
